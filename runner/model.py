@@ -1,0 +1,245 @@
+"""What exists: cameras, their rate-quality models, pipeline graphs, the vehicle. Frozen, valid once built.
+
+Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), sizes are px, times are seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from fractions import Fraction
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from runner.rules import RuleCall
+
+Kbps = Fraction
+Value = bool | int | float | str  # what an element's property may hold in YAML
+
+SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
+
+
+class ModelError(ValueError):
+    """What was found at `key` (a path below the thing being built) and the rule that it breaks."""
+
+    def __init__(self, key: str, found: object, rule: str) -> None:
+        super().__init__(f"{key}: {found}: {rule}")
+        self.key, self.found, self.rule = key, found, rule
+
+
+def exact(number: float | str | Fraction) -> Fraction:
+    """The number a person wrote, without binary rounding: 0.1 is 1/10.
+
+    A float prints as the shortest decimal text that reads back as itself, which for up to 15 digits is what was typed.
+    """
+    if isinstance(number, int | Fraction):
+        return Fraction(number)
+    return Fraction(str(number))
+
+
+def plain(number: Fraction) -> int | float:
+    """The same number for JSON and for people: whole numbers without a decimal point."""
+    return number.numerator if number.denominator == 1 else float(number)
+
+
+class Mode(StrEnum):
+    """Video rate control mode (paper, section II)."""
+
+    SINGLE = "single"
+    AUTOMATIC = "automatic"
+    COLLECTIVE = "collective"
+
+
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """Region of interest in px, counted from the top left of the camera's full (cropped) image."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+
+@dataclass(frozen=True, slots=True)
+class RateQualityModel:
+    """Scaling factor that looks best in each bitrate range (paper, Eq. 3 and Table I).
+
+    scaling  R factors in ]0, 1], rising
+    b_min    R lower bounds in kbit/s, rising from 0
+    b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
+    raises   ModelError
+    """
+
+    scaling: tuple[Fraction, ...]
+    b_min: tuple[Kbps, ...]
+    b_full: Kbps
+
+    def __post_init__(self) -> None:
+        bounds = [plain(b) for b in self.b_min]
+        factors = [plain(s) for s in self.scaling]
+        if len(factors) != len(bounds):
+            raise ModelError("b_min_kbps", bounds, f"must have one bound for each of the {len(factors)} scaling factors")
+        if any(a >= b for a, b in pairwise(factors)):
+            raise ModelError("scaling", factors, "must rise")
+        if not 0 < factors[0] or factors[-1] > 1:
+            raise ModelError("scaling", factors, "must lie in ]0, 1]")
+        if bounds[0] != 0 or any(a >= b for a, b in pairwise(bounds)):
+            raise ModelError("b_min_kbps", bounds, "must rise from 0")
+        if self.b_full <= self.b_min[-1]:
+            raise ModelError("b_full_kbps", plain(self.b_full), f"must be above the last b_min, {bounds[-1]}")
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One GStreamer element of a graph. A property value may hold {placeholders}, filled per camera by `graph.py`."""
+
+    name: str
+    factory: str
+    properties: Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One property that a knob sets, and with what: kbps, bps, left, right, top, bottom, on, off or a caps template."""
+
+    element: str
+    property: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A camera's pipeline on both sides as the YAML states it.
+
+    transport  rtsp: a server on the vehicle, the operator's first element is its client;
+               pipeline: the vehicle's last element sends, the operator's first one receives
+    wire       what `print` puts in place of server and client, since gst-launch has neither (rtsp only)
+    settings   named numbers of the graph (mtu_bytes, jitter_buffer_ms, ...) that properties refer to as {name}
+    verified   False: checked against its schema only, never run by this project's tests
+    """
+
+    name: str
+    transport: str
+    vehicle: tuple[Element, ...]
+    operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+    knobs: Mapping[str, tuple[Turn, ...]]
+    settings: Mapping[str, Value]
+    verified: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
+
+    loop      start again at the end without a gap (a clip)
+    render    name of the procedural drive that makes the clip, or ""
+    stand_in  elements that `print` shows where gst-launch cannot make the frames (born in Python, not rendered yet)
+    """
+
+    name: str
+    elements: tuple[Element, ...]
+    loop: bool = False
+    render: str = ""
+    render_s: float = 0
+    stand_in: tuple[Element, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a camera sits on the vehicle, ROS REP 103 axes: x forward, y left, z up from the ground below the rear axle.
+
+    Metres and degrees; yaw turns left, pitch tips the view down, roll tips it clockwise.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Tile on the operator's page, counted from the top left."""
+
+    row: int
+    column: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A camera mounted in a vehicle.
+
+    width, height   px of the full image, after the crop of the native one
+    native          px size of what the source delivers, with the part that is kept; None: it is the full image
+    weight          explicit weight in the allocation, >= 0
+    mount           device, address, clip, port: what a source or graph placeholder of that name is filled with
+    """
+
+    name: str
+    width: int
+    height: int
+    fps: Fraction
+    rate_quality: RateQualityModel
+    graph: Graph
+    source: Source
+    weight: Fraction = Fraction(1)
+    native: tuple[int, int] | None = None
+    crop: Roi | None = None
+    mount: Mapping[str, Value] = field(default_factory=dict)
+    place: Place | None = None
+    pose: Pose | None = None
+    fov_deg: float = 90.0
+    lens: str = "pinhole"
+
+    def __post_init__(self) -> None:
+        if self.native and self.crop:
+            width, height = self.native
+            if self.crop.x + self.crop.width > width or self.crop.y + self.crop.height > height:
+                found = f"{self.crop.width}x{self.crop.height} at {self.crop.x},{self.crop.y}"
+                raise ModelError("native", found, f"must lie inside the native {width}x{height}")
+
+    @property
+    def full_roi(self) -> Roi:
+        return Roi(0, 0, self.width, self.height)
+
+    @property
+    def source_size(self) -> tuple[int, int]:
+        return self.native or (self.width, self.height)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a server listens and where its clients find it."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vehicle:
+    """Everything the runner needs to know, valid once built.
+
+    modes  the rule list of each mode
+    pqos   the prediction source as the YAML states it, read by `pqos.py`
+    """
+
+    name: str
+    cameras: Mapping[str, Camera]
+    mode: Mode
+    modes: Mapping[Mode, tuple[RuleCall, ...]]
+    media: Endpoint
+    control: Endpoint
+    pqos: Mapping[str, Any]
+
+
+Progress = Callable[[str, float], None]  # what is being done, share done in [0, 1]
