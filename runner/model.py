@@ -83,11 +83,13 @@ class RateQualityModel:
     def __post_init__(self) -> None:
         bounds = [plain(b) for b in self.b_min]
         factors = [plain(s) for s in self.scaling]
+        if not factors:
+            raise ModelError("scaling", factors, "must have at least one factor")
         if len(factors) != len(bounds):
-            raise ModelError("b_min_kbps", bounds, f"must have one bound for each of the {len(factors)} scaling factors")
+            raise ModelError("b_min_kbps", bounds, f"must have {len(factors)} entries, one per scaling factor")
         if any(a >= b for a, b in pairwise(factors)):
             raise ModelError("scaling", factors, "must rise")
-        if not 0 < factors[0] or factors[-1] > 1:
+        if factors[0] <= 0 or factors[-1] > 1:
             raise ModelError("scaling", factors, "must lie in ]0, 1]")
         if bounds[0] != 0 or any(a >= b for a, b in pairwise(bounds)):
             raise ModelError("b_min_kbps", bounds, "must rise from 0")
@@ -154,9 +156,9 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a camera sits on the vehicle, ROS REP 103 axes: x forward, y left, z up from the ground below the rear axle.
+    """Where a camera sits on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
 
-    Metres and degrees; yaw turns left, pitch tips the view down, roll tips it clockwise.
+    The origin is on the ground below the rear axle. Metres and degrees; yaw turns left, pitch tips the view down, roll tips it clockwise.
     """
 
     x_m: float

@@ -1,0 +1,65 @@
+"""The difference between what is decided and what has been commanded, as commands to `apply`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from runner.decision import Decision, Setting
+from runner.model import Roi
+
+Size = tuple[int, int]
+KnobValue = bool | int | Roi | Size
+
+KNOBS = ("sending", "roi", "size", "bitrate")
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Turn one knob of one camera. All commands of a camera that come together act between the same two frames.
+
+    value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1
+    """
+
+    camera: str
+    knob: str
+    value: KnobValue
+
+    def to_json(self) -> dict[str, Any]:
+        value: Any = self.value
+        if isinstance(value, Roi):
+            value = {"x": value.x, "y": value.y, "width": value.width, "height": value.height}
+        elif isinstance(value, tuple):
+            value = {"width": value[0], "height": value[1]}
+        return {"camera": self.camera, "knob": self.knob, "value": value}
+
+
+Knobs = Mapping[str, KnobValue]  # value by knob, of one camera
+
+
+def wanted(setting: Setting) -> Knobs:
+    """Where a setting wants a camera's knobs. While nothing is sent the other knobs stay where they are."""
+    if not setting.sending:
+        return {"sending": False}
+    return {"sending": True, "roi": setting.roi, "size": (setting.width, setting.height), "bitrate": setting.kbps}
+
+
+def difference(decision: Decision, commanded: Mapping[str, Knobs]) -> list[Command]:
+    """Commands that take every camera from where its knobs were commanded to, to where the decision wants them."""
+    return [
+        Command(name, knob, value)
+        for name, setting in decision.settings.items()
+        for knob, value in wanted(setting).items()
+        if commanded.get(name, {}).get(knob) != value
+    ]
+
+
+def after(commanded: Mapping[str, Knobs], commands: list[Command]) -> Mapping[str, Knobs]:
+    """Where the knobs are commanded to once these commands are given."""
+    if not commands:
+        return commanded
+    knobs = {name: dict(values) for name, values in commanded.items()}
+    for command in commands:
+        knobs.setdefault(command.camera, {})[command.knob] = command.value
+    return knobs

@@ -1,0 +1,89 @@
+"""What the rules decide: one `Setting` per camera, and the `Draft` that a mode's rules fill in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Any
+
+from runner.model import Kbps, Mode, Roi, plain
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How one camera is to be sent.
+
+    sending        False: nothing is encoded (off, or allocated below 1 kbit/s), the stream stays connectable
+    demand         kbit/s, Eq. (1), 0 when off
+    kbps           whole kbit/s, rounded down
+    scaling        selected factor; None when off
+    width, height  px of the encoded picture, 0 when off
+    reason         why, for the operator; takes no part in comparison
+    """
+
+    on: bool
+    sending: bool
+    demand: Kbps
+    kbps: int
+    scaling: Fraction | None
+    roi: Roi
+    width: int
+    height: int
+    reason: str = field(compare=False)
+
+    def to_json(self) -> dict[str, Any]:
+        roi = self.roi
+        return {
+            "on": self.on,
+            "sending": self.sending,
+            "demand_kbps": plain(self.demand),
+            "kbps": self.kbps,
+            "scaling": None if self.scaling is None else plain(self.scaling),
+            "roi": {"x": roi.x, "y": roi.y, "width": roi.width, "height": roi.height},
+            "width": self.width,
+            "height": self.height,
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What is in force: the mode, its total before the cap at demand, and a setting for each camera."""
+
+    mode: Mode
+    total: Kbps
+    settings: Mapping[str, Setting]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "mode": self.mode.value,
+            "total_kbps": plain(self.total),
+            "cameras": {name: setting.to_json() for name, setting in self.settings.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A decision in the making. A rule reads what earlier ones gave and returns a draft with its own part replaced.
+
+    total    kbit/s of all cameras
+    demand   kbit/s by camera, 0 when off
+    bitrate  exact kbit/s by camera
+    scaling  factor by camera that is on
+    sending  False stops all cameras, whatever their bitrate
+    notes    reasons that concern all cameras
+    reasons  reason by camera
+    """
+
+    total: Kbps | None = None
+    demand: Mapping[str, Kbps] = field(default_factory=dict)
+    bitrate: Mapping[str, Kbps] = field(default_factory=dict)
+    scaling: Mapping[str, Fraction] = field(default_factory=dict)
+    sending: bool = True
+    notes: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    def noted(self, note: str, **changes: Any) -> Draft:
+        """The draft with these changes and the reason for them."""
+        return replace(self, notes=(*self.notes, note), **changes)

@@ -1,0 +1,55 @@
+"""Resolution scaling selection (paper, section II-B) and the picture size that follows from it."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from fractions import Fraction
+
+from runner.model import SMALLEST_SIDE_PX, Kbps, RateQualityModel, Roi, plain
+
+
+def as_full_image(allocated: Kbps, roi: Roi, full: Roi) -> Kbps:
+    """The bitrate that the full image would have at the same bits per pixel, kbit/s.
+
+    b_alloc * p_full / p_set                                             (paper, left side of Eq. 4)
+
+    A region of interest smaller than the full image so wins a greater scaling factor.
+    """
+    return Fraction(allocated * full.pixels, roi.pixels) if roi != full else allocated
+
+
+def select_range(model: RateQualityModel, bitrate: Kbps) -> int:
+    """Index r of the range B_r that a bitrate falls into:  b_min,r <= bitrate < b_min,r+1   (paper, Eq. 4)
+
+    bitrate  kbit/s of the full image, see `as_full_image`
+    returns  0 to R-1; a bound belongs to the upper range, the last range has no upper end
+    """
+    return bisect_right(model.b_min, bitrate) - 1
+
+
+def select_scaling(model: RateQualityModel, bitrate: Kbps) -> Fraction:
+    """Factor s_r in ]0, 1] of the range that a bitrate of the full image, kbit/s, falls into."""
+    return model.scaling[select_range(model, bitrate)]
+
+
+def bitrate_range(model: RateQualityModel, r: int) -> str:
+    """The range B_r as a person reads it: [300, 950) or [450, ...)."""
+    upper = plain(model.b_min[r + 1]) if r + 1 < len(model.b_min) else "..."
+    return f"[{plain(model.b_min[r])}, {upper})"
+
+
+def output_size(roi: Roi, scaling: Fraction) -> tuple[int, int]:
+    """Width and height in px of what is encoded: the ROI times the factor, pixels stay square.
+
+    Each side goes to the nearest even number, ties up, since 4:2:0 encoders refuse odd ones. Where a side would fall
+    below 16 px, both use the factor that makes the shorter one 16.
+    """
+    size = _scaled(roi, scaling)
+    if min(size) < SMALLEST_SIDE_PX:
+        return _scaled(roi, Fraction(SMALLEST_SIDE_PX, min(roi.width, roi.height)))
+    return size
+
+
+def _scaled(roi: Roi, scaling: Fraction) -> tuple[int, int]:
+    p, q = scaling.numerator, scaling.denominator
+    return 2 * ((roi.width * p + q) // (2 * q)), 2 * ((roi.height * p + q) // (2 * q))
