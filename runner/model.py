@@ -5,8 +5,9 @@ Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), siz
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from enum import StrEnum
 from fractions import Fraction
 from itertools import pairwise
@@ -42,6 +43,13 @@ def exact(number: float | str | Fraction) -> Fraction:
 def plain(number: Fraction) -> int | float:
     """The same number for JSON and for people: whole numbers without a decimal point."""
     return number.numerator if number.denominator == 1 else float(number)
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
+    known = list(known)
+    near = get_close_matches(word, known, 1)
+    return f"did you mean {near[0]}?" if near else f"there is {', '.join(known)}"
 
 
 class Mode(StrEnum):
@@ -126,7 +134,6 @@ class Graph:
     verified   False: checked against its schema only, never run by this project's tests
     """
 
-    name: str
     transport: str
     vehicle: tuple[Element, ...]
     operator: tuple[Element, ...]
@@ -136,18 +143,39 @@ class Graph:
     settings: Mapping[str, Value]
     verified: bool = True
 
+    def __post_init__(self) -> None:
+        names = [element.name for element in (*self.vehicle, *self.wire_vehicle)]
+        for side, elements in (("vehicle", self.vehicle), ("operator", self.operator)):
+            _check_unique(side, [element.name for element in elements])
+        if self.transport == "rtsp" and self.vehicle[-1].name != "pay0":
+            rule = "the last element must be named pay0, as the RTSP server asks"
+            raise ModelError("vehicle", repr(self.vehicle[-1].name), rule)
+        for knob, turns in self.knobs.items():
+            for index, turn in enumerate(turns):
+                if turn.element not in names:
+                    rule = f"no such element, {suggest(turn.element, names)}"
+                    raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
+
+
+def _check_unique(key: str, names: list[str]) -> None:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise ModelError(f"{key}[{index}].name", repr(name), "is already the name of another element")
+
 
 @dataclass(frozen=True, slots=True)
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
+    settings  what the file itself gives for placeholders: clip, device, address
     loop      start again at the end without a gap (a clip)
     render    name of the procedural drive that makes the clip, or ""
+    render_s  length of that drive, s
     stand_in  elements that `print` shows where gst-launch cannot make the frames (born in Python, not rendered yet)
     """
 
-    name: str
     elements: tuple[Element, ...]
+    settings: Mapping[str, Value] = field(default_factory=dict)
     loop: bool = False
     render: str = ""
     render_s: float = 0
@@ -158,7 +186,8 @@ class Source:
 class Pose:
     """Where a camera sits on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
 
-    The origin is on the ground below the rear axle. Metres and degrees; yaw turns left, pitch tips the view down, roll tips it clockwise.
+    The origin is on the ground below the rear axle. Metres and degrees; yaw turns left,
+    pitch tips the view down, roll tips it clockwise.
     """
 
     x_m: float
@@ -184,7 +213,7 @@ class Camera:
     width, height   px of the full image, after the crop of the native one
     native          px size of what the source delivers, with the part that is kept; None: it is the full image
     weight          explicit weight in the allocation, >= 0
-    mount           device, address, clip, port: what a source or graph placeholder of that name is filled with
+    mount           device, address, clip: what a placeholder of that name is filled with
     """
 
     name: str

@@ -11,14 +11,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from fractions import Fraction
 from functools import cache
 from typing import Any
 
 from runner import allocation, scaling
 from runner.decision import Decision, Draft, Setting
-from runner.model import Kbps, Mode, ModelError, Vehicle, exact, plain
+from runner.model import Kbps, Mode, ModelError, Vehicle, exact, plain, suggest
 from runner.state import State
 
 Memory = Mapping[str, Any]
@@ -271,8 +270,7 @@ def find_rule(name: str) -> Rule:
         for entry in entry_points(group="tod_runner.rules", name=name):
             entry.load()
     if name not in RULES:
-        near = get_close_matches(name, RULES, 1)
-        raise ModelError("", repr(name), f"unknown rule, did you mean {near[0]}?" if near else "unknown rule")
+        raise ModelError("", repr(name), f"unknown rule, {suggest(name, RULES)}")
     return RULES[name]
 
 
@@ -286,9 +284,8 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     known = found.parameters
     for key, value in parameters.items():
         if key not in known:
-            near = get_close_matches(key, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"{name} takes {', '.join(known) or 'none'}"
-            raise ModelError(f"{name}.{key}", None, f"unknown parameter, {hint}")
+            hint = suggest(key, known) if known else f"{name} takes none"
+            raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter, {hint}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
             raise ModelError(f"{name}.{key}", repr(value), "must be a number from 0")
         if "_every_" in key and value == 0:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from fractions import Fraction
 from typing import assert_never
 
 from runner import events as ev
 from runner.decision import Decision
-from runner.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain
+from runner.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain, suggest
 
 
 class Refused(Exception):
@@ -133,9 +132,7 @@ def _enter(state: State, mode: Mode, in_force: Decision) -> State:
 def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
-    near = get_close_matches(name, vehicle.cameras, 1)
-    hint = f"did you mean {near[0]}?" if near else f"the vehicle has {', '.join(vehicle.cameras)}"
-    raise Refused(f"unknown camera {name!r}, {hint}")
+    raise Refused(f"unknown camera {name!r}, {suggest(name, vehicle.cameras)}")
 
 
 def _only_in(mode: Mode, state: State, event: ev.Event) -> None:

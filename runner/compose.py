@@ -1,0 +1,312 @@
+"""Compose the YAML tree with Hydra, and remember which file or override each value came from."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from runner import schema
+from runner.model import suggest
+
+GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos")
+COMMAND_LINE = "command line"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One mistake of the user: where, what was found, which rule it breaks."""
+
+    file: str
+    path: str
+    found: str | None
+    rule: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (self.file, self.path, self.found, self.rule) if part)
+
+
+class ConfigError(Exception):
+    """What the user wrote is wrong; all problems at once."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = list(dict.fromkeys(problems))
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file or override that took part, with its content and the place in the whole where it landed."""
+
+    file: str
+    package: schema.Path
+    content: Any
+    path: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Composed:
+    """The whole configuration as plain data, and its parts, the one with the last word first."""
+
+    document: dict[str, Any]
+    parts: list[Part] = field(default_factory=list)
+
+    def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
+        """A problem of the whole, told of the file or override that it came from, by the path in there."""
+        part = self._origin(path)
+        return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
+
+    def _origin(self, path: schema.Path) -> Part:
+        """The part that has the value; for what is missing, the one that says most about its surroundings."""
+        inside = [part for part in self.parts if path[: len(part.package)] == part.package]
+        for length in range(len(path), 0, -1):
+            # For a missing key ask who made its surroundings, the most local file first.
+            asked = inside if length == len(path) else sorted(inside, key=lambda part: -len(part.package))
+            for part in asked:
+                if _holds(part.content, path[len(part.package) : length]) and length > len(part.package):
+                    return part
+            for part in asked:
+                if len(part.package) == length:
+                    return part
+        return self.parts[-1]
+
+
+def conf_directories(user: Path | None) -> list[Path]:
+    """Where configuration files are looked up, the user's directory first."""
+    packaged = Path(str(files("runner.conf")))
+    return [user, packaged] if user else [packaged]
+
+
+def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
+    """Compose conf/config.yaml with the user's overrides.
+
+    user    directory whose files shadow the packaged ones one by one
+    raises  ConfigError
+    """
+    parsed = _parse_overrides(overrides)
+    directories = conf_directories(user)
+    problems = [p for override in parsed for p in _choice_problems(override, directories)]
+    if problems:
+        raise ConfigError(problems)
+    document, choices = _compose(parsed, directories)
+    parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
+    parts += reversed(list(_file_parts(directories, choices)))
+    return Composed(document, parts)
+
+
+# --- overrides --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One override: a choice of a group's file, or a value."""
+
+    text: str
+    key: str
+    value: Any
+    choice: bool
+
+    @property
+    def hydra(self) -> str:
+        """As Hydra is to read it. A value may add a key that no file states; the schema knows which keys there are."""
+        return self.text if self.choice or self.text[0] in "+~" else f"++{self.text}"
+
+
+def _parse_overrides(overrides: Sequence[str]) -> list[Override]:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser, parsed, problems = OverridesParser.create(), [], []
+    for text in overrides:
+        try:
+            override = parser.parse_override(text)
+            group = override.key_or_group.split("@")[0].lstrip("/")
+            if override.is_sweep_override():
+                raise HydraException("a,b,c is a sweep; write [a,b,c] for a list")
+            value = None if override.is_delete() else override.value()
+            choice = group in GROUPS and not isinstance(value, dict)
+            parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice))
+        except HydraException as error:
+            rule = str(error).splitlines()[0]
+            hint = "" if "sweep" in rule else """; quote a value with special characters: 'key="value"'"""
+            problems.append(Problem(COMMAND_LINE, "", text, rule + hint))
+    if problems:
+        raise ConfigError(problems)
+    return parsed
+
+
+def _choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
+    """A choice of a file that is not there, or a value for a key that belongs to the whole document."""
+    if not override.choice or override.value is None:
+        return
+    group = override.key.split("@")[0].lstrip("/")
+    options = sorted({p.stem for d in directories for p in (d / group).glob("*.yaml")})
+    if str(override.value) not in options:
+        rule = f"no such file in conf/{group}/, {suggest(str(override.value), options)}"
+        yield Problem(COMMAND_LINE, override.key, str(override.value), rule)
+
+
+def _nested(key: str, value: Any) -> Any:
+    """{"a": {"b": value}} for a.b."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
+
+
+# --- Hydra ------------------------------------------------------------------------------------------------------------
+
+
+def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[dict[str, Any], dict[str, str]]:
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    _read_no_environment()
+    _search(directories)
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(directories[-1]), version_base="1.3"):
+            config = hydra_compose("config", [o.hydra for o in overrides], return_hydra_config=True)
+            choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
+            del_hydra = {key: config._get_node(key) for key in config if key != "hydra"}
+            document = OmegaConf.to_container(DictConfig(del_hydra), resolve=True)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError([yaml_problem(error, _first_bad_file(directories))]) from None
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError([_hydra_problem(error, directories)]) from None
+    assert isinstance(document, dict)
+    return {str(key): value for key, value in document.items()}, choices
+
+
+def _read_no_environment() -> None:
+    """OmegaConf's own resolver for environment variables is no part of this language: a file says what it says."""
+    from omegaconf import OmegaConf
+
+    OmegaConf.clear_resolver("oc.env")
+
+
+def _search(directories: Sequence[Path]) -> None:
+    """Let the user's directory shadow the packaged files; Hydra's own --config-dir only appends."""
+    from hydra.core.config_search_path import ConfigSearchPath
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+    class UserDirectory(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+            for directory in reversed(_USER_DIRECTORIES):
+                search_path.prepend("tod-runner", f"file://{directory}")
+
+    if not _USER_DIRECTORIES and len(directories) == 1:
+        return
+    _USER_DIRECTORIES[:] = directories[:-1]
+    if not _REGISTERED:
+        Plugins.instance().register(UserDirectory)
+        _REGISTERED.append(UserDirectory)
+
+
+_USER_DIRECTORIES: list[Path] = []
+_REGISTERED: list[type] = []
+
+
+def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
+    """Hydra's message as one problem; a file missing from a defaults list gets a suggestion."""
+    text = str(error)
+    missing = re.search(r"In '([\w/]+)': Could not find '([\w/]+)'", text)
+    if missing:
+        where, wanted = missing.groups()
+        group, _, name = wanted.rpartition("/")
+        options = sorted({p.stem for d in directories for p in (d / group).glob("*.yaml")})
+        found = find_file(directories, *where.rpartition("/")[::2])
+        return Problem(label(found, directories), "defaults", repr(wanted), f"no such file, {suggest(name, options)}")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return Problem("conf", "", None, "; ".join(lines))
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _load(path: Path) -> Any:
+    """A YAML file as OmegaConf reads it: YAML 1.1, duplicate keys refused."""
+    from omegaconf._utils import get_yaml_loader
+
+    with path.open(encoding="utf-8") as file:
+        return yaml.load(file, Loader=get_yaml_loader())
+
+
+def load_file(path: Path) -> Any:
+    """Content of a YAML file.
+
+    raises  yaml.YAMLError, OSError, UnicodeDecodeError
+    """
+    return _load(path)
+
+
+def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
+    """The first file of that name; where there is none, the place where it would be."""
+    candidates = [directory / group / f"{name}.yaml" for directory in directories]
+    return next((path for path in candidates if path.exists()), candidates[0])
+
+
+def label(path: Path, directories: Sequence[Path]) -> str:
+    """A file as messages name it: conf/... for a packaged one, the path as the user gave it for his own."""
+    packaged = directories[-1]
+    return f"conf/{path.relative_to(packaged)}" if path.is_relative_to(packaged) else str(path)
+
+
+def yaml_problem(error: yaml.YAMLError, path: str) -> Problem:
+    """A file that is no YAML."""
+    mark = getattr(error, "problem_mark", None)
+    what = getattr(error, "problem", None) or str(error)
+    line = f"line {mark.line + 1}" if mark else ""
+    return Problem(path, line, None, " ".join(str(what).split()))
+
+
+def _first_bad_file(directories: Sequence[Path]) -> str:
+    for directory in directories:
+        for path in sorted(directory.rglob("*.yaml")):
+            try:
+                load_file(path)
+            except yaml.YAMLError:
+                return label(path, directories)
+    return "conf"
+
+
+def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterator[Part]:
+    """The files behind a composition, in the order in which Hydra merged them."""
+    root = find_file(directories, "", "config")
+    yield Part(label(root, directories), (), load_file(root), root)
+    # Mounted files first: a vehicle file says last what belongs to the place.
+    for key, name in sorted(choices.items(), key=lambda item: "@" not in item[0]):
+        group, _, package = key.partition("@")
+        if group.startswith("hydra") or group not in GROUPS or name == "None":
+            continue
+        where = tuple(package.split(".")) if package else () if group == "vehicle" else (group,)
+        yield from _with_bases(find_file(directories, group, name), group, where, directories)
+
+
+def _with_bases(path: Path, group: str, package: schema.Path, directories: Sequence[Path]) -> Iterator[Part]:
+    """A group's file after those of its own group that its defaults list builds on."""
+    content = load_file(path)
+    for entry in (content or {}).get("defaults", []):
+        if isinstance(entry, str) and entry != "_self_":
+            yield from _with_bases(find_file(directories, group, entry), group, package, directories)
+    yield Part(label(path, directories), package, content, path)
+
+
+def _holds(content: Any, path: schema.Path) -> bool:
+    for part in path:
+        try:
+            content = content[part]
+        except (KeyError, IndexError, TypeError):
+            return False
+    return True

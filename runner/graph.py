@@ -1,0 +1,217 @@
+"""Compile a camera's pipeline graph into a `Plan`: plain elements for both sides and the knobs to turn. Pure text."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from runner.commands import KnobValue
+from runner.model import Camera, Element, Endpoint, ModelError, Roi, Value, suggest
+
+PLACEHOLDER = re.compile(r"\{(\w+)\}")
+_PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
+Assignment = tuple[str, str, Value]  # element, property, value
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """One camera compiled: nothing left to look up, nothing started.
+
+    source    elements that make raw frames
+    printed   the same for `print`: a stand-in where gst-launch cannot make them
+    vehicle   elements after the source
+    operator  elements of the operator's side
+    wire_*    what `print` adds in place of RTSP server and client
+    """
+
+    camera: Camera
+    source: tuple[Element, ...]
+    printed: tuple[Element, ...]
+    vehicle: tuple[Element, ...]
+    operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+
+    @property
+    def stands_in(self) -> bool:
+        """Whether `print` shows other frames than those that a run sends."""
+        return self.printed != self.source
+
+    @property
+    def serves(self) -> bool:
+        """Whether an RTSP server carries the stream; else the line brings its own sink and source."""
+        return self.camera.graph.transport == "rtsp"
+
+    @property
+    def pipeline(self) -> str:
+        """The vehicle's side as GStreamer parses it, knobs not yet turned."""
+        return launch((*self.source, *self.vehicle))
+
+    @property
+    def server(self) -> str | None:
+        """The RTSP factory's own string."""
+        return f"( {self.pipeline} )" if self.serves else None
+
+    @property
+    def receiver(self) -> str:
+        """The operator's side as GStreamer parses it."""
+        return launch(self.operator)
+
+    def vehicle_line(self, knobs: Mapping[str, KnobValue]) -> str:
+        """Arguments for gst-launch-1.0 with the knobs turned, quoted for a shell, ending in a network sink."""
+        turned = [a for knob, value in knobs.items() for a in assignments(self.camera, knob, value)]
+        return shell(_set((*self.printed, *self.vehicle, *self.wire_vehicle), turned))
+
+    def operator_line(self) -> str:
+        """Arguments for gst-launch-1.0, quoted for a shell, beginning with the source that `vehicle_line` sends to."""
+        # Where print has a wire, it takes the place of the RTSP client, the first element.
+        return shell((*self.wire_operator, *self.operator[1:]) if self.wire_operator else self.operator)
+
+
+def compile_graph(camera: Camera, media: Endpoint, index: int = 0, clip: str | None = None) -> Plan:
+    """Fill a camera's source and graph with what belongs to the camera.
+
+    media   the vehicle's RTSP server
+    index   number of the camera in its vehicle, for ports
+    clip    path of the rendered clip, where the source renders one and it is there
+    raises  ModelError for a placeholder that nothing fills
+    """
+    graph, source = camera.graph, camera.source
+    values = _values(camera, media, index, clip)
+
+    def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
+        return tuple(_filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
+
+    unrendered = bool(source.render) and clip is None
+    stand_in = fill(source.stand_in, "source.stand_in")
+    frames = stand_in if unrendered else fill(source.elements, "source.elements")
+    return Plan(
+        camera=camera,
+        source=frames,
+        printed=stand_in if stand_in and not source.render else frames,
+        vehicle=fill(graph.vehicle, "graph.vehicle"),
+        operator=fill(graph.operator, "graph.operator"),
+        wire_vehicle=fill(graph.wire_vehicle, "graph.wire.vehicle"),
+        wire_operator=fill(graph.wire_operator, "graph.wire.operator"),
+    )
+
+
+def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
+    """What turning a knob to a value sets on which elements, in the order of the graph.
+
+    raises  ModelError where a knob's value kind does not fit the knob
+    """
+    quantities = _quantities(camera, value)
+    turned: list[Assignment] = []
+    for turn in camera.graph.knobs[knob]:
+        if PLACEHOLDER.search(turn.value) and "width" in quantities:
+            filled: Value = PLACEHOLDER.sub(lambda match: str(quantities[match[1]]), turn.value)
+        elif turn.value in quantities:
+            filled = quantities[turn.value]
+        else:
+            raise ModelError(f"graph.knobs.{knob}", repr(turn.value), f"{knob} offers {', '.join(quantities)}")
+        turned.append((turn.element, turn.property, filled))
+    return turned
+
+
+def launch(elements: Iterable[Element]) -> str:
+    """Text for gst_parse_launch."""
+    return " ! ".join(" ".join(_tokens(element, _quoted)) for element in elements)
+
+
+def shell(elements: Iterable[Element]) -> str:
+    """Arguments for gst-launch-1.0 as a shell reads them."""
+    return " ! ".join(" ".join(map(shlex.quote, _tokens(element, str))) for element in elements)
+
+
+def rtsp_url(media: Endpoint, camera: str) -> str:
+    return f"rtsp://{media.host}:{media.port}/{camera}"
+
+
+def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
+    """What a knob's value offers to its turns, by the word that the YAML uses."""
+    if isinstance(value, bool):
+        return {"on": value, "off": not value}
+    if isinstance(value, int):
+        return {"kbps": value, "bps": value * 1000}
+    if isinstance(value, Roi):
+        # The crop element sees the native picture; an ROI counts from the full image inside it.
+        native_width, native_height = camera.source_size
+        full = camera.crop or camera.full_roi
+        left, top = full.x + value.x, full.y + value.y
+        right, bottom = native_width - left - value.width, native_height - top - value.height
+        return {"left": left, "right": right, "top": top, "bottom": bottom}
+    width, height = value
+    return {"width": width, "height": height}
+
+
+def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> dict[str, Value]:
+    """What the placeholders of a camera's source and graph stand for."""
+    width, height = camera.source_size
+    rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
+    square = "pixel-aspect-ratio=1/1"
+    values: dict[str, Value] = {
+        **camera.source.settings,
+        **camera.graph.settings,
+        **camera.mount,
+        "camera": camera.name,
+        "width": width,
+        "height": height,
+        "framerate": rate,
+        "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{square}",
+        "host": media.host,
+        "url": rtsp_url(media, camera.name),
+        "port": int(camera.graph.settings["first_port"]) + index,
+    }
+    return values if clip is None else values | {"clip": clip}
+
+
+def _filled(element: Element, values: Mapping[str, Value], where: str) -> Element:
+    properties = {
+        key: _fill_value(value, values, f"{where}.properties.{key}") for key, value in element.properties.items()
+    }
+    return replace(element, properties=properties)
+
+
+def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
+    if not isinstance(value, str):
+        return value
+    for name in PLACEHOLDER.findall(value):
+        if name not in values:
+            raise ModelError(where, repr(value), f"nothing fills {{{name}}}, {suggest(name, values)}")
+    whole = PLACEHOLDER.fullmatch(value)
+    if whole:
+        return values[whole[1]]  # keeps its type
+    return PLACEHOLDER.sub(lambda match: _text(values[match[1]]), value)
+
+
+def _set(elements: Iterable[Element], turned: Iterable[Assignment]) -> tuple[Element, ...]:
+    by_element: dict[str, dict[str, Value]] = {}
+    for name, key, value in turned:
+        by_element.setdefault(name, {})[key] = value
+    return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
+
+
+def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:
+    pairs = (f"{key}={quote(_text(value))}" for key, value in element.properties.items())
+    return [element.factory, f"name={element.name}", *pairs]
+
+
+def _text(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        # 0.1 stays 0.1, 90000.0 becomes 90000
+        exact = Fraction(str(value))
+        return str(exact.numerator) if exact.denominator == 1 else str(value)
+    return str(value)
+
+
+def _quoted(text: str) -> str:
+    if _PLAIN_VALUE.fullmatch(text):
+        return text
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

@@ -1,0 +1,170 @@
+"""Check documents against the JSON Schemas in schemas/ and say what is wrong as a person would."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from runner.model import suggest
+
+if TYPE_CHECKING:
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
+
+Path = tuple[str | int, ...]
+
+_TYPES = {
+    "integer": "a whole number",
+    "number": "a number",
+    "string": "text",
+    "boolean": "true or false",
+    "object": "a mapping",
+    "array": "a list",
+    "null": "null",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What breaks a rule, and where in the document; `found` is None where the path says it already."""
+
+    path: Path
+    found: str | None
+    rule: str
+
+
+def findings(document: Any, schema: str) -> list[Finding]:
+    """All that is wrong with a document, in the order of the document; empty: it is valid.
+
+    schema  name of a file in schemas/ without its ending
+    """
+    errors = sorted(validator(schema).iter_errors(document), key=lambda e: [str(part) for part in e.absolute_path])
+    found = [finding for error in errors for finding in _explain(error)]
+    # A misspelt key is one mistake, not an unknown key and a missing one.
+    meant = {
+        (*f.path[:-1], f.rule.rpartition("did you mean ")[2].rstrip("?")) for f in found if "did you mean" in f.rule
+    }
+    return [f for f in found if not (f.found == "missing" and f.path in meant)]
+
+
+def dotted(path: Path) -> str:
+    """A path as people write it: cameras.front_left.rate_quality.scaling[2]."""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return text.removeprefix(".")
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in YAML, cut where it is long."""
+    text = repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+@cache
+def validator(schema: str) -> Draft202012Validator:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator({"$ref": f"{schema}.schema.json"}, registry=_registry())
+
+
+@cache
+def event_validator(name: str) -> Draft202012Validator | None:
+    """Validator of one event's own definition; None: there is no such event."""
+    from jsonschema import Draft202012Validator
+
+    definitions = schema_document("event")["$defs"]
+    if name not in definitions or name == "t":
+        return None
+    definition = definitions[name]
+    properties = definition["properties"] | {"t": definitions["t"]}  # a reference less to follow for each event
+    return Draft202012Validator(definition | {"properties": properties})
+
+
+def event_problem(document: Any) -> str:
+    """What is wrong with the JSON of an event, in one line; "" if nothing is."""
+    if not isinstance(document, dict):
+        return f"{shown(document)}: must be a mapping with t and event"
+    name = document.get("event")
+    if name is None:
+        return "event: missing: must be given"
+    check = event_validator(name) if isinstance(name, str) else None
+    if check is None:
+        return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
+    if check.is_valid(document):
+        return ""
+    problems = [f for error in check.iter_errors(document) for f in _explain(error)]
+    return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in problems)
+
+
+@cache
+def event_names() -> tuple[str, ...]:
+    return tuple(name for name in schema_document("event")["$defs"] if name != "t")
+
+
+def schema_names() -> list[str]:
+    return sorted(p.name.removesuffix(".schema.json") for p in files("runner.schemas").iterdir() if "json" in p.name)
+
+
+@cache
+def schema_document(name: str) -> Mapping[str, Any]:
+    text = files("runner.schemas").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    document: Mapping[str, Any] = json.loads(text)
+    return document
+
+
+@cache
+def _registry() -> Any:
+    from referencing import Registry
+    from referencing.jsonschema import DRAFT202012
+
+    resources = ((f"{name}.schema.json", DRAFT202012.create_resource(schema_document(name))) for name in schema_names())
+    return Registry().with_resources(resources)
+
+
+def _explain(error: ValidationError) -> Iterator[Finding]:
+    path, value, limit = tuple(error.absolute_path), error.instance, error.validator_value
+    match error.validator:
+        case "additionalProperties":
+            known = error.schema.get("properties", {})
+            for key in value:
+                if key not in known:
+                    yield Finding((*path, key), None, f"unknown key, {suggest(str(key), known)}")
+        case "required":
+            for key in limit:
+                if key not in value:
+                    yield Finding((*path, key), "missing", "must be given")
+        case "propertyNames" | "not" | "if":
+            yield Finding(path, shown(value), error.message)
+        case _:
+            yield Finding(path, shown(value), _rule(str(error.validator), limit, value, error.schema))
+
+
+def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
+    match keyword:
+        case "type":
+            names = [_TYPES[name] for name in ([limit] if isinstance(limit, str) else limit)]
+            # YAML reads a bare on, off, yes or no as true or false.
+            quote = ', quote it: "on" or "off"' if isinstance(value, bool) and limit == "string" else ""
+            return f"must be {' or '.join(names)}{quote}"
+        case "minimum":
+            return f"must be at least {limit}"
+        case "maximum":
+            return f"must be at most {limit}"
+        case "exclusiveMinimum":
+            return f"must be above {limit}"
+        case "enum":
+            hint = suggest(value, limit) if isinstance(value, str) else ""
+            return f"must be one of {', '.join(map(str, limit))}" + (f", {hint}" if "mean" in hint else "")
+        case "const":
+            return f"must be {shown(limit)}"
+        case "minItems" | "minLength" | "minProperties":
+            return "must not be empty" if limit == 1 else "must say more"
+        case "maxProperties":
+            return "must have one entry"
+        case "pattern":
+            return str(schema.get("description", f"must match {limit}"))
+        case _:
+            return f"breaks {keyword} {shown(limit)}"
