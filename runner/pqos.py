@@ -10,23 +10,16 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from runner.bandwidth_map import BandwidthMap, Way, offset
 from runner.events import BitratePredicted, Event, PositionReported
 from runner.model import Kbps, ModelError, exact, plain
 from runner.table import RATE, TIME, find_file, number, read_map, read_table
 
-EARTH_M = 6378137.0  # WGS-84 equatorial radius; the ground's curvature differs from it by 0.7 % at most
 SLOWEST_MPS = 1.0  # below this speed the direction of movement is mostly GPS noise
 BASELINE_S = 0.5  # movement is taken over at least this long, else a 20 Hz GPS gives noise again
-REACH_M = 10_000.0  # the plane below fits the Earth about that far; an absurd speed ends here, too
-COLUMNS = 1 << 27  # more than the cells of 1 m around the equator
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+REACH_M = 10_000.0  # the map's plane fits the Earth about that far; an absurd speed ends here, too
 
 
 class Pqos(Protocol):
@@ -38,89 +31,6 @@ class Pqos(Protocol):
 
     def observe(self, event: Event) -> BitratePredicted | None:
         """What this event makes known, stamped with the event's own t; None: nothing new."""
-
-
-class Way(NamedTuple):
-    """Straight path from a place (degrees) to where the vehicle will be (m east and north of it)."""
-
-    lat: float
-    lon: float
-    east: float = 0.0
-    north: float = 0.0
-
-
-class BandwidthMap:
-    """Rates by place, found through a grid that is searched in sorted order.
-
-    lat, lon, kbps  one value per point: degrees, degrees, kbit/s; radius_m: how far from a path a point still counts
-
-    The rows of the grid are bands of latitude, each divided into columns of its own, so that a cell measures the same
-    at every latitude. Points are sorted by cell, then by rate: a dense map answers from the first point of most cells.
-    """
-
-    def __init__(self, lat: Floats, lon: Floats, kbps: Floats, radius_m: float) -> None:
-        self._radius = radius_m
-        self._cell = max(radius_m / 4, 1.0)  # many cells lie fully inside the radius; few are cut by its edge
-        row = np.floor(np.radians(lat) * EARTH_M / self._cell).astype(np.int64)
-        key = self._key(row, lon)
-        order = np.lexsort((kbps, key))
-        self._lat, self._lon, self._kbps = lat[order], lon[order], kbps[order]
-        self._keys, first = np.unique(key[order], return_index=True)
-        self._first = np.append(first, len(order)).astype(np.int64)
-        self._rows = int(row.min()), int(row.max())
-
-    def lowest(self, way: Way) -> float | None:
-        """Lowest rate, in kbit/s, of the points within the radius of a path; None: the path is off the map."""
-        cells = self._cells(way)
-        first = self._first[cells]
-        inside = self._inside(first, way)
-        best = self._kbps[first[inside]].min(initial=np.inf)
-        # The first point of a cell is its lowest: only where it lies outside may a later one lie inside and be lower.
-        cells = cells[~inside & (self._kbps[first] < best)]
-        rest = _spans(self._first[cells] + 1, self._first[cells + 1])
-        rest = rest[self._kbps[rest] < best]
-        best = min(best, self._kbps[rest[self._inside(rest, way)]].min(initial=np.inf))
-        return None if best == np.inf else float(best)
-
-    def _key(self, row: Ints, lon: Floats) -> Ints:
-        """Number of the cell at a longitude of a row; rising with the longitude within a row."""
-        parallel = np.maximum(np.cos((row + 0.5) * self._cell / EARTH_M), 0.0)
-        column: Ints = np.floor(np.radians(lon + 180) * EARTH_M * parallel / self._cell).astype(np.int64)
-        return row * COLUMNS + column
-
-    def _cells(self, way: Way) -> Ints:
-        """Occupied cells that may hold points within the radius of the path: one span of columns in each row."""
-        reach = self._radius + 0.01  # rounding must not lose a point on the edge
-        here = math.radians(way.lat) * EARTH_M
-        low = math.floor((here + min(way.north, 0) - reach) / self._cell)
-        high = math.floor((here + max(way.north, 0) + reach) / self._cell)
-        row = np.arange(max(low, self._rows[0]), min(high, self._rows[1]) + 1)
-        south = row * self._cell - here - reach
-        along = np.clip(np.array([south, south + self._cell + 2 * reach]) / (way.north or 1e-9), 0, 1) * way.east
-        degrees = math.degrees(1 / (EARTH_M * max(math.cos(math.radians(way.lat)), 1e-6)))
-        west = np.clip(way.lon + (along.min(axis=0) - reach) * degrees, -180, 180)
-        east = np.clip(way.lon + (along.max(axis=0) + reach) * degrees, -180, 180)
-        first, last = self._key(row, west), self._key(row, east)
-        return _spans(self._keys.searchsorted(first, "left"), self._keys.searchsorted(last, "right"))
-
-    def _inside(self, index: Ints, way: Way) -> NDArray[np.bool_]:
-        """Which points lie within the radius of the path: distance to a segment in the plane around its start."""
-        x = np.radians(self._lon[index] - way.lon) * (EARTH_M * math.cos(math.radians(way.lat)))
-        y = np.radians(self._lat[index] - way.lat) * EARTH_M
-        square = way.east**2 + way.north**2
-        if square > 0:
-            share = np.clip((x * way.east + y * way.north) / square, 0, 1)
-            x, y = x - share * way.east, y - share * way.north
-        near: NDArray[np.bool_] = x * x + y * y <= self._radius**2
-        return near
-
-
-def _spans(begin: Ints, end: Ints) -> Ints:
-    """All numbers of the half open ranges [begin, end), one after the other."""
-    length = end - begin
-    before = np.cumsum(length) - length
-    spans: Ints = np.arange(length.sum()) + np.repeat(begin - before, length)
-    return spans
 
 
 class _Motion:
@@ -147,19 +57,14 @@ class _Motion:
     def _measure(self, event: PositionReported) -> None:
         last = self._last = self._last or event
         elapsed = event.t - last.t
-        if elapsed >= BASELINE_S or (elapsed > 0 and self._course is None):
-            east, north = offset(last.lat, last.lon, event.lat, event.lon)
-            self._speed = math.hypot(east, north) / elapsed
-            if self._speed >= SLOWEST_MPS:
-                self._course = math.degrees(math.atan2(east, north)) % 360
         if elapsed >= BASELINE_S:
             self._last = event
-
-
-def offset(lat0: float, lon0: float, lat: float, lon: float) -> tuple[float, float]:
-    """Metres east and north from one place to another: equirectangular projection, right for some km."""
-    east = math.radians(math.remainder(lon - lon0, 360)) * math.cos(math.radians(lat0)) * EARTH_M
-    return east, math.radians(lat - lat0) * EARTH_M
+        elif elapsed <= 0 or self._course is not None:  # a first guess may come earlier
+            return
+        east, north = offset(last.lat, last.lon, event.lat, event.lon)
+        self._speed = math.hypot(east, north) / elapsed
+        if self._speed >= SLOWEST_MPS:
+            self._course = math.degrees(math.atan2(east, north)) % 360
 
 
 class MapPqos:
@@ -180,7 +85,7 @@ class MapPqos:
         return BitratePredicted(t=event.t, kbps=kbps, valid_s=self._valid_s)
 
     def _swapped(self, event: PositionReported) -> tuple[str, ...]:
-        """Defect that looks like a dead spot: lon and lat exchanged, in the map or in what reports the position."""
+        """A defect that looks like a dead spot: lon and lat exchanged in the map or in what reports the position."""
         if abs(event.lon) > 90 or self._points.lowest(Way(event.lon, event.lat)) is None:
             return ()
         return (
@@ -219,7 +124,7 @@ class LivePqos:
 def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
     """Rate in force at a time: that of the last row not after it; `off_trace` before the first row and after the end.
 
-    path  CSV with t_s, rising, and a rate column; the last row lasts as long as the one before it, then a loop restarts
+    path  CSV with t_s (never falling) and a rate; its last row lasts as long as the one before, then a loop restarts
     """
     table = read_table(path, (TIME, RATE))
     if len(table) < 2:
@@ -250,8 +155,8 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
             valid_s = None if settings.get("valid_s") is None else number(settings, "valid_s", positive=True)
             return MapPqos(points, look_ahead_s, off_map, valid_s)
         case "trace":
-            off_trace = exact(number(settings, "off_trace_kbps"))
-            kbps_at = trace(find_file(settings, "file", bases), bool(settings.get("loop")), off_trace)
+            path, off_trace = find_file(settings, "file", bases), exact(number(settings, "off_trace_kbps"))
+            kbps_at = trace(path, bool(settings.get("loop")), off_trace)
             return TimedPqos(kbps_at, number(settings, "period_s", positive=True))
         case "constant":
             constant = exact(number(settings, "kbps"))

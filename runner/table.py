@@ -22,19 +22,21 @@ FINITE = sys.float_info.max
 
 
 class Column(NamedTuple):
-    """A column of numbers: names its header may have, range, and whether each row must be above the one before."""
+    """A column of numbers: names its header may have, range, and whether it is a time that must not fall."""
 
     names: tuple[str, ...]
     least: float
     most: float
     rule: str
-    rises: bool = False
+    time: bool = False
 
 
 LON = Column(("lon",), -180, 180, "must lie in [-180, 180] degrees")
 LAT = Column(("lat",), -90, 90, "must lie in [-90, 90] degrees; are lon and lat swapped?")
 RATE = Column(("kbps", "bandwidth_kbps", "uplink_kbps"), 0, FINITE, "must be a finite number of kbit/s, 0 or more")
-TIME = Column(("t_s",), -FINITE, FINITE, "must be a finite number of seconds, above that of the row before", rises=True)
+TIME = Column(
+    ("t_s",), -FINITE, FINITE, "must be a finite number of seconds, not below that of the row before", time=True
+)
 SPEED = Column(("speed_mps",), 0, FINITE, "must be a finite number of m/s, 0 or more")
 
 
@@ -162,19 +164,25 @@ def _matrix(path: Path) -> _Text:
 
 
 def _checked(path: Path, columns: Sequence[Column], text: _Text) -> NDArray[np.float64]:
-    """The values of a table, each within the range of its column; raises ModelError for the first that is not."""
+    """The values of a table, each within the range of its column; raises ModelError for the first that is not.
+
+    Recorders write a row twice now and then: of rows with the same time the last one counts.
+    """
     values = text.values
     if values is None:
         raise _not_a_number(path, text)
     if not len(values):
         raise ModelError("file", path, "must have rows, there is none")
     good = (values >= [column.least for column in columns]) & (values <= [column.most for column in columns])
-    for j in (j for j, column in enumerate(columns) if column.rises):
-        good[1:, j] &= np.diff(values[:, j]) > 0
+    times = [j for j, column in enumerate(columns) if column.time]
+    for j in times:
+        good[1:, j] &= np.diff(values[:, j]) >= 0
     if not good.all():
         i, j = (int(k) for k in np.argwhere(~good)[0])
         line, cells = next(islice(text.rows, i, None))
         raise ModelError("file", f"{path}:{line}: {text.names[j]} {cells[j]}", columns[j].rule)
+    for j in times:
+        values = values[np.append(np.diff(values[:, j]) > 0, True)]
     return values
 
 

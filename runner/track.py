@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from runner.bandwidth_map import Floats, offset
 from runner.events import PositionReported
 from runner.model import ModelError
-from runner.pqos import SLOWEST_MPS, Floats, offset
+from runner.pqos import SLOWEST_MPS
 from runner.route import route
 from runner.table import LAT, LON, SPEED, TIME, find_file, header, number, read_map, read_table, within
 
@@ -79,7 +80,7 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
 
 
 def recorded(path: Path, loop: bool) -> Track:
-    """A recorded drive: CSV with t_s (rising), lat, lon (degrees) and, where it was measured, speed_mps."""
+    """A recorded drive: CSV with t_s (never falling), lat, lon (degrees) and, where it was measured, speed_mps."""
     columns = (TIME, LAT, LON, SPEED) if SPEED.names[0] in header(path) else (TIME, LAT, LON)
     times, lat, lon, *speed = read_table(path, columns).T
     if len(times) < 2:
