@@ -1,0 +1,196 @@
+"""Tables of numbers that a setting names: bandwidth maps, traces, GPS tracks; checked in full before use."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.model import ModelError
+
+FINITE = sys.float_info.max
+
+
+class Column(NamedTuple):
+    """A column of numbers: names its header may have, range, and whether it is a time that must not fall."""
+
+    names: tuple[str, ...]
+    least: float
+    most: float
+    rule: str
+    time: bool = False
+
+
+LON = Column(("lon",), -180, 180, "must lie in [-180, 180] degrees")
+LAT = Column(("lat",), -90, 90, "must lie in [-90, 90] degrees; are lon and lat swapped?")
+RATE = Column(("kbps", "bandwidth_kbps", "uplink_kbps"), 0, FINITE, "must be a finite number of kbit/s, 0 or more")
+TIME = Column(
+    ("t_s",), -FINITE, FINITE, "must be a finite number of seconds, not below that of the row before", time=True
+)
+SPEED = Column(("speed_mps",), 0, FINITE, "must be a finite number of m/s, 0 or more")
+
+
+class _Text(NamedTuple):
+    """A table as it stands in a file.
+
+    values  float64 (rows, columns); None: some cell is not a number
+    names   name of each column in this file
+    rows    line number and cells of each row, read again when a mistake has to be named
+    """
+
+    values: NDArray[np.float64] | None
+    names: Sequence[str]
+    rows: Iterator[tuple[int, Sequence[str]]]
+
+
+def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
+    """The file that a setting names: absolute as it is, else in the first of the directories that has it.
+
+    raises  ModelError
+    """
+    name = settings.get(key)
+    if not isinstance(name, str) or not name:
+        raise ModelError(key, name, "must name a file")
+    paths = [base / name for base in bases] or [Path(name)]
+    for path in paths:
+        if path.is_file():
+            return path
+    raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
+
+
+def number(settings: Mapping[str, Any], key: str, *, positive: bool = False) -> float:
+    """A setting that is a finite number, 0 or more (`positive`: above 0). Raises ModelError."""
+    value: Any = settings.get(key)
+    finite = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not finite or value < 0 or (positive and value == 0):
+        raise ModelError(key, value, f"must be a number {'above 0' if positive else 'of 0 or more'}")
+    return float(value)
+
+
+@contextmanager
+def within(section: str) -> Iterator[None]:
+    """Report the keys of what goes wrong inside as keys of a section of the settings."""
+    try:
+        yield
+    except ModelError as error:
+        raise ModelError(f"{section}.{error.key}", error.found, error.rule) from None
+
+
+def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
+    """The asked columns of a CSV file with a header, as float64 (rows, columns); other columns are ignored.
+
+    raises  ModelError with file, line, cell and rule of the first mistake
+    """
+    return _checked(path, columns, _csv(path, columns))
+
+
+def read_map(path: Path) -> NDArray[np.float64]:
+    """A bandwidth map as rows of lon, lat (degrees, WGS-84) and kbit/s: CSV, or the matrix in OpenCV's YAML.
+
+    raises  ModelError with file, line, cell and rule of the first mistake
+    """
+    columns = (LON, LAT, RATE)
+    text = _matrix(path) if path.suffix.lower() in {".yaml", ".yml"} else _csv(path, columns)
+    return _checked(path, columns, text)
+
+
+def header(path: Path) -> list[str]:
+    """Column names in the first line of a CSV file, in lower case."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        return [name.strip(' \t\r\n"').lower() for name in file.readline().split(",")]
+
+
+def _csv(path: Path, columns: Sequence[Column]) -> _Text:
+    found = header(path)
+    names = [next((name for name in column.names if name in found), "") for column in columns]
+    if "" in names:
+        wanted = ", ".join(" or ".join(column.names) for column in columns)
+        raise ModelError("file", f"{path}:1: {','.join(found)[:80]!r}", f"must be a header with the columns {wanted}")
+    index = [found.index(name) for name in names]
+
+    def rows() -> Iterator[tuple[int, Sequence[str]]]:
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            reader = csv.reader(file)
+            next(reader)
+            for row in filter(None, reader):
+                yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in index]
+
+    with path.open(encoding="utf-8-sig", errors="replace") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an empty table, which `_checked` refuses
+        try:
+            values = np.loadtxt(file, delimiter=",", skiprows=1, usecols=index, comments=None, quotechar='"', ndmin=2)
+        except ValueError:
+            return _Text(None, names, rows())
+    return _Text(values, names, rows())
+
+
+def _matrix(path: Path) -> _Text:
+    """The matrix of rows x 3 numbers (lon, lat, kbit/s) in which the paper's own implementation keeps its map.
+
+    OpenCV's `%YAML:1.0` is no YAML that a YAML parser reads, so rows, cols and data are looked up in the text.
+    """
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    data = re.search(r"\bdata:\s*\[([^\]]*)\]", text)
+    if not data:
+        raise ModelError("file", path, "must hold a matrix: rows, cols: 3 and data: [lon, lat, kbps, ...]")
+    cells = data[1].replace(",", " ").split()
+    size = [int(found[1]) if (found := re.search(rf"\b{key}:\s*(\d+)", text)) else 0 for key in ("rows", "cols")]
+    if size[1] != 3 or size[0] * 3 != len(cells):
+        sizes = f"{path}: rows {size[0]}, cols {size[1]}, {len(cells)} numbers in data"
+        raise ModelError("file", sizes, "must have 3 cols (lon, lat, kbps) and rows x cols numbers")
+
+    def rows() -> Iterator[tuple[int, Sequence[str]]]:
+        first = text.count("\n", 0, data.start(1)) + 1
+        lines = enumerate(data[1].replace(",", " ").split("\n"), first)
+        numbers = ((line, cell) for line, cells in lines for cell in cells.split())
+        for (line, lon), (_, lat), (_, rate) in zip(numbers, numbers, numbers, strict=True):
+            yield line, (lon, lat, rate)
+
+    try:
+        values = np.array(cells, dtype=np.float64).reshape(-1, 3)
+    except ValueError:
+        return _Text(None, ("lon", "lat", "kbps"), rows())
+    return _Text(values, ("lon", "lat", "kbps"), rows())
+
+
+def _checked(path: Path, columns: Sequence[Column], text: _Text) -> NDArray[np.float64]:
+    """The values of a table, each within the range of its column; raises ModelError for the first that is not.
+
+    Recorders write a row twice now and then: of rows with the same time the last one counts.
+    """
+    values = text.values
+    if values is None:
+        raise _not_a_number(path, text)
+    if not len(values):
+        raise ModelError("file", path, "must have rows, there is none")
+    good = (values >= [column.least for column in columns]) & (values <= [column.most for column in columns])
+    times = [j for j, column in enumerate(columns) if column.time]
+    for j in times:
+        good[1:, j] &= np.diff(values[:, j]) >= 0
+    if not good.all():
+        i, j = (int(k) for k in np.argwhere(~good)[0])
+        line, cells = next(islice(text.rows, i, None))
+        raise ModelError("file", f"{path}:{line}: {text.names[j]} {cells[j]}", columns[j].rule)
+    for j in times:
+        values = values[np.append(np.diff(values[:, j]) > 0, True)]
+    return values
+
+
+def _not_a_number(path: Path, text: _Text) -> ModelError:
+    for line, cells in text.rows:
+        for name, cell in zip(text.names, cells, strict=True):
+            try:
+                float(cell)
+            except ValueError:
+                return ModelError("file", f"{path}:{line}: {name} {cell!r}", "must be a number")
+    return ModelError("file", path, "must hold plain decimal numbers only")

@@ -1,0 +1,99 @@
+"""Positions for a drive without a GPS: along the points of a bandwidth map, or along a recorded track."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runner.bandwidth_map import Floats, offset
+from runner.events import PositionReported
+from runner.model import ModelError
+from runner.pqos import SLOWEST_MPS
+from runner.route import route
+from runner.table import LAT, LON, SPEED, TIME, find_file, header, number, read_map, read_table, within
+
+
+class Track:
+    """Position, speed and heading over time.
+
+    times     s, rising; the first one is the start of the drive
+    lat, lon  degrees, between the rows on a straight line
+    speed     m/s per row; None: the one that the movement has
+    loop      start again at the end, else stay there
+    """
+
+    def __init__(self, times: Floats, lat: Floats, lon: Floats, speed: Floats | None, loop: bool) -> None:
+        self._times, self._lat, self._lon, self._speed, self._loop = times - times[0], lat, lon, speed, loop
+        moves = [offset(*move) for move in zip(lat[:-1], lon[:-1], lat[1:], lon[1:], strict=True)]
+        seconds = np.diff(times)
+        self._pace = np.array([math.hypot(*move) for move in moves]) / seconds
+        self._heading: list[float | None] = []
+        last: float | None = None
+        for (east, north), pace in zip(moves, self._pace, strict=True):
+            last = math.degrees(math.atan2(east, north)) % 360 if pace >= SLOWEST_MPS else last
+            self._heading.append(last)
+
+    @property
+    def duration_s(self) -> float:
+        return float(self._times[-1])
+
+    def at(self, t: float) -> PositionReported:
+        """Where the vehicle is `t` seconds after the start; while it stands, the last heading holds."""
+        now = t % self.duration_s if self._loop else min(max(t, 0.0), self.duration_s)
+        row = min(int(np.searchsorted(self._times, now, "right")) - 1, len(self._pace) - 1)
+        ended = not self._loop and t > self.duration_s
+        speed = self._pace[row] if self._speed is None else np.interp(now, self._times, self._speed)
+        return PositionReported(
+            t=t,
+            lat=float(np.interp(now, self._times, self._lat)),
+            lon=float(np.interp(now, self._times, self._lon)),
+            speed_mps=0.0 if ended else float(speed),
+            heading_deg=self._heading[row],
+        )
+
+
+def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | None:
+    """The drive that `position` in the `pqos` section describes; None: positions come as events.
+
+    settings  the composed section; bases: directories in which a relative file is looked up
+    raises    ModelError with the key, what was found and what is right
+    """
+    position = settings.get("position") or {"kind": "live"}
+    loop = bool(position.get("loop"))
+    match kind := position.get("kind"):
+        case "route":
+            if settings.get("kind") != "map":
+                raise ModelError("position.kind", kind, "needs kind: map, whose points it drives through")
+            with within("position"):
+                speed = number(position, "speed_mps", positive=True)
+            return drive(read_map(find_file(settings, "file", bases)), speed, loop)
+        case "track":
+            with within("position"):
+                return recorded(find_file(position, "file", bases), loop)
+        case "live":
+            return None
+    raise ModelError("position.kind", kind, "must be route, track or live")
+
+
+def recorded(path: Path, loop: bool) -> Track:
+    """A recorded drive: CSV with t_s (never falling), lat, lon (degrees) and, where it was measured, speed_mps."""
+    columns = (TIME, LAT, LON, SPEED) if SPEED.names[0] in header(path) else (TIME, LAT, LON)
+    times, lat, lon, *speed = read_table(path, columns).T
+    if len(times) < 2:
+        raise ModelError("file", path, "must have two rows or more")
+    return Track(times, lat, lon, speed[0] if speed else None, loop)
+
+
+def drive(points: Floats, speed_mps: float, loop: bool) -> Track:
+    """A drive at one speed through the points (lon, lat in degrees, ...) of a map, in the order of `route`."""
+    lon, lat = points[route(points), :2].T
+    if loop and (lon[0], lat[0]) != (lon[-1], lat[-1]):  # a road that does not close is driven there and back
+        lon, lat = np.append(lon, lon[-2::-1]), np.append(lat, lat[-2::-1])
+    hops = np.array([math.hypot(*offset(*hop)) for hop in zip(lat[:-1], lon[:-1], lat[1:], lon[1:], strict=True)])
+    moved = np.append(True, hops > 0)  # time must rise from row to row
+    times = np.append(0.0, np.cumsum(hops))[moved] / speed_mps
+    return Track(times, lat[moved], lon[moved], None, loop)
