@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from runner.bandwidth_map import EARTH_M
 from runner.events import PositionReported
 from runner.pqos import build_pqos
+from runner.pqos.bandwidth_map import EARTH_M
 
 LAT, LON = 48.0, 11.0
 SETTINGS = {"kind": "map", "radius_m": 15, "look_ahead_s": 5, "off_map_kbps": 1000}

@@ -6,38 +6,21 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import yaml
 
 from runner import schema
+from runner.errors import ConfigError, Problem
 from runner.model import suggest
+from runner.resources import directory
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos")
 COMMAND_LINE = "command line"
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """One mistake of the user: where, what was found, which rule it breaks."""
-
-    file: str
-    path: str
-    found: str | None
-    rule: str
-
-    def __str__(self) -> str:
-        return ": ".join(part for part in (self.file, self.path, self.found, self.rule) if part)
-
-
-class ConfigError(Exception):
-    """What the user wrote is wrong; all problems at once."""
-
-    def __init__(self, problems: Sequence[Problem]) -> None:
-        self.problems = list(dict.fromkeys(problems))
-        super().__init__("\n".join(map(str, self.problems)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +62,7 @@ class Composed:
 
 def conf_directories(user: Path | None) -> list[Path]:
     """Where configuration files are looked up, the user's directory first."""
-    packaged = Path(str(files("runner.conf")))
+    packaged = directory("conf")
     return [user, packaged] if user else [packaged]
 
 
@@ -94,10 +77,10 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     problems = [p for override in parsed for p in _choice_problems(override, directories)]
     if problems:
         raise ConfigError(problems)
-    document, choices = _compose(parsed, directories)
+    config, choices = _compose(parsed, directories)
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
     parts += reversed(list(_file_parts(directories, choices)))
-    return Composed(document, parts)
+    return _resolved(config, parts)
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
@@ -162,36 +145,43 @@ def _nested(key: str, value: Any) -> Any:
 # --- Hydra ------------------------------------------------------------------------------------------------------------
 
 
-def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[dict[str, Any], dict[str, str]]:
+def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[DictConfig, dict[str, str]]:
+    """What Hydra composes, and by group the file that was chosen."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
-    from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    _read_no_environment()
     _search(directories)
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(directories[-1]), version_base="1.3"):
             config = hydra_compose("config", [o.hydra for o in overrides], return_hydra_config=True)
-            choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
-            del_hydra = {key: config._get_node(key) for key in config if key != "hydra"}
-            document = OmegaConf.to_container(DictConfig(del_hydra), resolve=True)
-    except yaml.MarkedYAMLError as error:
-        raise ConfigError([yaml_problem(error, _first_bad_file(directories))]) from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(_unreadable_files(directories) or [Problem("conf", "", None, str(error))]) from None
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None
-    assert isinstance(document, dict)
-    return {str(key): value for key, value in document.items()}, choices
+    choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
+    return config, choices
 
 
-def _read_no_environment() -> None:
-    """OmegaConf's own resolver for environment variables is no part of this language: a file says what it says."""
-    from omegaconf import OmegaConf
+def _resolved(config: DictConfig, parts: list[Part]) -> Composed:
+    """The composed tree as plain data, interpolations resolved."""
+    from omegaconf import OmegaConf, open_dict
+    from omegaconf.errors import OmegaConfBaseException
 
+    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
     OmegaConf.clear_resolver("oc.env")
+    with open_dict(config):
+        del config["hydra"]
+    try:
+        document = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        origin = Composed({}, parts)
+        path = tuple(int(p) if p.isdigit() else p for p in re.split(r"[.\[\]]+", str(error.full_key or "")) if p)
+        raise ConfigError([origin.problem(path, None, str(error).splitlines()[0])]) from None
+    return Composed(cast("dict[str, Any]", document), parts)
 
 
 def _search(directories: Sequence[Path]) -> None:
@@ -202,8 +192,8 @@ def _search(directories: Sequence[Path]) -> None:
 
     class UserDirectory(SearchPathPlugin):
         def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-            for directory in reversed(_USER_DIRECTORIES):
-                search_path.prepend("tod-runner", f"file://{directory}")
+            for user in reversed(_USER_DIRECTORIES):
+                search_path.prepend("tod-runner", f"file://{user}")
 
     if not _USER_DIRECTORIES and len(directories) == 1:
         return
@@ -253,7 +243,7 @@ def load_file(path: Path) -> Any:
 
 def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
     """The first file of that name; where there is none, the place where it would be."""
-    candidates = [directory / group / f"{name}.yaml" for directory in directories]
+    candidates = [d / group / f"{name}.yaml" for d in directories]
     return next((path for path in candidates if path.exists()), candidates[0])
 
 
@@ -263,7 +253,7 @@ def label(path: Path, directories: Sequence[Path]) -> str:
     return f"conf/{path.relative_to(packaged)}" if path.is_relative_to(packaged) else str(path)
 
 
-def yaml_problem(error: yaml.YAMLError, path: str) -> Problem:
+def yaml_problem(error: Exception, path: str) -> Problem:
     """A file that is no YAML."""
     mark = getattr(error, "problem_mark", None)
     what = getattr(error, "problem", None) or str(error)
@@ -271,14 +261,14 @@ def yaml_problem(error: yaml.YAMLError, path: str) -> Problem:
     return Problem(path, line, None, " ".join(str(what).split()))
 
 
-def _first_bad_file(directories: Sequence[Path]) -> str:
-    for directory in directories:
-        for path in sorted(directory.rglob("*.yaml")):
-            try:
-                load_file(path)
-            except yaml.YAMLError:
-                return label(path, directories)
-    return "conf"
+def _unreadable_files(directories: Sequence[Path]) -> list[Problem]:
+    problems = []
+    for path in (path for d in directories for path in sorted(d.rglob("*.yaml"))):
+        try:
+            load_file(path)
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            problems.append(yaml_problem(error, label(path, directories)))
+    return problems
 
 
 def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterator[Part]:
@@ -305,8 +295,10 @@ def _with_bases(path: Path, group: str, package: schema.Path, directories: Seque
 
 def _holds(content: Any, path: schema.Path) -> bool:
     for part in path:
+        # An override names the first entry of a list as a.0, a file has a list there.
+        key = str(part) if isinstance(content, dict) else part
         try:
-            content = content[part]
+            content = content[key]
         except (KeyError, IndexError, TypeError):
             return False
     return True

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import rules, schema
-from runner.compose import Composed, ConfigError, Problem, compose
+from runner.commands import KnobValue
+from runner.compose import Composed, compose, conf_directories
+from runner.errors import ConfigError, Problem
+from runner.graph import Plan, assignments, compile_graph
 from runner.model import (
     Camera,
     Element,
@@ -27,32 +30,58 @@ from runner.model import (
     exact,
 )
 
+if TYPE_CHECKING:
+    from runner.pqos import Pqos
+    from runner.pqos.track import Track
+
+SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
 GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "wire", "knobs")
 
 T = TypeVar("T")
 
 
-def load(overrides: Sequence[str] = (), user: Path | None = None) -> Vehicle:
+Check = Callable[[Plan], Iterable[ModelError]]
+
+
+def load(
+    overrides: Sequence[str] = (),
+    user: Path | None = None,
+    *,
+    runnable: bool = True,
+    check: Check | None = None,
+) -> Vehicle:
     """The vehicle that the configuration describes.
 
     overrides  Hydra overrides, as on the command line
     user       directory whose files shadow the packaged ones and may add any
+    runnable   check also what only a run needs: that clips, devices and addresses are named and files are there
+    check      what else may be wrong with a compiled plan: the GStreamer registry's view
     raises     ConfigError with all problems
     """
-    return build(compose(overrides, user))
+    builder = _Builder(compose(overrides, user), runnable, check)
+    return builder.finished(builder.vehicle())
 
 
-def build(composed: Composed) -> Vehicle:
-    """Check a composed configuration and build the vehicle from it.
+def load_run(
+    overrides: Sequence[str], user: Path | None, *, runnable: bool = True, check: Check | None = None
+) -> tuple[Vehicle, Pqos, Track | None]:
+    """The vehicle, its source of predictions, and the drive that gives positions where no GPS does.
 
-    raises  ConfigError with all problems
+    raises  ConfigError with all problems, also those of maps and traces
     """
-    builder = _Builder(composed)
+    from runner.pqos import build_pqos
+    from runner.pqos.track import build_track
+
+    builder = _Builder(compose(overrides, user), runnable, check)
     vehicle = builder.vehicle()
-    if vehicle is None or builder.problems:
+    if not builder.fine("pqos"):
         raise ConfigError(builder.problems)
-    return vehicle
+    settings, bases = builder.composed.document["pqos"], [*conf_directories(user), Path.cwd()]
+    pqos = builder.attempt(("pqos",), lambda: build_pqos(settings, bases))
+    # A map that cannot be read is told once, though the drive goes through its points.
+    track = builder.attempt(("pqos",), lambda: build_track(settings, bases)) if pqos else None
+    return builder.finished(vehicle), builder.finished(pqos), track
 
 
 @dataclass
@@ -63,20 +92,29 @@ class _Builder:
     """
 
     composed: Composed
+    runnable: bool
+    check: Check | None
     problems: list[Problem] = field(default_factory=list)
+    bad: set[schema.Path] = field(default_factory=set)
 
     def vehicle(self) -> Vehicle | None:
         document = self.composed.document
         wrong = schema.findings(document, "composed")
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
-        self._bad = {f.path for f in wrong}
-        modes = {mode: self._rule_list(mode) for mode in Mode} if self._fine("modes") else {}
-        cameras = {name: self._camera(name) for name in document.get("cameras") or {} if self._fine("cameras", name)}
-        if self.problems:
+        self.bad = {f.path for f in wrong}
+        modes = {mode: self._rule_list(mode) for mode in Mode} if self.fine("modes") else {}
+        cameras = {name: self._camera(name) for name in document.get("cameras") or {} if self.fine("cameras", name)}
+        if not (self.fine("media") and self.fine("control")):
             return None
         media, control = (Endpoint(**document[key]) for key in ("media", "control"))
         built = {name: camera for name, camera in cameras.items() if camera}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port})
+        for index, camera in enumerate(built.values()):
+            self._check_compiles(camera, media, index)
+            if self.runnable:
+                self._check_inputs(camera)
+        if self.problems:
+            return None
         return Vehicle(
             name=document["name"],
             cameras=built,
@@ -87,13 +125,19 @@ class _Builder:
             pqos=document["pqos"],
         )
 
+    def finished(self, built: T | None) -> T:
+        """What was built, if nothing was wrong."""
+        if built is None or self.problems:
+            raise ConfigError(self.problems)
+        return built
+
     # --- problems -----------------------------------------------------------------------------------------------------
 
-    def _fine(self, *path: str) -> bool:
+    def fine(self, *path: str) -> bool:
         """Whether the schema found nothing wrong at or below a path."""
-        return not any(bad[: len(path)] == path for bad in self._bad)
+        return not any(bad[: len(path)] == path for bad in self.bad)
 
-    def _try(self, path: schema.Path, make: Callable[[], T]) -> T | None:
+    def attempt(self, path: schema.Path, make: Callable[[], T]) -> T | None:
         try:
             return make()
         except ModelError as error:
@@ -111,7 +155,7 @@ class _Builder:
         calls = []
         for index, entry in enumerate(self.composed.document["modes"][mode]):
             ((name, parameters),) = entry.items()
-            call = self._try(("modes", mode.value, index), lambda n=name, p=parameters: rules.call_rule(n, p))  # type: ignore[misc]
+            call = self.attempt(("modes", mode.value, index), lambda n=name, p=parameters: rules.call_rule(n, p))  # type: ignore[misc]
             calls.append(call)
         known = tuple(call for call in calls if call)
         if len(known) == len(calls):
@@ -124,17 +168,17 @@ class _Builder:
         data, path = document["cameras"][name], ("cameras", name)
         own_graph, own_source = "graph" in data, "source" in data
         graph_path = (*path, "graph") if own_graph else ("graph",)
-        if not (self._fine(*graph_path) and self._fine("source")):
+        if not (self.fine(*graph_path) and self.fine("source")):
             return None
-        graph = self._try(graph_path, lambda: _graph(data["graph"] if own_graph else document["graph"]))
-        model = self._try((*path, "rate_quality"), lambda: _rate_quality(data["rate_quality"]))
+        graph = self.attempt(graph_path, lambda: _graph(data["graph"] if own_graph else document["graph"]))
+        model = self.attempt((*path, "rate_quality"), lambda: _rate_quality(data["rate_quality"]))
         source = _source(data["source"] if own_source else document["source"])
         if graph is None or model is None:
             return None
         fps, limit = exact(data["fps"]), document["fps_max"]
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        return self._try(
+        return self.attempt(
             path,
             lambda: Camera(
                 name=name,
@@ -154,6 +198,36 @@ class _Builder:
                 lens=data.get("lens", "pinhole"),
             ),
         )
+
+    def _check_inputs(self, camera: Camera) -> None:
+        """Whether the clip, device or address that a camera's source asks for is named, and a clip is there."""
+        source = camera.source
+        for key in () if source.render else sorted(source.needs.intersection(MOUNT_KEYS)):
+            where = ("cameras", camera.name) if key in camera.mount else self._of(camera, "source")
+            given = camera.mount.get(key, source.settings.get(key))
+            if given is None:
+                self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
+            elif key == "clip" and not Path(str(given)).is_file():
+                self._report(where, ModelError(key, repr(given), "no such file"))
+
+    def _check_compiles(self, camera: Camera, media: Endpoint, index: int) -> None:
+        """Whether everything that source and graph refer to is there."""
+        anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
+        try:
+            plan = compile_graph(replace(camera, mount=anything), media, index)
+            for knob, value in SAMPLE_KNOBS.items():
+                assignments(camera, knob, value)
+            errors = list(self.check(plan)) if self.check else []
+        except ModelError as broken:
+            errors = [broken]
+        for error in errors:
+            section, _, key = error.key.partition(".")
+            self._report(self._of(camera, section), ModelError(key, error.found, error.rule))
+
+    def _of(self, camera: Camera, section: str) -> schema.Path:
+        """Where a camera's graph or source stands: its own one, else the one of all."""
+        own = section in self.composed.document["cameras"][camera.name]
+        return ("cameras", camera.name, section) if own else (section,)
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
         """No two listeners on one port. Cameras count on from the first port of their graph."""

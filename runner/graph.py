@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from runner.commands import KnobValue
-from runner.model import Camera, Element, Endpoint, ModelError, Roi, Value, suggest
+from runner.model import PLACEHOLDER, Camera, Element, Endpoint, ModelError, Roi, Value, suggest
 
-PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 Assignment = tuple[str, str, Value]  # element, property, value
 
@@ -20,25 +19,24 @@ Assignment = tuple[str, str, Value]  # element, property, value
 class Plan:
     """One camera compiled: nothing left to look up, nothing started.
 
-    source    elements that make raw frames
-    printed   the same for `print`: a stand-in where gst-launch cannot make them
-    vehicle   elements after the source
-    operator  elements of the operator's side
-    wire_*    what `print` adds in place of RTSP server and client
+    source     elements that make raw frames; a stand-in as long as their clip is not rendered
+    loops      whether the source is a clip that starts again at its end
+    printed    what `print` shows of the source: the stand-in for frames that are born in Python
+    stands_in  whether that is a stand-in
+    vehicle    elements after the source
+    operator   elements of the operator's side
+    wire_*     what `print` adds in place of RTSP server and client
     """
 
     camera: Camera
     source: tuple[Element, ...]
+    loops: bool
     printed: tuple[Element, ...]
+    stands_in: bool
     vehicle: tuple[Element, ...]
     operator: tuple[Element, ...]
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
-
-    @property
-    def stands_in(self) -> bool:
-        """Whether `print` shows other frames than those that a run sends."""
-        return self.printed != self.source
 
     @property
     def serves(self) -> bool:
@@ -85,13 +83,16 @@ def compile_graph(camera: Camera, media: Endpoint, index: int = 0, clip: str | N
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
         return tuple(_filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
 
-    unrendered = bool(source.render) and clip is None
     stand_in = fill(source.stand_in, "source.stand_in")
+    unrendered = bool(source.render) and clip is None
     frames = stand_in if unrendered else fill(source.elements, "source.elements")
+    stands_in = bool(stand_in) and clip is None
     return Plan(
         camera=camera,
         source=frames,
-        printed=stand_in if stand_in and not source.render else frames,
+        loops=source.loop and not unrendered,
+        printed=stand_in if stands_in else frames,
+        stands_in=stands_in,
         vehicle=fill(graph.vehicle, "graph.vehicle"),
         operator=fill(graph.operator, "graph.operator"),
         wire_vehicle=fill(graph.wire_vehicle, "graph.wire.vehicle"),
@@ -185,7 +186,7 @@ def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
     whole = PLACEHOLDER.fullmatch(value)
     if whole:
         return values[whole[1]]  # keeps its type
-    return PLACEHOLDER.sub(lambda match: _text(values[match[1]]), value)
+    return PLACEHOLDER.sub(lambda match: text(values[match[1]]), value)
 
 
 def _set(elements: Iterable[Element], turned: Iterable[Assignment]) -> tuple[Element, ...]:
@@ -196,11 +197,12 @@ def _set(elements: Iterable[Element], turned: Iterable[Assignment]) -> tuple[Ele
 
 
 def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:
-    pairs = (f"{key}={quote(_text(value))}" for key, value in element.properties.items())
+    pairs = (f"{key}={quote(text(value))}" for key, value in element.properties.items())
     return [element.factory, f"name={element.name}", *pairs]
 
 
-def _text(value: Value) -> str:
+def text(value: Value) -> str:
+    """A property's value as GStreamer reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -210,8 +212,8 @@ def _text(value: Value) -> str:
     return str(value)
 
 
-def _quoted(text: str) -> str:
-    if _PLAIN_VALUE.fullmatch(text):
-        return text
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+def _quoted(value: str) -> str:
+    if _PLAIN_VALUE.fullmatch(value):
+        return value
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'

@@ -5,6 +5,7 @@ Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), siz
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 Kbps = Fraction
 Value = bool | int | float | str  # what an element's property may hold in YAML
 
+PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
 
 
@@ -49,7 +51,8 @@ def suggest(word: str, known: Iterable[str]) -> str:
     """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
     known = list(known)
     near = get_close_matches(word, known, 1)
-    return f"did you mean {near[0]}?" if near else f"there is {', '.join(known)}"
+    shown = [*known[:12], "..."] if len(known) > 12 else known
+    return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
 
 
 class Mode(StrEnum):
@@ -180,6 +183,12 @@ class Source:
     render: str = ""
     render_s: float = 0
     stand_in: tuple[Element, ...] = ()
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Names of the placeholders in its elements."""
+        values = (value for element in self.elements for value in element.properties.values())
+        return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,14 +6,13 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from runner.model import suggest
+from runner.resources import directory
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
-    from jsonschema.exceptions import ValidationError
 
 Path = tuple[str | int, ...]
 
@@ -105,12 +104,12 @@ def event_names() -> tuple[str, ...]:
 
 
 def schema_names() -> list[str]:
-    return sorted(p.name.removesuffix(".schema.json") for p in files("runner.schemas").iterdir() if "json" in p.name)
+    return sorted(path.name.removesuffix(".schema.json") for path in directory("schemas").glob("*.schema.json"))
 
 
 @cache
 def schema_document(name: str) -> Mapping[str, Any]:
-    text = files("runner.schemas").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    text = directory("schemas").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
     document: Mapping[str, Any] = json.loads(text)
     return document
 
@@ -124,11 +123,12 @@ def _registry() -> Any:
     return Registry().with_resources(resources)
 
 
-def _explain(error: ValidationError) -> Iterator[Finding]:
-    path, value, limit = tuple(error.absolute_path), error.instance, error.validator_value
+def _explain(error: Any) -> Iterator[Finding]:
+    path, value = tuple(error.absolute_path), error.instance
+    limit, parent = error.validator_value, error.schema
     match error.validator:
         case "additionalProperties":
-            known = error.schema.get("properties", {})
+            known = parent.get("properties", {})
             for key in value:
                 if key not in known:
                     yield Finding((*path, key), None, f"unknown key, {suggest(str(key), known)}")
@@ -139,7 +139,7 @@ def _explain(error: ValidationError) -> Iterator[Finding]:
         case "propertyNames" | "not" | "if":
             yield Finding(path, shown(value), error.message)
         case _:
-            yield Finding(path, shown(value), _rule(str(error.validator), limit, value, error.schema))
+            yield Finding(path, shown(value), _rule(str(error.validator), limit, value, parent))
 
 
 def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> str:  # noqa: PLR0911

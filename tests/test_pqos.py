@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from shared_data import ROOT, shared
 
-from runner.bandwidth_map import EARTH_M, BandwidthMap, Way, offset
 from runner.events import BitratePredicted, ClockAdvanced, OperatorConnected, PositionReported
 from runner.model import ModelError
 from runner.pqos import MapPqos, Pqos, build_pqos
+from runner.pqos.bandwidth_map import EARTH_M, BandwidthMap, Way, offset
 
 CONF = ROOT / "conf"
 SCHEMA = json.loads((ROOT / "schemas" / "pqos.schema.json").read_text())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runner.model import ModelError
-from runner.table import LAT, LON, RATE, TIME, find_file, number, read_map, read_table, within
+from runner.pqos.table import LAT, LON, RATE, TIME, find_file, number, read_map, read_table, within
 
 MATRIX = (
     "%YAML:1.0\n---\nbandwidth_map: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n"

@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared_data import ROOT, shared
 
-from runner.bandwidth_map import EARTH_M, offset
 from runner.events import PositionReported
 from runner.model import ModelError
 from runner.pqos import build_pqos
-from runner.route import route
-from runner.table import read_map
-from runner.track import Track, build_track, drive
+from runner.pqos.bandwidth_map import EARTH_M, offset
+from runner.pqos.route import route
+from runner.pqos.table import read_map
+from runner.pqos.track import Track, build_track, drive
 
 CONF = ROOT / "conf"
 ROUTE = {"kind": "route", "speed_mps": 8, "loop": True}

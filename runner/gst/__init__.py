@@ -1,0 +1,12 @@
+"""Everything that touches GStreamer, behind the one door `runner/apply.py`."""
+
+import gi
+
+for _name in ("Gst", "GstRtp", "GstRtsp", "GstRtspServer"):
+    gi.require_version(_name, "1.0")
+
+from gi.repository import GLib, Gst  # noqa: E402
+
+__all__ = ["GLib", "Gst"]
+
+Gst.init(None)

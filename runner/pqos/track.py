@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from runner.bandwidth_map import Floats, offset
 from runner.events import PositionReported
 from runner.model import ModelError
 from runner.pqos import SLOWEST_MPS
-from runner.route import route
-from runner.table import LAT, LON, SPEED, TIME, find_file, header, number, read_map, read_table, within
+from runner.pqos.bandwidth_map import Floats, offset
+from runner.pqos.route import route
+from runner.pqos.table import LAT, LON, SPEED, TIME, find_file, header, number, read_map, read_table, within
 
 
 class Track:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.bandwidth_map import EARTH_M, Floats, Ints
 from runner.model import ModelError
+from runner.pqos.bandwidth_map import EARTH_M, Floats, Ints
 
 THIN_M = 4.0  # points closer than this make a route shake
 POINTS = 3000  # a map of more is thinned further before it is ordered, so that ordering stays below 1 s

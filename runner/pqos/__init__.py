@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from runner.bandwidth_map import BandwidthMap, Way, offset
 from runner.events import BitratePredicted, Event, PositionReported
 from runner.model import Kbps, ModelError, exact, plain
-from runner.table import RATE, TIME, find_file, number, read_map, read_table
+from runner.pqos.bandwidth_map import BandwidthMap, Way, offset
+from runner.pqos.table import RATE, TIME, find_file, number, read_map, read_table
 
 SLOWEST_MPS = 1.0  # below this speed the direction of movement is mostly GPS noise
 BASELINE_S = 0.5  # movement is taken over at least this long, else a 20 Hz GPS gives noise again

@@ -1,0 +1,75 @@
+"""Command line: `tod-runner VERB [NAME=VALUE ...]`, a verb, then Hydra overrides and verb arguments."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from runner.errors import RunError, UserError
+from runner.verbs import VERBS, Arguments
+
+USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
+
+{verbs}
+
+An OVERRIDE is Hydra's: vehicle=delivery_robot, modes=paper, cameras.front_left.weight=2.
+conf=DIR (or the environment variable TOD_CONF) names a directory of your own; its files shadow the packaged ones.
+
+  tod-runner demo                                    drive the paper's vehicle on this machine
+  tod-runner print total_kbps=3000                   what would run, and why
+  tod-runner validate conf=my_vehicles               check your YAML, for example in CI
+  tod-runner VERB --help                             one verb, with examples"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C
+    """
+    try:
+        return _run(list(sys.argv[1:] if argv is None else argv))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except RunError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # Who read our output has gone; the interpreter would complain again when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(USAGE.format(verbs="\n".join(f"  {name:10}{verb.summary}" for name, verb in VERBS.items())))
+        return 0 if words else 2
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"tod-runner {version('tod-runner')}")
+        return 0
+    name, *rest = words
+    if name not in VERBS:
+        from runner.model import suggest
+
+        raise UserError("command line", "", name, f"unknown verb, {suggest(name, VERBS)}")
+    verb = VERBS[name]
+    module = import_module(verb.module)
+    if any(word in ("-h", "--help") for word in rest):
+        print((module.__doc__ or "").strip())
+        return 0
+    arguments = Arguments.parse(name, rest)
+    if arguments.conf is not None and not arguments.conf.is_dir():
+        raise UserError("command line", "conf", str(arguments.conf), "no such directory")
+    status: int = module.run(arguments)
+    sys.stdout.flush()
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

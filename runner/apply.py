@@ -1,0 +1,190 @@
+"""The one door to GStreamer: build what was planned, carry out commands, say what is applied.
+
+Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere else.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from runner.commands import Command, KnobValue
+from runner.errors import RunError
+from runner.graph import Plan, launch
+from runner.gst import GLib, Gst
+from runner.gst.pipeline import CameraPipeline
+from runner.gst.receiver import Received, Receiver
+from runner.gst.registry import check_plan, missing_plugins
+from runner.gst.server import CameraServer
+from runner.gst.supervised import CameraCaller
+from runner.model import Endpoint
+
+__all__ = ["OperatorSide", "Received", "VehicleSide", "check_machine", "check_plan", "missing_plugins"]
+
+Report = Callable[[str, str], None]  # camera, what happened to it
+
+
+def check_machine(plans: Sequence[Plan]) -> None:
+    """Whether every plugin is installed and every source opens: files, devices.
+
+    raises  RunError that says what to do, for all cameras at once
+    """
+    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
+    if missing:
+        raise RunError("\n".join(missing))
+    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _opening_fails(plan))]
+    if refused:
+        raise RunError("\n".join(refused))
+
+
+def _opening_fails(plan: Plan) -> str:
+    """What GStreamer says when the source is opened, or "". Devices are opened on the way to READY."""
+    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
+    try:
+        if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
+            return ""
+        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
+        return str(message.parse_error()[0].message) if message else "its source does not start"
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+class _Glib:
+    """GLib's main loop in a thread of its own: the RTSP server and the buses live there."""
+
+    def __init__(self) -> None:
+        self._loop = GLib.MainLoop()
+        self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
+        self._thread.start()
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Run a function in the loop's thread and wait for it; what it raises is raised here."""
+        done = threading.Event()
+        raised: list[BaseException] = []
+
+        def once() -> bool:
+            try:
+                function()
+            except BaseException as error:
+                raised.append(error)
+            done.set()
+            return False
+
+        GLib.idle_add(once)
+        done.wait()
+        if raised:
+            raise raised[0]
+
+    def quit(self) -> None:
+        self._loop.quit()
+        self._thread.join(timeout=5)
+
+
+class VehicleSide:
+    """All cameras of the vehicle, streaming. Keeps where each knob is wanted, and writes it all again after a rebuild.
+
+    report  told, from another thread, when a camera's pipeline comes, goes or fails
+    raises  RunError where the port is in use
+    """
+
+    def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report) -> None:
+        self._lock = threading.Lock()
+        self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
+        self._glib = _Glib()
+        self._server: CameraServer | None = None
+        self._callers = {p.camera.name: CameraCaller(p, self._wanted_of, report) for p in plans if not p.serves}
+        served = [plan for plan in plans if plan.serves]
+
+        def start() -> None:
+            if served:
+                self._server = CameraServer(served, media, self._wanted_of, report)
+            for caller in self._callers.values():
+                caller.start()
+
+        self._glib.call(start)
+
+    def turn(self, commands: Iterable[Command]) -> None:
+        """Carry out commands: those of one camera between the same two of its frames. Returns at once."""
+        changed: dict[str, dict[str, KnobValue]] = {}
+        for command in commands:
+            changed.setdefault(command.camera, {})[command.knob] = command.value
+        for name, values in changed.items():
+            with self._lock:
+                self._wanted[name] |= values
+            pipeline = self._pipeline(name)
+            if pipeline:
+                pipeline.turn(self._wanted_of(name), values)
+
+    def applied(self) -> dict[str, Mapping[str, KnobValue]]:
+        """By camera and knob, what was read back from the elements; cameras without a pipeline have nothing."""
+        return {name: dict(p.knobs.applied) if (p := self._pipeline(name)) else {} for name in self._wanted}
+
+    def sent(self) -> dict[str, tuple[int, int]]:
+        """By camera, frames and bytes that its encoder has put out since its pipeline was built."""
+        return {name: p.counters() if (p := self._pipeline(name)) else (0, 0) for name in self._wanted}
+
+    def faults(self) -> list[str]:
+        """What elements refused since the last call; each is a defect or a wrong graph."""
+        told = []
+        for name in self._wanted:
+            pipeline = self._pipeline(name)
+            if pipeline:
+                told += pipeline.knobs.faults
+                pipeline.knobs.faults.clear()
+        return told
+
+    def stop(self) -> None:
+        def stop() -> None:
+            for caller in self._callers.values():
+                caller.stop()
+            if self._server:
+                self._server.stop()
+
+        self._glib.call(stop)
+        self._glib.quit()
+
+    def _wanted_of(self, name: str) -> Mapping[str, KnobValue]:
+        with self._lock:
+            return dict(self._wanted[name])
+
+    def _pipeline(self, name: str) -> CameraPipeline | None:
+        if name in self._callers:
+            return self._callers[name].pipeline
+        return self._server.pipelines.get(name) if self._server else None
+
+
+class OperatorSide:
+    """All cameras of the vehicle, received and decoded."""
+
+    def __init__(self, plans: Sequence[Plan], report: Report) -> None:
+        self._glib = _Glib()
+        self._receivers = {plan.camera.name: Receiver(plan, report) for plan in plans}
+
+        def start() -> None:
+            for receiver in self._receivers.values():
+                receiver.start()
+
+        self._glib.call(start)
+
+    def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
+        """What has come of each camera; to be called a few times a second.
+
+        sending  which cameras should send; one that should and is silent is built anew
+        """
+        samples: dict[str, Received] = {}
+
+        def sample() -> None:
+            for name, receiver in self._receivers.items():
+                receiver.should_send = sending.get(name, False)
+                samples[name] = receiver.sample()
+
+        self._glib.call(sample)
+        return samples
+
+    def stop(self) -> None:
+        def stop() -> None:
+            for receiver in self._receivers.values():
+                receiver.stop()
+
+        self._glib.call(stop)
+        self._glib.quit()

@@ -1,0 +1,107 @@
+"""Control link between operator and vehicle over MQTT: requests, replies, applied state, telemetry.
+
+Topics of a vehicle are tod/<vehicle>/request, reply, state and telemetry. A request is an event of
+schemas/event.schema.json with an `id` and without `t`, never retained; the vehicle stamps it on receipt and answers
+with the same id. The state is retained, so that who comes late knows what is applied. Last wills say that a side is
+gone: the vehicle's state says {"online": false}, the operator's request says operator_disconnected.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import paho.mqtt.client as mqtt
+
+from runner.errors import RunError
+from runner.model import Endpoint
+
+KEEPALIVE_S = 2  # the broker publishes a will after one and a half of these
+OFFLINE = {"online": False}
+OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
+MAX_MESSAGE_BYTES = 65_536  # the longest event is a hundredth of it
+
+Document = Mapping[str, Any]
+
+
+class Link:
+    """One side's connection to the broker; reconnects by itself. Callbacks come from the link's own thread.
+
+    will       topic (below tod/<vehicle>/), message and whether it is retained, published when this side is lost
+    listen     by topic, who takes its messages (bytes of JSON, not yet looked at)
+    connected  told True and False as the connection comes and goes
+    raises     RunError where nobody listens at the broker's address
+    """
+
+    def __init__(
+        self,
+        vehicle: str,
+        broker: Endpoint,
+        will: tuple[str, Document, bool],
+        listen: Mapping[str, Callable[[bytes], None]],
+        connected: Callable[[bool], None],
+    ) -> None:
+        self._prefix = f"tod/{vehicle}/"
+        self._listen = {self._prefix + topic: function for topic, function in listen.items()}
+        self._connected = connected
+        client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        topic, message, retain = will
+        client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=retain)
+        client.on_socket_open = _no_delay
+        client.on_connect = self._on_connect
+        client.on_disconnect = lambda *_: connected(False)
+        client.on_message = lambda _client, _data, message: self._listen[message.topic](message.payload)
+        client.reconnect_delay_set(min_delay=1, max_delay=2)
+        self._client = client
+        try:
+            client.connect(broker.host, broker.port, KEEPALIVE_S)
+        except OSError as error:
+            rule = "start a broker there (mosquitto), or choose control.host and control.port"
+            raise RunError(f"no MQTT broker at {broker.host}:{broker.port}: {error}; {rule}") from None
+        client.loop_start()
+
+    def publish(self, topic: str, message: Document, *, retain: bool = False) -> None:
+        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain)
+
+    def close(self, farewell: tuple[str, Document, bool]) -> None:
+        """Say goodbye as the will would have, and disconnect."""
+        topic, message, retain = farewell
+        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain).wait_for_publish(1)
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _on_connect(self, client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+        if code.is_failure:
+            return
+        for topic in self._listen:
+            client.subscribe(topic, qos=1)
+        self._connected(True)
+
+
+def _no_delay(_client: object, _data: object, sock: socket.socket) -> None:
+    """Without this, small messages wait 20 ms for company (Nagle's algorithm)."""
+    if isinstance(sock, socket.socket):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def read_request(payload: bytes) -> tuple[dict[str, Any], str, str]:
+    """A request as it came: the event without its id, the id ("" if there is none), and what is wrong ("" if nothing).
+
+    The event itself is checked when its time is known.
+    """
+    if len(payload) > MAX_MESSAGE_BYTES:
+        return {}, "", f"{len(payload)} bytes: must be at most {MAX_MESSAGE_BYTES}"
+    try:
+        document = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        return {}, "", f"not JSON: {error}"
+    if not isinstance(document, dict):
+        return {}, "", "must be a mapping with id and event"
+    identity = document.pop("id", None)
+    if not isinstance(identity, str) or not identity:
+        return document, "", "id: must be given, as text"
+    if "t" in document:
+        return document, identity, "t: must not be given, the vehicle stamps events on receipt"
+    return document, identity, ""

@@ -1,0 +1,43 @@
+"""What ends a run with one clear message instead of a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One mistake of the user: where, what was found, which rule it breaks.
+
+    found  None where the path says it already
+    """
+
+    file: str
+    path: str
+    found: str | None
+    rule: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (self.file, self.path, self.found, self.rule) if part)
+
+
+class UserError(Exception):
+    """The user's input is wrong: exit status 2."""
+
+    def __init__(self, file: str, path: str, found: str | None, rule: str) -> None:
+        super().__init__(str(Problem(file, path, found, rule)))
+
+
+class ConfigError(UserError):
+    """The configuration is wrong: all problems at once."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = list(dict.fromkeys(problems))
+        count = len(self.problems)
+        summary = f"{count} problem{'' if count == 1 else 's'}, nothing was started"
+        Exception.__init__(self, "\n".join([*map(str, self.problems), summary]))
+
+
+class RunError(Exception):
+    """A run failed on this machine: exit status 1. The text says what to do."""

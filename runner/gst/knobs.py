@@ -1,0 +1,74 @@
+"""Turn the knobs of a pipeline that plays: everything of one change between the same two frames."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from gi.repository import Gst
+
+from runner.commands import KnobValue
+from runner.graph import Assignment, assignments, text
+from runner.model import Camera
+
+
+class Knobs:
+    """The knobs of one camera's pipeline, built anew with the pipeline.
+
+    Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe in front of the first
+    element that changes then sets them all at once. Set one after the other while a frame passes, crop edges leave
+    moments without any picture, which ends the stream.
+    """
+
+    def __init__(self, pipeline: Gst.Bin, camera: Camera) -> None:
+        self._camera = camera
+        self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
+        self._by_name = {element.get_name(): element for element in self._elements}
+        self._lock = threading.Lock()
+        self._waiting: dict[str, KnobValue] = {}
+        self.applied: dict[str, KnobValue] = {}
+        self.faults: list[str] = []
+
+    def set_now(self, values: Mapping[str, KnobValue]) -> None:
+        """Set knobs of a pipeline that does not play yet."""
+        with self._lock:
+            self._waiting |= values
+        self._set_waiting()
+
+    def turn(self, values: Mapping[str, KnobValue]) -> None:
+        """Set knobs between two frames, soon; returns at once."""
+        with self._lock:
+            self._waiting |= values
+        touched = {element for knob, value in values.items() for element, _, _ in self._assignments(knob, value)}
+        first = next(element for element in self._elements if element.get_name() in touched)
+        pad = first.get_static_pad("sink") or first.get_static_pad("src")
+        pad.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
+
+    def _between_frames(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        self._set_waiting()
+        return Gst.PadProbeReturn.REMOVE
+
+    def _set_waiting(self) -> None:
+        with self._lock:
+            values, self._waiting = self._waiting, {}
+            for knob, value in values.items():
+                wrong = [fault for turned in self._assignments(knob, value) if (fault := self._assign(turned))]
+                self.faults += wrong
+                if not wrong:
+                    self.applied[knob] = value
+
+    def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
+        return assignments(self._camera, knob, value)
+
+    def _assign(self, turned: Assignment) -> str:
+        """Set one property and read it back; what is wrong, or ""."""
+        name, key, value = turned
+        element = self._by_name[name]
+        wanted: Any = Gst.Caps.from_string(value) if key == "caps" else value
+        if element.get_property(key) != wanted:
+            element.set_property(key, wanted)
+            held = element.get_property(key)
+            if not (held.is_equal(wanted) if key == "caps" else held == wanted):
+                return f"{self._camera.name}: {name}.{key} is {text(str(held))} after it was set to {text(value)}"
+        return ""

@@ -1,0 +1,72 @@
+"""One camera's pipeline on the vehicle, from the moment it is built until it is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gi.repository import Gst, GstRtp
+
+from runner.commands import KnobValue
+from runner.graph import Plan
+from runner.gst.knobs import Knobs
+from runner.gst.source import loop_clip
+
+CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
+
+
+class CameraPipeline:
+    """What is done to a pipeline that was just built, and the knobs that it has from then on.
+
+    wanted  where the knobs are to be
+    """
+
+    def __init__(self, pipeline: Gst.Bin, plan: Plan, wanted: Mapping[str, KnobValue]) -> None:
+        self._pipeline = pipeline
+        self._wanted = wanted
+        self.knobs = Knobs(pipeline, plan.camera)
+        if plan.loops:
+            loop_clip(pipeline, plan)
+        self._started = False
+        elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
+        last = next(pad for element in reversed(elements) if (pad := element.get_static_pad("src")))
+        self._stamp(last.get_parent_element())
+        self.knobs.set_now(self._allowed(wanted))
+        last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
+
+    def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
+        """Take the knobs to where they are wanted; `changed` is what is new."""
+        self._wanted = wanted
+        allowed = self._allowed(changed)
+        if allowed:
+            self.knobs.turn(allowed)
+
+    def _allowed(self, values: Mapping[str, KnobValue]) -> Mapping[str, KnobValue]:
+        """Until the first frame is out, sending stays as it is.
+
+        A gate that is closed from the start lets no caps through, and a client's DESCRIBE would wait for them in vain.
+        """
+        return values if self._started else {knob: value for knob, value in values.items() if knob != "sending"}
+
+    def counters(self) -> tuple[int, int]:
+        """Frames and bytes that the encoder has put out so far, counted in C."""
+        sent = self._pipeline.get_by_name("sent")
+        return counted(sent) if sent else (0, 0)
+
+    def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        self._started = True
+        if "sending" in self._wanted:
+            self.knobs.turn({"sending": self._wanted["sending"]})
+        return Gst.PadProbeReturn.REMOVE
+
+    def _stamp(self, payloader: Gst.Element) -> None:
+        """Let every packet carry the capture time of its frame."""
+        if isinstance(payloader, GstRtp.RTPBasePayload):
+            extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
+            extension.set_id(1)
+            payloader.emit("add-extension", extension)
+
+
+def counted(identity: Gst.Element) -> tuple[int, int]:
+    """Buffers and bytes that an identity has passed."""
+    stats = identity.get_property("stats")
+    return stats.get_value("num-buffers"), stats.get_value("num-bytes")

@@ -1,0 +1,106 @@
+"""The operator's side: each camera received, decoded and measured by a pipeline of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gi.repository import Gst
+
+from runner.graph import Plan
+from runner.gst.pipeline import counted
+from runner.gst.supervised import SupervisedPipeline
+
+NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
+STALL_S = 2.0  # a camera that should send and is silent for longer is built anew
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """What has come of one camera; counters run since the start and go on through rebuilt pipelines.
+
+    frames      access units received
+    bytes       their payload
+    decoded     frames that reached the sink
+    lost        RTP packets that never came
+    width, height  px of the decoded picture, 0 before the first
+    latency_ms  capture to decode of the last sampled frame; None before the first
+    rebuilt     how often the pipeline was built anew
+    """
+
+    frames: int = 0
+    bytes: int = 0
+    decoded: int = 0
+    lost: int = 0
+    width: int = 0
+    height: int = 0
+    latency_ms: float | None = None
+    rebuilt: int = 0
+
+
+class Receiver:
+    """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream."""
+
+    def __init__(self, plan: Plan, report: Callable[[str, str], None]) -> None:
+        self._sink_name = plan.operator[-1].name
+        name = plan.camera.name
+        self._supervised = SupervisedPipeline(plan.receiver, self._on_built, lambda what: report(name, what))
+        self._before = Received()  # what earlier pipelines have counted
+        self._latency_ms: float | None = None
+        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
+        self.should_send = False
+
+    def start(self) -> None:
+        self._supervised.start()
+
+    def stop(self) -> None:
+        self._supervised.stop()
+
+    def sample(self) -> Received:
+        """What has come so far; asks for the latency of the next frame."""
+        received = self._count()
+        now = time.monotonic()
+        if received.frames != self._moved[0] or not self.should_send:
+            self._moved = (received.frames, now)
+        elif now - self._moved[1] > STALL_S:
+            self._moved = (received.frames, now)
+            self._supervised.restart(f"no frame for {STALL_S:g} s")
+        else:
+            return received
+        # One frame in many is looked at: no Python runs for the others.
+        self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
+        return received
+
+    def _on_built(self, pipeline: Gst.Pipeline) -> None:
+        self._before = self._count() if self._supervised.rebuilt else Received()
+        self._sink = pipeline.get_by_name(self._sink_name)
+        self._received = pipeline.get_by_name("received")
+        self._jitter_buffers: list[Gst.Element] = []
+        pipeline.connect("deep-element-added", self._on_element)
+
+    def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
+        if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
+            self._jitter_buffers.append(element)
+
+    def _count(self) -> Received:
+        before = self._before
+        frames, size = counted(self._received)
+        caps = self._sink.get_static_pad("sink").get_current_caps()
+        picture = caps.get_structure(0) if caps else None
+        return Received(
+            frames=before.frames + frames,
+            bytes=before.bytes + size,
+            decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
+            lost=before.lost + sum(b.get_property("stats").get_value("num-lost") for b in self._jitter_buffers),
+            width=picture.get_int("width")[1] if picture else 0,
+            height=picture.get_int("height")[1] if picture else 0,
+            latency_ms=self._latency_ms,
+            rebuilt=self._supervised.rebuilt,
+        )
+
+    def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        captured = info.get_buffer().get_reference_timestamp_meta(None)
+        if captured:
+            self._latency_ms = 1000 * (time.time() + NTP_EPOCH_S - captured.timestamp / Gst.SECOND)
+        return Gst.PadProbeReturn.REMOVE

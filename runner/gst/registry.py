@@ -1,0 +1,160 @@
+"""Check a plan against the GStreamer registry of this machine: what could only fail while driving fails here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+from gi.repository import GLib, GObject, Gst
+
+from runner.commands import KnobValue
+from runner.graph import Plan, assignments, text
+from runner.model import Element, ModelError, Value, suggest
+
+PACKAGES = {  # Debian package that brings an element; `doctor` and missing plugins name it
+    "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
+    "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
+    " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux",
+    "gstreamer1.0-plugins-bad": "h264parse openh264enc x265enc srtsrc srtsink vah264enc nvh264enc",
+    "gstreamer1.0-plugins-ugly": "x264enc",
+    "gstreamer1.0-libav": "avdec_h264",
+    "gstreamer1.0-rtsp": "rtspclientsink",
+    "gstreamer1.0-x": "textoverlay",
+    "nvidia-l4t-gstreamer": "nvvidconv nvv4l2h264enc",
+}
+PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
+
+
+def missing_plugins(plan: Plan) -> list[str]:
+    """A sentence for each element that this project knows and this machine lacks."""
+    names = dict.fromkeys(e.factory for e in (*plan.source, *plan.vehicle, *plan.operator))
+    return [
+        f"the GStreamer element {name} is not installed; on Debian: apt-get install {PACKAGE_OF[name]}"
+        for name in names
+        if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None
+    ]
+
+
+def check_plan(plan: Plan) -> list[ModelError]:
+    """All that the registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
+
+    Elements that are known and not installed are the business of `missing_plugins`.
+    """
+    parts = {
+        "source.elements": plan.source,
+        "graph.vehicle": plan.vehicle,
+        "graph.operator": plan.operator,
+        "graph.wire.vehicle": plan.wire_vehicle,
+        "graph.wire.operator": plan.wire_operator,
+    }
+    found = [error for where, elements in parts.items() for error in _check_elements(elements, where)]
+    found += _check_knobs(plan)
+    return found or _check_links(plan)
+
+
+def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[ModelError]:
+    for index, element in enumerate(elements):
+        path = f"{where}[{index}]"
+        if _template(element.factory) is None:
+            if element.factory not in PACKAGE_OF:
+                rule = f"unknown element, {suggest(element.factory, _factory_names(element.factory))}"
+                yield ModelError(f"{path}.element", repr(element.factory), rule)
+            continue
+        for key, value in element.properties.items():
+            rule = _objection(element.factory, key, value)
+            if rule:
+                yield ModelError(f"{path}.properties.{key}", _shown(value), rule)
+
+
+def _check_knobs(plan: Plan) -> Iterator[ModelError]:
+    """Each knob's property exists, may change while PLAYING and takes the largest value that can come."""
+    camera = plan.camera
+    factories = {element.name: element.factory for element in (*plan.source, *plan.vehicle)}
+    largest: dict[str, KnobValue] = {
+        "sending": True,
+        "roi": camera.full_roi,
+        "size": (camera.width, camera.height),
+        "bitrate": int(camera.rate_quality.b_full),
+    }
+    for knob, value in largest.items():
+        for index, (name, key, filled) in enumerate(assignments(camera, knob, value)):
+            factory = factories[name]
+            element = _template(factory)
+            if element is None:
+                continue
+            path = f"graph.knobs.{knob}[{index}]"
+            rule = _objection(factory, key, filled)
+            if rule:
+                yield ModelError(f"{path}.property", repr(key), rule)
+            elif not int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING:
+                rule = f"{factory} cannot change {key} while playing, so that no knob can turn it"
+                yield ModelError(f"{path}.property", repr(key), rule)
+
+
+def _check_links(plan: Plan) -> list[ModelError]:
+    """Whether neighbours can be linked at all."""
+    errors = []
+    for where, line in (("graph.vehicle", plan.pipeline), ("graph.operator", plan.receiver)):
+        try:
+            if not missing_plugins(plan):
+                Gst.parse_launch(line)
+        except GLib.Error as error:
+            errors.append(ModelError(where, None, error.message))
+    return errors
+
+
+def _objection(factory: str, key: str, value: Value) -> str:
+    """Why an element does not take this value for this property; "" if it does."""
+    element = _template(factory)
+    assert element is not None
+    spec = element.find_property(key)
+    if spec is None:
+        return f"{factory} has no such property, {suggest(key, (p.name for p in element.list_properties()))}"
+    if not int(spec.flags) & GObject.ParamFlags.WRITABLE:
+        return f"{factory} does not let {key} be set"
+    kind = spec.value_type.name
+    if not _readable(kind, text(value)):
+        nicks = _nicks(spec)
+        return f"must be one of {', '.join(nicks)}" if nicks else f"must be a {kind.removeprefix('g')}"
+    if hasattr(spec, "minimum") and not spec.minimum <= float(value) <= spec.maximum:
+        return f"must be from {spec.minimum} to {spec.maximum}"
+    return ""
+
+
+def _readable(kind: str, value: str) -> bool:
+    """Whether GStreamer reads a text as a property of that type; the text of a structure is where it tells."""
+    quoted = value.replace("\\", "\\\\").replace('"', '\\"')
+    for written in (value, f'"{quoted}"'):
+        try:
+            Gst.Structure.from_string(f"x, value=({kind}){written}")
+        except TypeError:
+            continue
+        return True
+    return False
+
+
+def _nicks(spec: GObject.ParamSpec) -> list[str]:
+    if hasattr(spec, "enum_class"):
+        return [value.value_nick for value in spec.enum_class.__enum_values__.values()]
+    if hasattr(spec, "flags_class"):
+        return [nick for value in spec.flags_class.__flags_values__.values() for nick in value.value_nicks]
+    return []
+
+
+@cache
+def _template(factory: str) -> Gst.Element | None:
+    """One element of a factory, to ask for its properties."""
+    return Gst.ElementFactory.make(factory, None)
+
+
+def _factory_names(like: str) -> list[str]:
+    """Names that a misspelt one may have meant; all of them would be a thousand."""
+    every = Gst.Registry.get().get_feature_list(Gst.ElementFactory)
+    from difflib import get_close_matches
+
+    near: list[str] = get_close_matches(like, [feature.get_name() for feature in every], 1)
+    return near or ["a list of all: gst-inspect-1.0"]
+
+
+def _shown(value: Value) -> str:
+    return repr(value) if isinstance(value, str) else text(value)

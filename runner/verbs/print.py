@@ -1,0 +1,87 @@
+"""usage: tod-runner print [OVERRIDE ...] [total_kbps=N] [format=text|json]
+
+Dry run: for each camera the pipeline of the vehicle and of the operator, and what the rules decide for a total of
+N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: where the live system has an
+RTSP server and its client, the lines state a UDP sink and the matching source, since gst-launch has neither.
+
+  tod-runner print total_kbps=3000                              the paper's vehicle at 3 Mbit/s
+  tod-runner print vehicle=delivery_robot mode=collective       another vehicle
+  tod-runner print graph=openh264_rtsp format=json              for programs
+  sh -c "gst-launch-1.0 $(tod-runner print source=test format=json | jq -r .cameras.front_left.vehicle)"
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+
+from runner import sources
+from runner.commands import wanted
+from runner.config import load
+from runner.decision import Decision
+from runner.events import BitratePredicted, Event, ModeSelected, TotalSet
+from runner.graph import Plan
+from runner.model import Kbps, Mode, Vehicle, exact, plain
+from runner.step import start, step
+from runner.verbs import Arguments
+
+
+def run(arguments: Arguments) -> int:
+    form = arguments.choice("format", ("text", "json"))
+    total = arguments.number("total_kbps")
+    vehicle = load(arguments.overrides, arguments.conf)
+    plans = sources.compile_plans(vehicle)
+    decision = decide(vehicle, None if total is None else exact(total))
+    print(as_json(plans, decision) if form == "json" else as_text(vehicle, plans, decision))
+    if form == "json" and (note := _stand_ins(plans)):
+        print(note, file=sys.stderr)
+    return 0
+
+
+def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
+    """What the rules decide at the start, or for a total in kbit/s; mode single takes what automatic would."""
+    events: Sequence[Event] = ()
+    if total is not None and vehicle.mode is Mode.COLLECTIVE:
+        events = (TotalSet(t=0, kbps=total),)
+    elif total is not None:
+        events = (BitratePredicted(t=0, kbps=total), ModeSelected(t=0, mode=vehicle.mode))
+        vehicle = replace(vehicle, mode=Mode.AUTOMATIC)
+    run = start(vehicle)
+    for event in events:
+        run = step(vehicle, run, event)
+    return run.decision
+
+
+def as_json(plans: Sequence[Plan], decision: Decision) -> str:
+    cameras = {
+        plan.camera.name: {
+            "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
+            "operator": plan.operator_line(),
+            "server": plan.server,
+            "decision": decision.settings[plan.camera.name].to_json(),
+        }
+        for plan in plans
+    }
+    document = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
+    return json.dumps(document, indent=2, ensure_ascii=False)
+
+
+def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:
+    lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
+    lines += [f"# {note}" for note in [_stand_ins(plans)] if note]
+    for plan in plans:
+        setting = decision.settings[plan.camera.name]
+        what = f"{setting.width}x{setting.height} at {setting.kbps} kbit/s" if setting.sending else "not sending"
+        lines += ["", f"# {plan.camera.name}: {what}: {setting.reason}"]
+        lines.append(f"gst-launch-1.0 {plan.vehicle_line(wanted(setting))}")
+        lines.append(f"gst-launch-1.0 {plan.operator_line()}")
+        if plan.server:
+            lines.append(f"# server: {plan.server}")
+    return "\n".join(lines)
+
+
+def _stand_ins(plans: Sequence[Plan]) -> str:
+    names = [plan.camera.name for plan in plans if plan.stands_in]
+    return f"videotestsrc stands in for the frames of {', '.join(names)}" if names else ""

@@ -1,0 +1,120 @@
+"""usage: tod-runner validate [OVERRIDE ...] [conf=DIR]
+
+Check every file of the configuration against its schema, then every combination of vehicle, modes, graph and source:
+it must compose and compile. Where GStreamer is installed, also against its registry: elements, properties, types,
+ranges, and whether what a knob turns may change while playing. Ends with status 2 and all problems at once.
+
+  tod-runner validate                          the packaged files
+  tod-runner validate conf=my_vehicles         yours too, the step for your CI
+  tod-runner validate vehicle=tum_q7           one vehicle with everything else
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import yaml
+
+from runner import schema
+from runner.compose import GROUPS, conf_directories, label, load_file, yaml_problem
+from runner.config import Check, load
+from runner.errors import ConfigError, Problem
+from runner.graph import Plan
+from runner.model import ModelError
+from runner.verbs import Arguments
+
+COMBINED = ("vehicle", "modes", "graph", "source")
+
+
+def run(arguments: Arguments) -> int:
+    directories = conf_directories(arguments.conf)
+    found, files = check_files(directories)
+    if found:
+        raise ConfigError(found)
+    combinations = list(_combinations(arguments, directories))
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(combinations))) as pool:
+        chunk = max(1, len(combinations) // (8 * (os.cpu_count() or 1)))
+        results = list(pool.map(_check, combinations, chunksize=chunk))
+    problems = [problem for result in results for problem in result.problems]
+    if problems:
+        raise ConfigError(problems)
+    notes = dict.fromkeys(note for result in results for note in result.notes)
+    print(f"{files} files and {len(combinations)} combinations of {', '.join(COMBINED)} are valid")
+    print("\n".join(notes), end="\n" if notes else "")
+    return 0
+
+
+def check_files(directories: Sequence[Path]) -> tuple[list[Problem], int]:
+    """Every YAML file of some configuration directories against the schema of its group; and how many there are."""
+    problems: list[Problem] = []
+    count = 0
+    for directory in directories:
+        for path in sorted(directory.rglob("*.yaml")):
+            count += 1
+            problems += check_file(path, path.relative_to(directory), label(path, directories))
+    return problems, count
+
+
+def check_file(path: Path, relative: Path, name: str) -> Iterator[Problem]:
+    """Problems of one file. The folder says which schema it follows."""
+    group = relative.parts[0] if len(relative.parts) > 1 else relative.stem
+    kind = {"cameras": "camera"}.get(group, group)
+    if kind not in (*GROUPS, "camera", "config"):
+        folders = ", ".join(f"{group}/" for group in GROUPS)
+        yield Problem(name, "", None, f"belongs to no group, the groups are {folders}")
+        return
+    try:
+        content = load_file(path)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        yield yaml_problem(error, name)
+        return
+    for finding in schema.findings(content, kind):
+        yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    problems: list[Problem]
+    notes: list[str]
+
+
+def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator[tuple[list[str], Path | None]]:
+    """Overrides for each combination; a choice on the command line narrows its axis."""
+    chosen = {word.partition("=")[0] for word in arguments.overrides}
+    axes: list[list[list[str]]] = [[arguments.overrides]]
+    for group in COMBINED:
+        options = sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
+        axes.append([[]] if group in chosen else [[f"{group}={option}"] for option in options])
+    for words in product(*axes):
+        yield [word for part in words for word in part], arguments.conf
+
+
+def _check(combination: tuple[list[str], Path | None]) -> Checked:
+    overrides, user = combination
+    notes: list[str] = []
+    check = _registry_check(notes)
+    try:
+        load(overrides, user, runnable=False, check=check)
+    except ConfigError as error:
+        return Checked(error.problems, [])
+    return Checked([], notes)
+
+
+def _registry_check(notes: list[str]) -> Check | None:
+    """The check against GStreamer's registry; what it could not look at goes to the notes."""
+    try:
+        from runner.apply import check_plan, missing_plugins
+    except ImportError:
+        notes.append("nothing was checked against the GStreamer registry: its Python bindings are not installed")
+        return None
+
+    def check(plan: Plan) -> list[ModelError]:
+        notes.extend(f"not checked: {sentence}" for sentence in missing_plugins(plan))
+        return check_plan(plan)
+
+    return check
