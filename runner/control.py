@@ -13,7 +13,8 @@ import socket
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import paho.mqtt.client as mqtt
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
 
 from runner.errors import RunError
 from runner.model import Endpoint
@@ -29,50 +30,57 @@ Document = Mapping[str, Any]
 class Link:
     """One side's connection to the broker; reconnects by itself. Callbacks come from the link's own thread.
 
-    will       topic (below tod/<vehicle>/), message and whether it is retained, published when this side is lost
+    will       topic (below tod/<vehicle>/) and message, published when this side is lost
     listen     by topic, who takes its messages (bytes of JSON, not yet looked at)
     connected  told True and False as the connection comes and goes
-    raises     RunError where nobody listens at the broker's address
     """
 
     def __init__(
         self,
         vehicle: str,
         broker: Endpoint,
-        will: tuple[str, Document, bool],
+        will: tuple[str, Document],
         listen: Mapping[str, Callable[[bytes], None]],
         connected: Callable[[bool], None],
     ) -> None:
         self._prefix = f"tod/{vehicle}/"
         self._listen = {self._prefix + topic: function for topic, function in listen.items()}
         self._connected = connected
-        client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
-        topic, message, retain = will
-        client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=retain)
+        client = Client(CallbackAPIVersion.VERSION2)
+        topic, message = will
+        client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
         client.on_socket_open = _no_delay
         client.on_connect = self._on_connect
         client.on_disconnect = lambda *_: connected(False)
-        client.on_message = lambda _client, _data, message: self._listen[message.topic](message.payload)
+        client.on_message = lambda _client, _data, message: self._listen[message.topic](bytes(message.payload))
         client.reconnect_delay_set(min_delay=1, max_delay=2)
-        self._client = client
+        self._client, self._broker = client, broker
+
+    def connect(self) -> None:
+        """Connect, and from then on stay connected.
+
+        raises  RunError where nobody listens at the broker's address
+        """
+        broker = self._broker
         try:
-            client.connect(broker.host, broker.port, KEEPALIVE_S)
+            self._client.connect(broker.host, broker.port, KEEPALIVE_S)
         except OSError as error:
             rule = "start a broker there (mosquitto), or choose control.host and control.port"
             raise RunError(f"no MQTT broker at {broker.host}:{broker.port}: {error}; {rule}") from None
-        client.loop_start()
+        self._client.loop_start()
 
-    def publish(self, topic: str, message: Document, *, retain: bool = False) -> None:
-        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain)
+    def publish(self, topic: str, message: Document) -> None:
+        """Send a message; the state is kept by the broker for who comes later."""
+        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
 
-    def close(self, farewell: tuple[str, Document, bool]) -> None:
+    def close(self, topic: str, message: Document) -> None:
         """Say goodbye as the will would have, and disconnect."""
-        topic, message, retain = farewell
+        retain = topic == "state"
         self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain).wait_for_publish(1)
         self._client.disconnect()
         self._client.loop_stop()
 
-    def _on_connect(self, client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+    def _on_connect(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
             return
         for topic in self._listen:
@@ -80,7 +88,7 @@ class Link:
         self._connected(True)
 
 
-def _no_delay(_client: object, _data: object, sock: socket.socket) -> None:
+def _no_delay(_client: object, _data: object, sock: Any) -> None:
     """Without this, small messages wait 20 ms for company (Nagle's algorithm)."""
     if isinstance(sock, socket.socket):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -6,7 +6,7 @@ import json
 import queue
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from runner.schema import event_problem
 from runner.step import Run, start, step
 
 TICK_S = 0.1  # time between clock_advanced events
+TELEMETRY_TICKS = 5
 Answer = Callable[[Mapping[str, Any]], None]
 
 
@@ -66,6 +67,7 @@ class Loop:
     refused: int = 0
     _inbox: queue.SimpleQueue[tuple[Mapping[str, Any], Answer | None]] = field(default_factory=queue.SimpleQueue)
     _stopped: bool = False
+    _ticks: int = 0
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
         """An event as JSON without `t`, from any thread; `answer` is told what came of it."""
@@ -86,7 +88,7 @@ class Loop:
             try:
                 document, answer = self._inbox.get(timeout=max(0.0, next_tick - self._now()))
             except queue.Empty:
-                self._tick(next_tick)
+                self._tick()
                 next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
                 continue
             if document:
@@ -95,15 +97,17 @@ class Loop:
     def _now(self) -> float:
         return round(time.monotonic() - self._began, 6)
 
-    def _tick(self, scheduled: float) -> None:
+    def _tick(self) -> None:
         """Time passes: where the drive comes from a track, the position with it."""
-        t = max(self._now(), scheduled)
+        t = self._now()
         if self.track is not None:
-            position = self.track.at(t)
-            self._take(position)
+            self._take(replace(self.track.at(t), t=t))
         self._take(ClockAdvanced(t=t))
         for fault in self.applier.faults():
             self.report(fault)
+        self._ticks += 1
+        if self._ticks % TELEMETRY_TICKS == 0:
+            self._tell_measured(t)
 
     def _take_document(self, document: Mapping[str, Any], answer: Answer | None) -> None:
         stamped = {**document, "t": self._now()}
@@ -135,7 +139,7 @@ class Loop:
         if answer:
             said = {"t": after.state.t, "accepted": not after.refused}
             answer(said | ({"reason": after.refused} if after.refused else {}))
-        if after.commands or after.decision is not before.decision and after.decision != before.decision:
+        if after.commands or after.decision != before.decision:
             self._tell(before, event)
 
     def _tell(self, before: Run, event: Event | None) -> None:
@@ -150,9 +154,20 @@ class Loop:
             if (was.scaling, was.sending) != (now.scaling, now.sending):
                 self.report(f"{cause} -> {name}: {now.reason}")
 
-    def operator_lost(self) -> None:
-        """The control link broke: for the vehicle, the operator is gone."""
-        self.post({"event": "operator_disconnected"})
+    def _tell_measured(self, t: float) -> None:
+        """What was read back from the elements, and what the encoders have put out so far."""
+        sent = self.applier.sent()
+        cameras = {
+            name: {
+                "applied": {c.knob: c.to_json()["value"] for c in (Command(name, *item) for item in knobs.items())},
+                "frames": sent[name][0],
+                "bytes": sent[name][1],
+            }
+            for name, knobs in self.applier.applied().items()
+        }
+        telemetry = {"t": t, "cameras": cameras, "refused": self.refused}
+        self.log.write({**telemetry, "log": "telemetry"})
+        self.publish("telemetry", telemetry)
 
 
 def _cause(event: Event) -> str:

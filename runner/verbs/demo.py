@@ -1,0 +1,62 @@
+"""usage: tod-runner demo [OVERRIDE ...] [duration_s=60] [log=DIR]
+
+Both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a drive
+through a bandwidth map in mode A. The operator's table shows what comes of each camera beside what was decided. The
+demo runs every camera at fps_max=15, which two cores carry for the paper's eight cameras; give fps_max=null for theirs.
+
+  tod-runner demo                                             synthetic drive, a minute
+  tod-runner demo vehicle=delivery_robot duration_s=20
+  tod-runner demo source=file source.clip=clip.mp4            every camera shows your clip
+  tod-runner demo pqos.file=tum_bandwidth_map.yaml            along another map
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from runner.broker import private_broker
+from runner.config import load_run
+from runner.errors import RunError
+from runner.sources import render_missing
+from runner.verbs import Arguments
+from runner.verbs.live import progress_bar, streaming
+
+DURATION_S = "60"
+DEFAULTS = ["fps_max=15"]  # Hz; what two cores encode, send and decode eight times without falling behind
+
+
+def run(arguments: Arguments) -> int:
+    apply = streaming()
+    duration = arguments.values.get("duration_s", DURATION_S)
+    arguments.number("duration_s")
+    arguments = replace(arguments, overrides=DEFAULTS + arguments.overrides)
+    vehicle, _, _ = load_run(arguments.overrides, arguments.conf, check=apply.check_plan)
+    with progress_bar() as progress:
+        render_missing(vehicle, progress)
+    own = [*arguments.overrides, *([f"conf={arguments.conf}"] if arguments.conf else [])]
+    log = [f"log={arguments.values['log']}"] if "log" in arguments.values else []
+    with tempfile.TemporaryFile("w+") as said, private_broker(vehicle.control):
+        with _side("vehicle", [*own, *log], said.fileno()) as vehicle_side:
+            try:
+                status = _side("operator", [*own, f"duration_s={duration}"]).wait()
+            finally:
+                early = vehicle_side.poll()
+                vehicle_side.terminate()
+        if early is not None:
+            said.seek(0)
+            raise RunError(f"the vehicle's side ended early:\n{said.read().strip()}")
+    return status
+
+
+def _side(verb: str, words: Sequence[str], stderr: int | None = None) -> subprocess.Popen[bytes]:
+    """One side in a process of its own, with the same Python."""
+    command = [sys.executable, "-m", "runner", verb, *words]
+    root = str(Path(__file__).resolve().parents[2])
+    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return subprocess.Popen(command, stderr=stderr, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)})

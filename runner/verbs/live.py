@@ -1,0 +1,64 @@
+"""What the live verbs share: a progress bar, lines on standard error, and the way to GStreamer."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+from runner.errors import RunError
+from runner.model import Progress
+
+
+def streaming() -> ModuleType:
+    """The module `runner.apply`.
+
+    raises  RunError where GStreamer's Python bindings are missing
+    """
+    try:
+        from runner import apply
+    except (ImportError, ValueError) as error:
+        raise RunError(f"{error}; run `make setup`, or see what is missing with `tod-runner doctor`") from None
+    return apply
+
+
+def say(what: str) -> None:
+    """One line for the person who looks on, with the time of day."""
+    now = time.time()
+    clock = time.strftime("%H:%M:%S", time.localtime(now))
+    print(f"{clock}.{int(now * 1000) % 1000:03d} {what}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Shows how far long work is; nothing where there is none. Off a terminal, a line for each tenth."""
+    if not sys.stderr.isatty():
+        yield _progress_lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, int] = {}
+
+        def progress(what: str, done: float) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=1.0)
+            bars.update(tasks[what], completed=done)  # type: ignore[arg-type]
+
+        yield progress
+
+
+def _progress_lines() -> Progress:
+    tenths: dict[str, int] = {}
+
+    def progress(what: str, done: float) -> None:
+        if int(done * 10) != tenths.get(what):
+            tenths[what] = int(done * 10)
+            say(f"{what}: {done:.0%}")
+
+    return progress

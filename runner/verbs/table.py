@@ -1,0 +1,132 @@
+"""The operator's table in the terminal, and the summary at its end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from runner.model import Vehicle
+from runner.telemetry import Decided, Meter, Rates, middle, percentile
+
+PLAIN_EVERY_S = 5.0
+NOTES = 4
+
+
+class Row(NamedTuple):
+    """One camera as the table shows it; `received` is its counters, `setting` what the vehicle says of it."""
+
+    name: str
+    rates: Rates
+    received: Any
+    decided: Decided | None
+    setting: Mapping[str, Any]
+
+
+class Table:
+    """Shown in place on a terminal, every few seconds elsewhere."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._console = Console(width=None if sys.stdout.isatty() else 150)
+        self._live = Live(console=self._console, auto_refresh=False) if sys.stdout.isatty() else None
+        self._notes: deque[str] = deque(maxlen=NOTES)
+        self._shown = 0.0
+
+    def __enter__(self) -> Table:
+        if self._live:
+            self._live.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._live:
+            self._live.__exit__(kind, error, at)
+
+    def note(self, what: str) -> None:
+        """One line of news below the table."""
+        line = f"{time.strftime('%H:%M:%S')} {what}"
+        self._notes.append(line)
+        if not self._live:
+            self._console.print(line, markup=False, highlight=False)
+
+    def show(self, rows: Sequence[Row], headline: str) -> None:
+        if self._live:
+            self._live.update(Group(_table(rows, headline), *map(Text, self._notes)), refresh=True)
+        elif time.monotonic() - self._shown >= PLAIN_EVERY_S:
+            self._shown = time.monotonic()
+            self._console.print(_table(rows, headline))
+
+
+def _table(rows: Sequence[Row], headline: str) -> RichTable:
+    table = RichTable(title=headline, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("camera")
+    for heading in ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("why", overflow="fold")
+    for row in rows:
+        received, setting = row.received, row.setting
+        size = f"{received.width}x{received.height}" if received.width else "-"
+        latency = f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-"
+        table.add_row(
+            row.name,
+            f"{row.rates.fps:.1f}",
+            f"{row.rates.kbps:.0f}",
+            str(setting.get("kbps", "-")),
+            f"{setting['demand_kbps']:.0f}" if setting else "-",
+            Text(size, style=_size_style(row)),
+            str(setting.get("scaling") or "off") if setting else "-",
+            latency,
+            str(received.lost),
+            str(setting.get("reason", "")),
+        )
+    return table
+
+
+def _size_style(row: Row) -> str:
+    """Marks a picture that has not the size that was decided (yet)."""
+    decided, received = row.decided, row.received
+    wrong = decided and decided.sending and (decided.width, decided.height) != (received.width, received.height)
+    return "bold yellow" if wrong else ""
+
+
+def show_summary(meters: Mapping[str, Meter], received: Mapping[str, Any]) -> None:
+    """What came against what was decided, over the whole run."""
+    table = RichTable(title="received", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("camera")
+    headings = ["frames", "Hz", "seconds short\nof frames", "kbit/s of\nallocated", "seconds at the\ndecided size"]
+    for heading in (*headings, "sizes\nseen", "latency ms\nmedian", "p95", "packets\nlost", "rebuilt"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, meter in meters.items():
+        got = received.get(name)
+        if got is None:
+            continue
+        table.add_row(
+            name,
+            str(got.frames),
+            f"{meter.fps:g}",
+            f"{meter.short} of {meter.windows}",
+            _share(middle(meter.followed)),
+            f"{sum(meter.sizes.values())} of {meter.windows}",
+            str(len(meter.sizes)),
+            _number(middle(meter.latencies_ms)),
+            _number(percentile(meter.latencies_ms, 0.95)),
+            str(got.lost),
+            str(got.rebuilt),
+        )
+    Console(width=None if sys.stdout.isatty() else 150).print(table)
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0%}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
