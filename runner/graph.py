@@ -12,6 +12,11 @@ from runner.commands import KnobValue
 from runner.model import PLACEHOLDER, Camera, Element, Endpoint, ModelError, Roi, Value, suggest
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
+# Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and with what.
+_PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
+    "key_interval_s": ("key_interval_frames", lambda seconds, fps: seconds * fps),
+    "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
+}
 Assignment = tuple[str, str, Value]  # element, property, value
 
 
@@ -167,6 +172,9 @@ def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> di
         "url": rtsp_url(media, camera.name),
         "port": int(camera.graph.settings["first_port"]) + index,
     }
+    for key, (name, amount) in _PER_FRAME_RATE.items():
+        if key in camera.graph.settings:
+            values[name] = max(1, round(amount(float(camera.graph.settings[key]), float(camera.fps))))
     return values if clip is None else values | {"clip": clip}
 
 

@@ -25,7 +25,8 @@ class Knobs:
         self._camera = camera
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
-        self._lock = threading.Lock()
+        # Reentrant: new caps send an event up through the very pad whose probe sets them, which calls it once more.
+        self._lock = threading.RLock()
         self._waiting: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
         self.faults: list[str] = []
