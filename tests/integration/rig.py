@@ -73,7 +73,8 @@ class Client:
         line = plan.receiver
         if pictures:
             head, _, _ = line.rpartition(" ! ")
-            line = f"{head} ! videoconvert ! video/x-raw,format=RGB ! appsink name=sink sync=false max-buffers=1 drop=true"
+            sink = "appsink name=sink sync=false max-buffers=1 drop=true"
+            line = f"{head} ! videoconvert ! video/x-raw,format=RGB ! {sink}"
         self.sizes: list[tuple[int, int]] = []
         self.times: list[float] = []
         self.errors: list[str] = []

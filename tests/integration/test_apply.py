@@ -7,11 +7,11 @@ import socket
 import time
 
 import pytest
+
+from rig import CLIPS, Client, streaming, until, watching
 from runner.commands import Command
 from runner.errors import RunError
 from runner.model import Roi
-
-from rig import CLIPS, Client, streaming, until, watching
 
 CAMERA = "front_left"
 
@@ -155,7 +155,8 @@ def quadrants(width, height):
         return made.tobytes()
 
     luma = plane(width, height, (210, 80, 60, 30))
-    return luma + plane(width // 2, height // 2, (128, 90, 200, 128)) + plane(width // 2, height // 2, (128, 220, 110, 128))
+    u, v = (128, 90, 200, 128), (128, 220, 110, 128)
+    return luma + plane(width // 2, height // 2, u) + plane(width // 2, height // 2, v)
 
 
 BRIGHT, RED, BLUE, DARK = "bright", "red", "blue", "dark"
@@ -189,8 +190,8 @@ def test_an_roi_shows_what_it_names(roi, size, corners):
             client.close()
         assert picture.shape[1::-1] == size
         height, width = picture.shape[:2]
-        near = ((height // 8, width // 8), (height // 8, -width // 8), (-height // 8, width // 8), (-height // 8, -width // 8))
-        assert tuple(colour(picture[at]) for at in near) == corners
+        rows, columns = (height // 8, -height // 8), (width // 8, -width // 8)
+        assert tuple(colour(picture[row, column]) for row in rows for column in columns) == corners
 
 
 def test_a_native_crop_comes_before_the_roi():
@@ -211,13 +212,17 @@ def test_a_native_crop_comes_before_the_roi():
 
 
 def test_a_frame_of_another_size_is_refused():
-    with streaming("source=appsrc") as (side, _, (plan,), _reported), watching(plan):
-        with pytest.raises(ValueError, match="front_left: a frame of 3 bytes must have 2995200, I420 of 1920x1040"):
-            until(lambda: side.push(CAMERA, b"abc"))
+    rule = "front_left: a frame of 3 bytes must have 2995200, I420 of 1920x1040"
+    with (
+        streaming("source=appsrc") as (side, _, (plan,), _reported),
+        watching(plan),
+        pytest.raises(ValueError, match=rule),
+    ):
+        until(lambda: side.push(CAMERA, b"abc"))
 
 
 def test_a_port_in_use_is_told_in_one_line():
-    from runner.apply import check_port_free
+    from runner.ports import check_port_free
 
     with streaming() as (_, vehicle, _, _reported), pytest.raises(RunError) as told:
         check_port_free(vehicle.media)
