@@ -241,7 +241,7 @@ def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
 def _setting(state: State, draft: Draft, name: str) -> Setting:
     roi = state.rois[name]
     if not state.on[name]:
-        return Setting(False, False, allocation.ZERO, 0, None, roi, 0, 0, "switched off")
+        return Setting(False, False, allocation.ZERO, 0, 0, None, roi, 0, 0, "switched off")
     kbps, factor = int(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
     width, height = scaling.output_size(roi, factor)
@@ -249,7 +249,7 @@ def _setting(state: State, draft: Draft, name: str) -> Setting:
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
     reason = "; ".join((reason, *draft.notes))
-    return Setting(True, sending, draft.demand[name], kbps if sending else 0, factor, roi, width, height, reason)
+    return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
 
 
 def _short(bitrate: Kbps) -> int | str:
