@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 from runner.commands import Command, KnobValue
 from runner.errors import RunError
@@ -15,11 +16,19 @@ from runner.gst import GLib, Gst
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import Received, Receiver
 from runner.gst.registry import check_plan, missing_plugins
-from runner.gst.server import CameraServer
+from runner.gst.server import CameraServer, check_port_free
 from runner.gst.supervised import CameraCaller
 from runner.model import Endpoint
 
-__all__ = ["OperatorSide", "Received", "VehicleSide", "check_machine", "check_plan", "missing_plugins"]
+__all__ = [
+    "OperatorSide",
+    "Received",
+    "VehicleSide",
+    "check_machine",
+    "check_plan",
+    "check_port_free",
+    "missing_plugins",
+]
 
 Report = Callable[[str, str], None]  # camera, what happened to it
 
@@ -114,6 +123,13 @@ class VehicleSide:
             pipeline = self._pipeline(name)
             if pipeline:
                 pipeline.turn(self._wanted_of(name), values)
+
+    def push(self, camera: str, frame: Any) -> bool:
+        """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle.push`."""
+        with self._lock:
+            self._wanted[camera]  # an unknown camera is the caller's mistake
+        pipeline = self._pipeline(camera)
+        return pipeline is not None and pipeline.push(frame)
 
     def applied(self) -> dict[str, Mapping[str, KnobValue]]:
         """By camera and knob, what was read back from the elements; cameras without a pipeline have nothing."""

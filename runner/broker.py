@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -23,9 +24,7 @@ def private_broker(endpoint: Endpoint) -> Iterator[None]:
 
     raises  RunError where mosquitto is missing or does not come up
     """
-    program = shutil.which("mosquitto", path="/usr/local/bin:/usr/bin:/usr/local/sbin:/usr/sbin")
-    if program is None:
-        raise RunError("mosquitto is not installed; on Debian: apt-get install mosquitto")
+    program = find_mosquitto()
     with tempfile.TemporaryDirectory(prefix="tod-broker-") as directory:
         file = Path(directory) / "mosquitto.conf"
         file.write_text(f"listener {endpoint.port} {endpoint.host}\nallow_anonymous true\npersistence false\n")
@@ -36,6 +35,17 @@ def private_broker(endpoint: Endpoint) -> Iterator[None]:
                 yield
             finally:
                 child.terminate()
+
+
+def find_mosquitto() -> str:
+    """Path of the broker, which Debian puts where only root looks.
+
+    raises  RunError
+    """
+    program = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/local/sbin:/usr/sbin")
+    if program is None:
+        raise RunError("mosquitto is not installed; on Debian: apt-get install mosquitto")
+    return program
 
 
 def _wait(child: subprocess.Popen[str], endpoint: Endpoint) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from gi.repository import Gst, GstRtp
 
@@ -21,7 +22,7 @@ class CameraPipeline:
     """
 
     def __init__(self, pipeline: Gst.Bin, plan: Plan, wanted: Mapping[str, KnobValue]) -> None:
-        self._pipeline = pipeline
+        self._pipeline, self._plan = pipeline, plan
         self._wanted = wanted
         self.knobs = Knobs(pipeline, plan.camera)
         if plan.loops:
@@ -46,6 +47,19 @@ class CameraPipeline:
         A gate that is closed from the start lets no caps through, and a client's DESCRIBE would wait for them in vain.
         """
         return values if self._started else {knob: value for knob, value in values.items() if knob != "sending"}
+
+    def push(self, frame: Any) -> bool:
+        """Hand one frame to the source, which must be an appsrc.
+
+        raises  ValueError for a frame of another length than width * height * 3 / 2
+        """
+        width, height = self._plan.camera.source_size
+        data = bytes(memoryview(frame).cast("B"))
+        if len(data) != width * height * 3 // 2:
+            rule = f"must have {width * height * 3 // 2}, I420 of {width}x{height}"
+            raise ValueError(f"camera {self._plan.camera.name}: a frame of {len(data)} bytes {rule}")
+        source = self._pipeline.get_by_name(self._plan.source[0].name)
+        return bool(source.emit("push-buffer", Gst.Buffer.new_wrapped(data)) == Gst.FlowReturn.OK)
 
     def counters(self) -> tuple[int, int]:
         """Frames and bytes that the encoder has put out so far, counted in C."""

@@ -62,6 +62,9 @@ class CameraServer:
         name = plan.camera.name
         element = media.get_element()
         element.get_parent().connect("deep-element-added", _on_element)
+        bus = element.get_parent().get_bus()
+        bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
+        bus.connect("sync-message::error", lambda _bus, message: self._report(name, message.parse_error()[0].message))
         self.pipelines[name] = CameraPipeline(element, plan, self._wanted(name))
         media.connect("unprepared", self._on_unprepared, name, self.pipelines[name])
         self._report(name, "pipeline built")
@@ -69,7 +72,7 @@ class CameraServer:
     def _on_unprepared(self, _media: object, name: str, pipeline: CameraPipeline) -> None:
         if self.pipelines.get(name) is pipeline:
             del self.pipelines[name]
-        self._report(name, "pipeline gone: nobody watches")
+        self._report(name, "pipeline gone")
 
 
 def _on_element(_bin: Gst.Bin, _parent: Gst.Bin, element: Gst.Element) -> None:

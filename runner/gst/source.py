@@ -8,9 +8,6 @@ from gi.repository import Gst
 
 from runner.graph import Plan
 
-_FIRST = Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT
-_AGAIN = Gst.SeekFlags.SEGMENT
-
 
 def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     """Make a clip start again at its end, with running time going on.
@@ -18,27 +15,45 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     A segment seek tells the demuxer to say SEGMENT_DONE in place of EOS; the next seek then queues the clip behind
     itself. Python runs once per round, not per frame.
     """
-    pace = pipeline.get_by_name(plan.source[-1].name)
-    pad = pace.get_static_pad("sink")
+    pace = pipeline.get_by_name(plan.source[-1].name).get_static_pad("sink")
+    _Loop(pace.get_peer())
+    _born_on_release(pace)
 
-    def seek(flags: Gst.SeekFlags) -> None:
-        event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
-        # Not from the streaming thread, which the seek has to wait for.
-        threading.Thread(target=pad.push_event, args=(event,), daemon=True).start()
 
-    def on_first_frame(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        seek(_FIRST)
-        return Gst.PadProbeReturn.REMOVE
+class _Loop:
+    """Watches the pad in front of the pacing element. Nothing of the first seek, a flush, is seen behind it."""
 
-    def on_event(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        if info.get_event().type not in (Gst.EventType.SEGMENT_DONE, Gst.EventType.EOS):
-            return Gst.PadProbeReturn.OK
-        seek(_AGAIN)
+    def __init__(self, pad: Gst.Pad) -> None:
+        self._pad = pad
+        self._sought = self._flushed = False
+        pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
+        pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
+
+    def _on_early_frame(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """Frames from before the first seek would come twice."""
+        if self._flushed:
+            return Gst.PadProbeReturn.REMOVE
+        if not self._sought:
+            self._sought = True
+            self._seek(Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT)
         return Gst.PadProbeReturn.DROP
 
-    pad.add_probe(Gst.PadProbeType.BUFFER, on_first_frame)
-    pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, on_event)
-    _born_on_release(pad)
+    def _on_event(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        match info.get_event().type:
+            case Gst.EventType.FLUSH_START:
+                return Gst.PadProbeReturn.DROP
+            case Gst.EventType.FLUSH_STOP:
+                self._flushed = True
+                return Gst.PadProbeReturn.DROP
+            case Gst.EventType.SEGMENT_DONE | Gst.EventType.EOS:
+                self._seek(Gst.SeekFlags.SEGMENT)
+                return Gst.PadProbeReturn.DROP
+        return Gst.PadProbeReturn.OK
+
+    def _seek(self, flags: Gst.SeekFlags) -> None:
+        event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
+        # Not from the streaming thread, which the seek has to wait for. A source pad takes it from below.
+        threading.Thread(target=self._pad.send_event, args=(event,), daemon=True).start()
 
 
 def _born_on_release(pad: Gst.Pad) -> None:

@@ -25,7 +25,7 @@ from runner.config import load_run
 from runner.errors import RunError
 from runner.sources import render_missing
 from runner.verbs import Arguments
-from runner.verbs.live import progress_bar, streaming
+from runner.verbs.screen import progress_bar, streaming
 
 DURATION_S = "60"
 DEFAULTS = ["fps_max=15"]  # Hz; what two cores encode, send and decode eight times without falling behind

@@ -24,7 +24,7 @@ from runner.model import Vehicle
 from runner.sources import compile_plans
 from runner.telemetry import Decided, Meter
 from runner.verbs import Arguments
-from runner.verbs.live import streaming
+from runner.verbs.screen import streaming
 from runner.verbs.table import Row, Table, show_summary
 
 SAMPLE_S = 0.25

@@ -13,46 +13,21 @@ from __future__ import annotations
 
 import signal
 
-from runner.config import load_run
-from runner.control import OFFLINE, Link, read_request
-from runner.graph import rtsp_url
-from runner.loop import Log, Loop
-from runner.sources import compile_plans, render_missing
+from runner.live import live_vehicle
 from runner.verbs import Arguments
-from runner.verbs.live import progress_bar, say, streaming
+from runner.verbs.screen import progress_bar, say, streaming
 
 
 def run(arguments: Arguments) -> int:
-    apply = streaming()
+    streaming()
     duration = arguments.number("duration_s")
-    vehicle, pqos, track = load_run(arguments.overrides, arguments.conf, check=apply.check_plan)
-    with progress_bar() as progress:
-        render_missing(vehicle, progress)
-    plans = compile_plans(vehicle)
-    apply.check_machine(plans)
-    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: say(f"{camera}: {what}"))
-
-    def on_request(payload: bytes) -> None:
-        document, identity, problem = read_request(payload)
-        if problem:
-            link.publish("reply", {"id": identity, "accepted": False, "reason": problem})
-            return
-        loop.post(document, lambda said: link.publish("reply", {"id": identity, **said}))
-
-    def on_connected(here: bool) -> None:
-        if not here:
-            loop.post({"event": "operator_disconnected"})  # for the vehicle, who cannot be heard is gone
-
-    link = Link(vehicle.name, vehicle.control, ("state", OFFLINE), {"request": on_request}, on_connected)
-    loop = Loop(vehicle, side, pqos, track, Log(arguments.path("log")), link.publish, say)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: loop.stop())
-    try:
-        link.connect()
-        for plan in plans:
-            say(f"{plan.camera.name}: {rtsp_url(vehicle.media, plan.camera.name) if plan.serves else 'dials out'}")
-        loop.run(duration)
-    finally:
-        link.close("state", OFFLINE)
-        side.stop()
+    with (
+        progress_bar() as progress,
+        live_vehicle(
+            arguments.overrides, arguments.conf, log=arguments.path("log"), say=say, progress=progress
+        ) as vehicle,
+    ):
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: vehicle.loop.stop())
+        vehicle.loop.run(duration)
     return 0

@@ -1,0 +1,222 @@
+"""What a change costs while playing: figures for commands, resolution changes and bitrate steps over real RTSP.
+
+  python bench/live.py                       everything, about two minutes
+  python bench/live.py --clip CLIP.mp4       steps on a clip of yours; else on the synthetic drive
+
+Run it on an otherwise idle machine; both sides share it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from runner.apply import VehicleSide, check_plan
+from runner.commands import Command
+from runner.config import load
+from runner.gst import Gst, knobs
+from runner.model import Vehicle
+from runner.sources import compile_plans, render_missing
+from runner.telemetry import middle, percentile
+
+PORT = 18554
+Sample = tuple[float, int, int, int]  # time, width, height, bytes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clip", type=Path)
+    parser.add_argument("--rounds", type=int, default=60)
+    words = parser.parse_args()
+    source = ["source=file", f'source.clip="{words.clip}"'] if words.clip else ["source=synthetic"]
+    command_latency(source, words.rounds)
+    size_change(source, words.rounds)
+    for fps in (15, 40):
+        bitrate_step(source, fps)
+
+
+def command_latency(source: Sequence[str], rounds: int) -> None:
+    """From a decision for all cameras to the last encoder that has it; eight cameras as the demo runs them."""
+    vehicle = _vehicle([*source, "fps_max=15"])
+    with _streaming(vehicle) as side, _operator([*source, "fps_max=15"]):
+        _until(lambda: all(sent[0] > 30 for sent in side.sent().values()))
+        for what, sizes in (("bitrate", [(960, 520)]), ("bitrate and size", [(960, 520), (480, 260)])):
+            last, each = [], []
+            for n in range(rounds):
+                commands = [
+                    command
+                    for name in vehicle.cameras
+                    for command in (
+                        Command(name, "size", sizes[n % len(sizes)]),
+                        Command(name, "bitrate", 500 + n % 7 * 40),
+                    )
+                ]
+                began = time.perf_counter()
+                with _recorded() as applied:
+                    side.turn(commands)
+                    _until(lambda seen=applied: len(seen) >= len(vehicle.cameras), 2)
+                waits = sorted(1000 * (at - began) for at in applied)
+                last.append(waits[-1])
+                each += waits
+                time.sleep(0.137)
+            _print(f"{what}: command to encoder", each, "ms")
+            _print(f"{what}: command to the last of {len(vehicle.cameras)} encoders", last, "ms")
+
+
+def size_change(source: Sequence[str], rounds: int) -> None:
+    """One camera at 40 Hz: from a new size to its first decoded frame, and the longest gap between frames."""
+    vehicle = _one_camera(source, 40)
+    sizes = [(960, 520), (480, 260), (240, 130)]
+    waits: list[float] = []
+    with _streaming(vehicle) as side, _client(vehicle) as (samples, errors):
+        _until(lambda: len(samples) > 40)
+        start = len(samples)
+        for n in range(rounds):
+            size = sizes[n % 3]
+            began, seen = time.time(), len(samples)
+            side.turn([Command("front_left", "size", size), Command("front_left", "bitrate", 1000)])
+            _until(lambda size=size, seen=seen: any(s[1:3] == size for s in samples[seen:]))
+            first = next(s for s in samples[seen:] if s[1:3] == size)
+            waits.append((first[0] - began) * 40)
+            time.sleep(0.31)
+        times = [s[0] for s in samples[start:]]
+    gaps = [(b - a) * 40 for a, b in pairwise(times)]
+    _print("first frame of a new size decoded after", waits, "frame intervals")
+    print(f"{'longest gap between frames':52} {max(gaps):8.2f} frame intervals, {len(gaps)} frames")
+    print(f"{'decoder errors':52} {len(errors):8}")
+
+
+def bitrate_step(source: Sequence[str], fps: int) -> None:
+    """4000 -> 1000 kbit/s, with and without a change of factor: what is on the wire, as a multiple of the new rate."""
+    vehicle = _one_camera(source, fps)
+    for what, size in (("same factor", (960, 520)), ("factor 0.5 -> 0.25", (480, 260))):
+        with _streaming(vehicle) as side, _client(vehicle) as (samples, _):
+            side.turn([Command("front_left", "size", (960, 520)), Command("front_left", "bitrate", 4000)])
+            time.sleep(5)
+            side.turn([Command("front_left", "size", size), Command("front_left", "bitrate", 1000)])
+            began = time.time()
+            time.sleep(4.5)
+        before = _kbps(samples, began - 2, began)
+        early, late = _kbps(samples, began, began + 0.5), _kbps(samples, began + 2, began + 4)
+        shares = f"first 0.5 s {early / 1000:.2f}, seconds 2 to 4 {late / 1000:.2f} of 1000 kbit/s"
+        print(f"{f'4000 -> 1000 at {fps} Hz, {what}':52} {before:8.0f} kbit/s before, {shares}")
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _vehicle(overrides: Sequence[str]) -> Vehicle:
+    vehicle = load([*overrides, f"media.port={PORT}"], check=check_plan)
+    render_missing(vehicle, lambda what, done: print(f"\r{what} {done:4.0%}", end="", file=sys.stderr))
+    return vehicle
+
+
+def _one_camera(source: Sequence[str], fps: int) -> Vehicle:
+    vehicle = _vehicle([*source, f"fps_max={fps}"])
+    return replace(vehicle, cameras={"front_left": vehicle.cameras["front_left"]})
+
+
+@contextmanager
+def _streaming(vehicle: Vehicle) -> Iterator[VehicleSide]:
+    side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda *_: None)
+    try:
+        yield side
+    finally:
+        side.stop()
+
+
+@contextmanager
+def _operator(overrides: Sequence[str]) -> Iterator[None]:
+    """Receives and decodes all cameras in a process of its own, as the operator does."""
+    code = (
+        "import sys, time; from runner.apply import OperatorSide; from runner.config import load;"
+        "from runner.sources import compile_plans;"
+        "side = OperatorSide(compile_plans(load(sys.argv[1:])), lambda *_: None); time.sleep(600)"
+    )
+    command = [sys.executable, "-c", code, *overrides, f"media.port={PORT}"]
+    with subprocess.Popen(command) as child:
+        try:
+            yield
+        finally:
+            child.kill()
+
+
+@contextmanager
+def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
+    """Decodes the one camera and writes down each frame; bytes are those of the access unit before it."""
+    (plan,) = compile_plans(vehicle)
+    pipeline = Gst.parse_launch(plan.receiver)
+    samples: list[Sample] = []
+    errors: list[str] = []
+    sizes: list[int] = []
+
+    def on_unit(_pad: Any, info: Any) -> Any:
+        sizes.append(info.get_buffer().get_size())
+        return Gst.PadProbeReturn.OK
+
+    def on_frame(pad: Any, _info: Any) -> Any:
+        picture = pad.get_current_caps().get_structure(0)
+        width, height = picture.get_int("width")[1], picture.get_int("height")[1]
+        samples.append((time.time(), width, height, sizes[-1]))
+        return Gst.PadProbeReturn.OK
+
+    def on_message(_bus: Any, message: Any) -> Any:
+        if message.type in (Gst.MessageType.ERROR, Gst.MessageType.WARNING):
+            errors.append(message.get_structure().to_string())
+        return Gst.BusSyncReply.PASS
+
+    pipeline.get_by_name("received").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_unit)
+    pipeline.get_by_name("sink").get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, on_frame)
+    pipeline.get_bus().set_sync_handler(on_message)
+    pipeline.set_state(Gst.State.PLAYING)
+    try:
+        yield samples, errors
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+@contextmanager
+def _recorded() -> Iterator[list[float]]:
+    """Times at which knobs were set, from now on."""
+    times: list[float] = []
+    plain = knobs.Knobs._set_waiting
+
+    def timed(self: knobs.Knobs) -> None:
+        waiting = bool(self._waiting)
+        plain(self)
+        if waiting:
+            times.append(time.perf_counter())
+
+    knobs.Knobs._set_waiting = timed
+    try:
+        yield times
+    finally:
+        knobs.Knobs._set_waiting = plain
+
+
+def _until(done: Any, seconds: float = 10) -> None:
+    until = time.monotonic() + seconds
+    while not done():
+        if time.monotonic() > until:
+            raise SystemExit("it did not come to pass; is the machine idle?")
+        time.sleep(0.0005)
+
+
+def _kbps(samples: Sequence[Sample], start: float, end: float) -> float:
+    return sum(s[3] for s in samples if start <= s[0] < end) * 8 / 1000 / (end - start)
+
+
+def _print(what: str, values: list[float], unit: str) -> None:
+    print(f"{what:52} {middle(values):8.2f} median {percentile(values, 0.95):7.2f} p95 {max(values):7.2f} max {unit}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""A vehicle that streams: cameras, loop and control link together. The verb `vehicle` runs it; so may your program.
+
+    with live_vehicle(["source=appsrc"]) as vehicle:
+        vehicle.start()                               # the loop runs in a thread of its own
+        while driving:
+            vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.config import load_run
+from runner.control import OFFLINE, Link, read_request
+from runner.graph import rtsp_url
+from runner.loop import Log, Loop
+from runner.model import Progress
+from runner.sources import compile_plans, render_missing
+
+if TYPE_CHECKING:
+    from runner.apply import VehicleSide
+
+
+class LiveVehicle:
+    """The parts of a vehicle that streams.
+
+    side  the cameras
+    loop  events in, commands out; `loop.post` takes events from any thread
+    """
+
+    def __init__(self, side: VehicleSide, loop: Loop) -> None:
+        self.side, self.loop = side, loop
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Run the loop in a thread, until the vehicle is left."""
+        self._thread = threading.Thread(target=self.loop.run, name="loop", daemon=True)
+        self._thread.start()
+
+    def push(self, camera: str, frame: Any) -> bool:
+        """One frame of a camera whose source is `appsrc`, captured now.
+
+        frame    I420 of the camera's (native) size: width * height * 3 / 2 bytes
+        returns  False where nobody watches, so that the frame went nowhere
+        raises   ValueError for a frame of another length, KeyError for an unknown camera
+        """
+        return self.side.push(camera, frame)
+
+    def stop(self) -> None:
+        self.loop.stop()
+        if self._thread:
+            self._thread.join()
+
+
+@contextmanager
+def live_vehicle(
+    overrides: Sequence[str] = (),
+    conf: Path | None = None,
+    *,
+    log: Path | None = None,
+    say: Callable[[str], None] = print,
+    progress: Progress = lambda what, done: None,
+) -> Iterator[LiveVehicle]:
+    """Everything that the vehicle's side needs, stopped and said goodbye for at the end.
+
+    log       directory that the drive is recorded to
+    say       told in a line what happens
+    progress  told how far the rendering of a synthetic drive is
+    raises    ConfigError, RunError
+    """
+    from runner import apply
+
+    vehicle, pqos, track = load_run(overrides, conf, check=apply.check_plan)
+    render_missing(vehicle, progress)
+    plans = compile_plans(vehicle)
+    apply.check_machine(plans)
+    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: say(f"{camera}: {what}"))
+
+    def on_request(payload: bytes) -> None:
+        document, identity, problem = read_request(payload)
+
+        def answer(said: Any) -> None:
+            link.publish("reply", {"id": identity, **said})
+
+        if problem:
+            answer({"accepted": False, "reason": problem})
+        else:
+            loop.post(document, answer)
+
+    def on_connected(here: bool) -> None:
+        if not here:
+            loop.post({"event": "operator_disconnected"})  # for the vehicle, who cannot be heard is gone
+
+    link = Link(vehicle.name, vehicle.control, ("state", OFFLINE), {"request": on_request}, on_connected)
+    loop = Loop(vehicle, side, pqos, track, Log(log), link.publish, say)
+    live = LiveVehicle(side, loop)
+    try:
+        link.connect()
+        for plan in plans:
+            say(f"{plan.camera.name}: {rtsp_url(vehicle.media, plan.camera.name) if plan.serves else 'dials out'}")
+        yield live
+    finally:
+        live.stop()
+        link.close("state", OFFLINE)
+        side.stop()

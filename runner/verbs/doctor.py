@@ -1,0 +1,118 @@
+"""usage: tod-runner doctor [OVERRIDE ...]
+
+What this machine lacks for what the configuration asks for, and what brings it: Python packages, GStreamer and its
+bindings, elements, broker, free ports, cores. Ends with status 1 where something is missing.
+
+  tod-runner doctor
+  tod-runner doctor vehicle=delivery_robot graph=h264_va_rtsp
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import NamedTuple
+
+from runner.broker import find_mosquitto
+from runner.config import load
+from runner.errors import RunError
+from runner.model import Endpoint, Vehicle
+from runner.sources import compile_plans
+from runner.verbs import Arguments
+
+TYPELIBS = {  # Debian package by typelib
+    "Gst": "gir1.2-gstreamer-1.0",
+    "GstRtp": "gir1.2-gst-plugins-base-1.0",
+    "GstRtsp": "gir1.2-gst-plugins-base-1.0",
+    "GstRtspServer": "gir1.2-gst-rtsp-server-1.0",
+}
+EXTRAS = {"paho.mqtt": "live", "rich": "live", "numba": "synthetic"}  # extra of this package by Python module
+CORE_MPX_S = 180  # what one core crops, scales and encodes in a second at factor 0.5, measured with h264_rtsp
+
+
+class Finding(NamedTuple):
+    """One thing looked at."""
+
+    fine: bool
+    what: str
+
+
+def run(arguments: Arguments) -> int:
+    vehicle = load(arguments.overrides, arguments.conf, runnable=False)
+    findings = list(examine(vehicle))
+    for fine, what in findings:
+        print(f"{'ok     ' if fine else 'MISSING'} {what}")
+    return 0 if all(fine for fine, _ in findings) else 1
+
+
+def examine(vehicle: Vehicle) -> Iterator[Finding]:
+    """Everything that the live verbs need."""
+    for module, extra in EXTRAS.items():
+        there = _importable(module)
+        yield Finding(there, f"Python module {module}" + ("" if there else f": pip install 'tod-runner[{extra}]'"))
+    bindings = list(_bindings())
+    yield from bindings
+    if all(finding.fine for finding in bindings):
+        yield from _elements(vehicle)
+    try:
+        yield Finding(True, f"MQTT broker {find_mosquitto()}, for the demo")
+    except RunError as error:
+        yield Finding(False, str(error))
+    if all(finding.fine for finding in bindings):
+        yield from _ports(vehicle)
+    yield _cores(vehicle)
+
+
+def _importable(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _bindings() -> Iterator[Finding]:
+    if not _importable("gi"):
+        yield Finding(False, "Python module gi: apt-get install python3-gi, and a virtual environment that sees it")
+        return
+    import gi
+
+    for name, package in TYPELIBS.items():
+        try:
+            gi.require_version(name, "1.0")
+        except ValueError:
+            yield Finding(False, f"typelib {name}: apt-get install {package}")
+        else:
+            yield Finding(True, f"typelib {name}")
+
+
+def _elements(vehicle: Vehicle) -> Iterator[Finding]:
+    from runner.apply import missing_plugins
+
+    plans = compile_plans(vehicle)
+    names = dict.fromkeys(e.factory for plan in plans for e in (*plan.source, *plan.vehicle, *plan.operator))
+    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
+    yield from (Finding(False, sentence) for sentence in missing)
+    if not missing:
+        yield Finding(True, f"{len(names)} GStreamer elements")
+
+
+def _ports(vehicle: Vehicle) -> Iterator[Finding]:
+    from runner.apply import check_port_free
+
+    ports: dict[str, Endpoint] = {"media.port": vehicle.media, "control.port": vehicle.control}
+    for key, endpoint in ports.items():
+        try:
+            check_port_free(endpoint)
+        except RunError as error:
+            yield Finding(False, f"{key}: {error}")
+        else:
+            yield Finding(True, f"{key}: {endpoint.host}:{endpoint.port} is free")
+
+
+def _cores(vehicle: Vehicle) -> Finding:
+    """Whether the cores carry all cameras at full rate, as an estimate; never called missing."""
+    load_mpx = sum(float(camera.fps) * camera.width * camera.height for camera in vehicle.cameras.values()) / 1e6
+    cores = os.cpu_count() or 1
+    need = load_mpx / CORE_MPX_S
+    return Finding(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving comes on top")
