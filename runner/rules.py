@@ -117,9 +117,11 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
             continue
         model, roi, full = camera.rate_quality, state.rois[name], camera.full_roi
         bitrate = scaling.as_full_image(draft.bitrate[name], roi, full)
-        r = scaling.select_range(model, bitrate)
+        # What cannot be sent is not a picture to look at: however few its pixels, the smallest factor.
+        nothing = draft.bitrate[name] < 1
+        r = 0 if nothing else scaling.select_range(model, bitrate)
         factors[name] = factor = model.scaling[r]
-        seen = "" if roi == full else f", as {int(bitrate)} for the full image"
+        seen = "" if nothing or roi == full else f", as {int(bitrate)} for the full image"
         reasons[name] = (
             f"{int(draft.bitrate[name])} of {_short(draft.demand[name])} kbit/s{seen}, "
             f"range {scaling.bitrate_range(model, r)} -> {plain(factor)}"
