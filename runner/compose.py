@@ -50,15 +50,18 @@ class Composed:
         """The part that has the value; for what is missing, the one that says most about its surroundings."""
         inside = [part for part in self.parts if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
+            makers = [part for part in inside if len(part.package) == length]
+            above = (part for part in inside if len(part.package) < length)
+            holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
             # For a missing key ask who made its surroundings, the most local file first.
-            asked = inside if length == len(path) else sorted(inside, key=lambda part: -len(part.package))
-            for part in asked:
-                if _holds(part.content, path[len(part.package) : length]) and length > len(part.package):
-                    return part
-            for part in asked:
-                if len(part.package) == length:
-                    return part
+            asked = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
+            if asked:
+                return asked[0]
         return self.parts[-1]
+
+
+def _locality(part: Part) -> int:
+    return -len(part.package)
 
 
 def conf_directories(user: Path | None) -> list[Path]:
@@ -161,8 +164,11 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
+    OmegaConf.clear_resolver("oc.env")
     _search(directories)
     GlobalHydra.instance().clear()
     try:
@@ -172,7 +178,8 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
         raise ConfigError(_unreadable_files(directories) or [Problem("conf", "", None, str(error))]) from None
     except (HydraException, OmegaConfBaseException) as error:
         problem = _hydra_problem(error, directories)
-        raise ConfigError([problem] if problem.rule else _misshapen_files(directories) or [problem]) from None
+        clear = problem.rule and "Cannot merge" not in str(error)
+        raise ConfigError([problem] if clear else _misshapen_files(directories) or [problem]) from None
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         # What Hydra takes for granted: that a file is a mapping, and its defaults list a list of names.
         rule = str(error).partition("\n")[0]
@@ -186,8 +193,6 @@ def _resolved(config: DictConfig, parts: list[Part]) -> Composed:
     from omegaconf import OmegaConf, open_dict
     from omegaconf.errors import OmegaConfBaseException
 
-    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
-    OmegaConf.clear_resolver("oc.env")
     with open_dict(config):
         del config["hydra"]
     try:
@@ -241,7 +246,8 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         return Problem(_chooser(twice[1], directories), "defaults", repr(f"/{twice[1]}"), rule)
     inside = re.search(r"In '([\w/.-]+)': (?:\w+ raised while composing config:; )?(.*)", rule)
     if inside:
-        return Problem(label(find_file(directories, *_place(inside[1])), directories), "", None, inside[2])
+        rule = re.sub("Cannot merge.*", "a key is a list here and a mapping in a file that this builds on", inside[2])
+        return Problem(label(find_file(directories, *_place(inside[1])), directories), "", None, rule)
     interpolation = re.search(r"Error resolving interpolation '(.+?)'", text)
     if interpolation:
         paths = (path for path in _files(directories) if interpolation[1] in path.read_text(encoding="utf-8"))
