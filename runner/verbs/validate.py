@@ -78,7 +78,11 @@ def check_file(path: Path, relative: Path, name: str) -> Iterator[Problem]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         yield yaml_problem(error, name)
         return
+    bases = content.get("defaults") if isinstance(content, dict) else None
+    inherits = any(isinstance(base, str) and base != "_self_" for base in bases or ())
     for finding in schema.findings(content, kind):
+        if inherits and finding.found == "missing":
+            continue  # a file that it builds on may have it; the combinations show whether
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
