@@ -103,7 +103,7 @@ def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Ev
 def read_event(line: str) -> tuple[Any, str]:
     """The JSON of a line, and what is wrong with it as an event, or ""."""
     try:
-        document = json.loads(line, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+        document = json.loads(line.rstrip(), parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
     except RecursionError:
         return None, "not JSON: nested too deeply"
     except json.JSONDecodeError as error:
