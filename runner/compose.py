@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos")
 COMMAND_LINE = "command line"
+PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +50,18 @@ class Composed:
         """The part that has the value; for what is missing, the one that says most about its surroundings."""
         inside = [part for part in self.parts if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
+            makers = [part for part in inside if len(part.package) == length]
+            above = (part for part in inside if len(part.package) < length)
+            holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
             # For a missing key ask who made its surroundings, the most local file first.
-            asked = inside if length == len(path) else sorted(inside, key=lambda part: -len(part.package))
-            for part in asked:
-                if _holds(part.content, path[len(part.package) : length]) and length > len(part.package):
-                    return part
-            for part in asked:
-                if len(part.package) == length:
-                    return part
+            asked = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
+            if asked:
+                return asked[0]
         return self.parts[-1]
+
+
+def _locality(part: Part) -> int:
+    return -len(part.package)
 
 
 def conf_directories(user: Path | None) -> list[Path]:
@@ -78,6 +82,10 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     if problems:
         raise ConfigError(problems)
     config, choices = _compose(parsed, directories)
+    vehicle = find_file(directories, "vehicle", choices.get("vehicle", ""))
+    if vehicle.exists() and PACKAGE_HEADER not in vehicle.read_text(encoding="utf-8"):
+        rule = f"must begin with the line {PACKAGE_HEADER}"
+        raise ConfigError([Problem(label(vehicle, directories), "", None, rule)])
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
     parts += reversed(list(_file_parts(directories, choices)))
     return _resolved(config, parts)
@@ -112,12 +120,17 @@ def _parse_overrides(overrides: Sequence[str]) -> list[Override]:
             group = override.key_or_group.split("@")[0].lstrip("/")
             if override.is_sweep_override():
                 raise HydraException("a,b,c is a sweep; write [a,b,c] for a list")
+            if group.partition(".")[0].partition("/")[0] in ("", "hydra"):
+                raise HydraException("no such key")
             value = None if override.is_delete() else override.value()
             choice = group in GROUPS and not isinstance(value, dict)
+            if choice and value is None and not override.is_delete():
+                value = "null"
             parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice))
         except HydraException as error:
             rule = str(error).splitlines()[0]
-            hint = "" if "sweep" in rule else """; quote a value with special characters: 'key="value"'"""
+            plain = "sweep" in rule or "no such" in rule
+            hint = "" if plain else """; quote a value with special characters: 'key="value"'"""
             problems.append(Problem(COMMAND_LINE, "", text, rule + hint))
     if problems:
         raise ConfigError(problems)
@@ -151,8 +164,11 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
+    OmegaConf.clear_resolver("oc.env")
     _search(directories)
     GlobalHydra.instance().clear()
     try:
@@ -161,7 +177,13 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(_unreadable_files(directories) or [Problem("conf", "", None, str(error))]) from None
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError([_hydra_problem(error, directories)]) from None
+        problem = _hydra_problem(error, directories)
+        clear = problem.rule and "Cannot merge" not in str(error)
+        raise ConfigError([problem] if clear else _misshapen_files(directories) or [problem]) from None
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        # What Hydra takes for granted: that a file is a mapping, and its defaults list a list of names.
+        rule = str(error).partition("\n")[0]
+        raise ConfigError(_misshapen_files(directories) or [Problem("conf", "", None, rule)]) from None
     choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
     return config, choices
 
@@ -171,12 +193,10 @@ def _resolved(config: DictConfig, parts: list[Part]) -> Composed:
     from omegaconf import OmegaConf, open_dict
     from omegaconf.errors import OmegaConfBaseException
 
-    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
-    OmegaConf.clear_resolver("oc.env")
     with open_dict(config):
         del config["hydra"]
     try:
-        document = OmegaConf.to_container(config, resolve=True)
+        document = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         origin = Composed({}, parts)
         path = tuple(int(p) if p.isdigit() else p for p in re.split(r"[.\[\]]+", str(error.full_key or "")) if p)
@@ -210,15 +230,49 @@ _REGISTERED: list[type] = []
 def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
     """Hydra's message as one problem; a file missing from a defaults list gets a suggestion."""
     text = str(error)
-    missing = re.search(r"In '([\w/]+)': Could not find '([\w/]+)'", text)
+    missing = re.search(r"In '([\w/.-]+)': Could not (?:find|load) '([\w/.-]+)'", text)
     if missing:
         where, wanted = missing.groups()
-        group, _, name = wanted.rpartition("/")
+        group, name = _place(wanted)
         options = sorted({p.stem for d in directories for p in (d / group).glob("*.yaml")})
-        found = find_file(directories, *where.rpartition("/")[::2])
-        return Problem(label(found, directories), "defaults", repr(wanted), f"no such file, {suggest(name, options)}")
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return Problem("conf", "", None, "; ".join(lines))
+        hint = suggest(name, options) if options else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
+        file = label(find_file(directories, *_place(where)), directories)
+        return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
+    lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
+    rule = "; ".join(lines)
+    twice = re.search(r"Multiple values for ([\w/@.-]+?)\. ", text)
+    if twice:
+        rule = f"is chosen twice; to choose again write override /{twice[1]}: FILE"
+        return Problem(_chooser(twice[1], directories), "defaults", repr(f"/{twice[1]}"), rule)
+    inside = re.search(r"In '([\w/.-]+)': (?:\w+ raised while composing config:; )?(.*)", rule)
+    if inside:
+        rule = re.sub("Cannot merge.*", "a key is a list here and a mapping in a file that this builds on", inside[2])
+        return Problem(label(find_file(directories, *_place(inside[1])), directories), "", None, rule)
+    interpolation = re.search(r"Error resolving interpolation '(.+?)'", text)
+    if interpolation:
+        paths = (path for path in _files(directories) if interpolation[1] in path.read_text(encoding="utf-8"))
+        rule = "a defaults list may refer to a choice above it only, such as ${vehicle}"
+        for path in paths:
+            return Problem(label(path, directories), "defaults", interpolation[1], rule)
+    return Problem(COMMAND_LINE, "", None, rule)
+
+
+def _place(name: str) -> tuple[str, str]:
+    """Group and file of a name like vehicle/tum_q7."""
+    group, _, file = name.rpartition("/")
+    return group, file
+
+
+def _chooser(key: str, directories: Sequence[Path]) -> str:
+    """The file whose defaults list speaks of a group and package most often, the user's files first."""
+
+    def times(path: Path) -> int:
+        content = load_file(path)
+        entries = content.get("defaults") if isinstance(content, dict) else None
+        keys = [next(iter(entry)) for entry in entries or () if isinstance(entry, dict)]
+        return sum(str(k).removeprefix("/") == key for k in keys)
+
+    return label(max(_files(directories), key=times), directories)
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -239,6 +293,11 @@ def load_file(path: Path) -> Any:
     raises  yaml.YAMLError, OSError, UnicodeDecodeError
     """
     return _load(path)
+
+
+def _files(directories: Sequence[Path]) -> Iterator[Path]:
+    """Every YAML file, the user's first."""
+    return (path for d in directories for path in sorted(d.rglob("*.yaml")))
 
 
 def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
@@ -263,12 +322,52 @@ def yaml_problem(error: Exception, path: str) -> Problem:
 
 def _unreadable_files(directories: Sequence[Path]) -> list[Problem]:
     problems = []
-    for path in (path for d in directories for path in sorted(d.rglob("*.yaml"))):
+    for path in _files(directories):
         try:
             load_file(path)
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             problems.append(yaml_problem(error, label(path, directories)))
     return problems
+
+
+def _misshapen_files(directories: Sequence[Path]) -> list[Problem]:
+    """Files that are YAML and yet no configuration."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    problems = []
+    for path in _files(directories):
+        content, file = load_file(path), label(path, directories)
+        if content is None:
+            continue
+        if not isinstance(content, dict):
+            problems.append(Problem(file, "", schema.shown(content), "must be a mapping"))
+            continue
+        if _is_circular(content, []):
+            problems.append(Problem(file, "", None, "an alias, *NAME, stands inside what it refers to"))
+            continue
+        entries = content.get("defaults", [])
+        if not isinstance(entries, list):
+            problems.append(Problem(file, "defaults", schema.shown(entries), "must be a list"))
+            continue
+        for index, entry in enumerate(entries):
+            where = f"defaults[{index}]"
+            if entry == path.stem:
+                problems.append(Problem(file, where, repr(entry), "is this file itself"))
+            elif not isinstance(entry, str) and not (isinstance(entry, dict) and len(entry) == 1):
+                problems.append(Problem(file, where, schema.shown(entry), "must be a file's name or GROUP: NAME"))
+        try:
+            OmegaConf.create(content)
+        except OmegaConfBaseException as error:
+            problems.append(Problem(file, str(error.full_key or ""), None, str(error).partition("\n")[0]))
+    return problems
+
+
+def _is_circular(value: Any, above: list[int]) -> bool:
+    if not isinstance(value, dict | list):
+        return False
+    inner = value.values() if isinstance(value, dict) else value
+    return id(value) in above or any(_is_circular(part, [*above, id(value)]) for part in inner)
 
 
 def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterator[Part]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -28,6 +29,7 @@ from runner.model import (
     Value,
     Vehicle,
     exact,
+    suggest,
 )
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
+CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # what the schema asks of a camera, given by its kind
 GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "wire", "knobs")
 
 T = TypeVar("T")
@@ -99,11 +102,12 @@ class _Builder:
 
     def vehicle(self) -> Vehicle | None:
         document = self.composed.document
-        wrong = schema.findings(document, "composed")
+        wrong = list(self._told_once(schema.findings(document, "composed")))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
-        self.bad = {f.path for f in wrong}
-        modes = {mode: self._rule_list(mode) for mode in Mode} if self.fine("modes") else {}
-        cameras = {name: self._camera(name) for name in document.get("cameras") or {} if self.fine("cameras", name)}
+        self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
+        modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
+        mounted = document.get("cameras")
+        cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         if not (self.fine("media") and self.fine("control")):
             return None
         media, control = (Endpoint(**document[key]) for key in ("media", "control"))
@@ -133,9 +137,21 @@ class _Builder:
 
     # --- problems -----------------------------------------------------------------------------------------------------
 
-    def fine(self, *path: str) -> bool:
-        """Whether the schema found nothing wrong at or below a path."""
-        return not any(bad[: len(path)] == path for bad in self.bad)
+    def fine(self, *path: str | int) -> bool:
+        """Whether the schema found nothing wrong at or below a path, nor with what it is a part of."""
+        return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
+
+    def _told_once(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
+        """A name below cameras that no kind is mounted under is one mistake, not many missing keys."""
+        missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
+        unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
+        for path in sorted(unmounted, key=str):
+            others = [name for name in self.composed.document["cameras"] if ("cameras", name) not in unmounted]
+            hint = suggest(str(path[1]), others)
+            if "did you mean" not in hint:
+                hint = f"its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
+            yield schema.Finding(path, None, f"no camera of that name is mounted, {hint}")
+        yield from (f for f in wrong if f.path[:2] not in unmounted)
 
     def attempt(self, path: schema.Path, make: Callable[[], T]) -> T | None:
         try:
@@ -166,16 +182,13 @@ class _Builder:
     def _camera(self, name: str) -> Camera | None:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
-        own_graph, own_source = "graph" in data, "source" in data
-        graph_path = (*path, "graph") if own_graph else ("graph",)
-        if not (self.fine(*graph_path) and self.fine("source")):
+        # Parts that the schema accepts are looked at further, whatever is wrong beside them.
+        graph = self._part(self._of(name, "graph"), _graph)
+        source = self._part(self._of(name, "source"), _source)
+        model = self._part((*path, "rate_quality"), _rate_quality)
+        if graph is None or source is None or model is None or not (self.fine(*path) and self.fine("fps_max")):
             return None
-        graph = self.attempt(graph_path, lambda: _graph(data["graph"] if own_graph else document["graph"]))
-        model = self.attempt((*path, "rate_quality"), lambda: _rate_quality(data["rate_quality"]))
-        source = _source(data["source"] if own_source else document["source"])
-        if graph is None or model is None:
-            return None
-        fps, limit = exact(data["fps"]), document["fps_max"]
+        fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
         return self.attempt(
@@ -199,11 +212,20 @@ class _Builder:
             ),
         )
 
+    def _part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
+        """What a part of the document describes, if the schema accepts it."""
+        if not self.fine(*path):
+            return None
+        data: Any = self.composed.document
+        for key in path:
+            data = data[key]
+        return self.attempt(path, lambda: make(data))
+
     def _check_inputs(self, camera: Camera) -> None:
         """Whether the clip, device or address that a camera's source asks for is named, and a clip is there."""
         source = camera.source
         for key in () if source.render else sorted(source.needs.intersection(MOUNT_KEYS)):
-            where = ("cameras", camera.name) if key in camera.mount else self._of(camera, "source")
+            where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
             given = camera.mount.get(key, source.settings.get(key))
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
@@ -222,12 +244,12 @@ class _Builder:
             errors = [broken]
         for error in errors:
             section, _, key = error.key.partition(".")
-            self._report(self._of(camera, section), ModelError(key, error.found, error.rule))
+            self._report(self._of(camera.name, section), ModelError(key, error.found, error.rule))
 
-    def _of(self, camera: Camera, section: str) -> schema.Path:
+    def _of(self, camera: str, section: str) -> schema.Path:
         """Where a camera's graph or source stands: its own one, else the one of all."""
-        own = section in self.composed.document["cameras"][camera.name]
-        return ("cameras", camera.name, section) if own else (section,)
+        data = self.composed.document["cameras"][camera]
+        return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
         """No two listeners on one port. Cameras count on from the first port of their graph."""

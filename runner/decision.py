@@ -16,7 +16,8 @@ class Setting:
 
     sending        False: nothing is encoded (off, or allocated below 1 kbit/s), the stream stays connectable
     demand         kbit/s, Eq. (1), 0 when off
-    kbps           whole kbit/s, rounded down
+    kbps           whole kbit/s, rounded down; 0 while nothing is sent
+    given          the same, also while a rule stops all sending: what the camera resumes with
     scaling        selected factor; None when off
     width, height  px of the encoded picture, 0 when off
     reason         why, for the operator; takes no part in comparison
@@ -26,6 +27,7 @@ class Setting:
     sending: bool
     demand: Kbps
     kbps: int
+    given: int
     scaling: Fraction | None
     roi: Roi
     width: int

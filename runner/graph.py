@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from runner.commands import KnobValue
-from runner.model import PLACEHOLDER, Camera, Element, Endpoint, ModelError, Roi, Value, suggest
+from runner.model import PLACEHOLDER, Camera, Element, Endpoint, Graph, ModelError, Roi, Source, Value, suggest
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 # Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and with what.
@@ -80,9 +80,10 @@ def compile_graph(camera: Camera, media: Endpoint, index: int = 0, clip: str | N
     media   the vehicle's RTSP server
     index   number of the camera in its vehicle, for ports
     clip    path of the rendered clip, where the source renders one and it is there
-    raises  ModelError for a placeholder that nothing fills
+    raises  ModelError for a placeholder that nothing fills, or a name that source and graph share
     """
     graph, source = camera.graph, camera.source
+    _check_names(graph, source)
     values = _values(camera, media, index, clip)
 
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
@@ -152,6 +153,17 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
         return {"left": left, "right": right, "top": top, "bottom": bottom}
     width, height = value
     return {"width": width, "height": height}
+
+
+def _check_names(graph: Graph, source: Source) -> None:
+    """Source and graph become one pipeline, whose elements are found by name."""
+    for key, elements in (("elements", source.elements), ("stand_in", source.stand_in)):
+        taken = {element.name for element in (*graph.vehicle, *graph.wire_vehicle)}
+        for index, element in enumerate(elements):
+            if element.name in taken:
+                rule = "is already the name of another element"
+                raise ModelError(f"source.{key}[{index}].name", repr(element.name), rule)
+            taken.add(element.name)
 
 
 def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> dict[str, Value]:

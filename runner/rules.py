@@ -117,9 +117,11 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
             continue
         model, roi, full = camera.rate_quality, state.rois[name], camera.full_roi
         bitrate = scaling.as_full_image(draft.bitrate[name], roi, full)
-        r = scaling.select_range(model, bitrate)
+        # What cannot be sent is not a picture to look at: however few its pixels, the smallest factor.
+        nothing = draft.bitrate[name] < 1
+        r = 0 if nothing else scaling.select_range(model, bitrate)
         factors[name] = factor = model.scaling[r]
-        seen = "" if roi == full else f", as {int(bitrate)} for the full image"
+        seen = "" if nothing or roi == full else f", as {int(bitrate)} for the full image"
         reasons[name] = (
             f"{int(draft.bitrate[name])} of {_short(draft.demand[name])} kbit/s{seen}, "
             f"range {scaling.bitrate_range(model, r)} -> {plain(factor)}"
@@ -241,7 +243,7 @@ def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
 def _setting(state: State, draft: Draft, name: str) -> Setting:
     roi = state.rois[name]
     if not state.on[name]:
-        return Setting(False, False, allocation.ZERO, 0, None, roi, 0, 0, "switched off")
+        return Setting(False, False, allocation.ZERO, 0, 0, None, roi, 0, 0, "switched off")
     kbps, factor = int(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
     width, height = scaling.output_size(roi, factor)
@@ -249,7 +251,7 @@ def _setting(state: State, draft: Draft, name: str) -> Setting:
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
     reason = "; ".join((reason, *draft.notes))
-    return Setting(True, sending, draft.demand[name], kbps if sending else 0, factor, roi, width, height, reason)
+    return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
 
 
 def _short(bitrate: Kbps) -> int | str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,10 @@ _TYPES = {
     "array": "a list",
     "null": "null",
 }
+_PATTERNS = {
+    "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
+    "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,24 +40,28 @@ class Finding:
     found: str | None
     rule: str
 
+    @property
+    def meant(self) -> Path:
+        """The path that was probably meant where a key is misspelt; else its own."""
+        _, misspelt, key = self.rule.rpartition("did you mean ")
+        return (*self.path[:-1], key.rstrip("?")) if misspelt and self.found is None else self.path
+
 
 def findings(document: Any, schema: str) -> list[Finding]:
     """All that is wrong with a document, in the order of the document; empty: it is valid.
 
     schema  name of a file in schemas/ without its ending
     """
+    odd = list(_oddities(document, ()))
+    seen = {f.path for f in odd}
     errors = sorted(validator(schema).iter_errors(document), key=lambda e: [str(part) for part in e.absolute_path])
-    found = [finding for error in errors for finding in _explain(error)]
-    # A misspelt key is one mistake, not an unknown key and a missing one.
-    meant = {
-        (*f.path[:-1], f.rule.rpartition("did you mean ")[2].rstrip("?")) for f in found if "did you mean" in f.rule
-    }
-    return [f for f in found if not (f.found == "missing" and f.path in meant)]
+    found = [f for f in _explained(errors) if not any(f.path[: len(path)] == path for path in seen)]
+    return odd + found
 
 
 def dotted(path: Path) -> str:
     """A path as people write it: cameras.front_left.rate_quality.scaling[2]."""
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    text = "".join(f".{part}" if not isinstance(part, int) or isinstance(part, bool) else f"[{part}]" for part in path)
     return text.removeprefix(".")
 
 
@@ -94,7 +103,7 @@ def event_problem(document: Any) -> str:
         return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
     if check.is_valid(document):
         return ""
-    problems = [f for error in check.iter_errors(document) for f in _explain(error)]
+    problems = _explained(check.iter_errors(document))
     return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in problems)
 
 
@@ -121,6 +130,28 @@ def _registry() -> Any:
 
     resources = ((f"{name}.schema.json", DRAFT202012.create_resource(schema_document(name))) for name in schema_names())
     return Registry().with_resources(resources)
+
+
+def _oddities(value: Any, path: Path) -> Iterator[Finding]:
+    """What YAML can say and JSON Schema cannot speak of: keys that are no text, numbers that are none."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if isinstance(key, str):
+                yield from _oddities(inner, (*path, key))
+            else:
+                yield Finding((*path, key), None, "a key must be text, quote it")
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _oddities(inner, (*path, index))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield Finding(path, f"{value}", "must be a finite number")
+
+
+def _explained(errors: Iterable[Any]) -> list[Finding]:
+    found = list(dict.fromkeys(finding for error in errors for finding in _explain(error)))
+    # A misspelt key is one mistake, not an unknown key and a missing one.
+    meant = {f.meant for f in found if f.found != "missing"}
+    return [f for f in found if not (f.found == "missing" and f.path in meant)]
 
 
 def _explain(error: Any) -> Iterator[Finding]:
@@ -165,6 +196,6 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "maxProperties":
             return "must have one entry"
         case "pattern":
-            return str(schema.get("description", f"must match {limit}"))
+            return _PATTERNS.get(limit) or str(schema.get("description", f"must match {limit}"))
         case _:
             return f"breaks {keyword} {shown(limit)}"

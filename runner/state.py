@@ -110,9 +110,9 @@ def _changed(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
-    """What the cameras that are on send now, as settings of mode single."""
+    """What the cameras that are on send now, or would if an operator watched, as settings of mode single."""
     settings = ((name, in_force.settings[name]) for name in names or in_force.settings)
-    return {name: Manual(s.kbps, s.scaling) for name, s in settings if s.scaling is not None}
+    return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 
 
 def _enter(state: State, mode: Mode, in_force: Decision) -> State:

@@ -34,6 +34,8 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
+LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
+
 
 def run(arguments: Arguments) -> int:
     pqos: Pqos | None = None
@@ -88,7 +90,7 @@ def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Ev
     last = 0.0
     for number, line in enumerate(lines, 1):
         document, problem = read_event(line)
-        if not problem and isinstance(document, dict) and "log" in document:
+        if not problem and _is_log(document):
             continue
         if not problem and document["t"] < last:
             problem = f"t: {document['t']}: must not fall, the event before was at {last}"
@@ -101,14 +103,19 @@ def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Ev
 def read_event(line: str) -> tuple[Any, str]:
     """The JSON of a line, and what is wrong with it as an event, or ""."""
     try:
-        document = json.loads(line, parse_constant=_no_number, parse_float=_finite)
+        document = json.loads(line.rstrip(), parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
     except RecursionError:
         return None, "not JSON: nested too deeply"
+    except json.JSONDecodeError as error:
+        return None, f"not JSON: {error.msg} (column {error.pos + 1})"
     except ValueError as error:
         return None, f"not JSON: {error}"
-    if isinstance(document, dict) and "log" in document:
-        return document, ""
-    return document, event_problem(document)
+    return document, "" if _is_log(document) else event_problem(document)
+
+
+def _is_log(document: Any) -> bool:
+    """Whether it is a line of a drive log that tells what the vehicle did: a decision, telemetry."""
+    return isinstance(document, dict) and "log" in document and "event" not in document
 
 
 def _no_number(text: str) -> float:
@@ -120,6 +127,12 @@ def _finite(text: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{text} is too large")
     return number
+
+
+def _whole(text: str) -> int:
+    if len(text) > LONGEST_WHOLE:
+        raise ValueError(f"{text[:20]}... is too large")
+    return int(text)
 
 
 @contextmanager
@@ -145,7 +158,9 @@ def _output(arguments: Arguments) -> Iterator[TextIO]:
         sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)  # type: ignore[union-attr]
         yield sys.stdout
         return
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    # What is there and no file, such as /dev/null, is written to as it is.
+    special = path.exists() and not path.is_file()
+    unfinished = path if special else path.with_name(f".{path.name}.{os.getpid()}")
     try:
         file = unfinished.open("w", encoding="utf-8")
     except OSError as error:
@@ -154,4 +169,5 @@ def _output(arguments: Arguments) -> Iterator[TextIO]:
         with file:
             yield file
     finally:
-        unfinished.replace(path)  # also after a bad line: what was put out before stays
+        if not special:
+            unfinished.replace(path)  # also after a bad line: what was put out before stays

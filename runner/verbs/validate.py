@@ -2,7 +2,8 @@
 
 Check every file of the configuration against its schema, then every combination of vehicle, modes, graph and source:
 it must compose and compile. Where GStreamer is installed, also against its registry: elements, properties, types,
-ranges, and whether what a knob turns may change while playing. Ends with status 2 and all problems at once.
+ranges, and whether what a knob turns may change while playing. Maps, traces and tracks of pqos files are read. Ends
+with status 2 and all problems at once.
 
   tod-runner validate                          the packaged files
   tod-runner validate conf=my_vehicles         yours too, the step for your CI
@@ -22,7 +23,7 @@ import yaml
 
 from runner import schema
 from runner.compose import GROUPS, conf_directories, label, load_file, yaml_problem
-from runner.config import Check, load
+from runner.config import Check, load, load_run
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
 from runner.model import ModelError
@@ -42,6 +43,7 @@ def run(arguments: Arguments) -> int:
         chunk = max(1, len(combinations) // (8 * (os.cpu_count() or 1)))
         results = list(pool.map(_check, combinations, chunksize=chunk))
     problems = [problem for result in results for problem in result.problems]
+    problems += _prediction_problems(arguments, directories)
     if problems:
         raise ConfigError(problems)
     notes = dict.fromkeys(note for result in results for note in result.notes)
@@ -76,7 +78,11 @@ def check_file(path: Path, relative: Path, name: str) -> Iterator[Problem]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         yield yaml_problem(error, name)
         return
+    bases = content.get("defaults") if isinstance(content, dict) else None
+    inherits = any(isinstance(base, str) and base != "_self_" for base in bases or ())
     for finding in schema.findings(content, kind):
+        if inherits and finding.found == "missing":
+            continue  # a file that it builds on may have it; the combinations show whether
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
@@ -91,8 +97,8 @@ def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator
     chosen = {word.partition("=")[0] for word in arguments.overrides}
     axes: list[list[list[str]]] = [[arguments.overrides]]
     for group in COMBINED:
-        options = sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
-        axes.append([[]] if group in chosen else [[f"{group}={option}"] for option in options])
+        options = [[f"{group}={option}"] for option in _options(group, directories)]
+        axes.append([[]] if group in chosen else options)
     for words in product(*axes):
         yield [word for part in words for word in part], arguments.conf
 
@@ -106,6 +112,21 @@ def _check(combination: tuple[list[str], Path | None]) -> Checked:
     except ConfigError as error:
         return Checked(error.problems, [])
     return Checked([], notes)
+
+
+def _prediction_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
+    """What is wrong with the sources of predictions: maps, traces and tracks are read."""
+    chosen = any(word.lstrip("+~").startswith("pqos") for word in arguments.overrides)
+    for option in [""] if chosen else _options("pqos", directories):
+        words = [*arguments.overrides, f"pqos={option}"] if option else arguments.overrides
+        try:
+            load_run(words, arguments.conf, runnable=False)
+        except ConfigError as error:
+            yield from error.problems
+
+
+def _options(group: str, directories: Sequence[Path]) -> list[str]:
+    return sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
 
 
 def _registry_check(notes: list[str]) -> Check | None:

@@ -1,0 +1,71 @@
+"""Events a second that `tod-runner replay` decides for the eight cameras of the paper's vehicle.
+
+python bench/replay.py [events]
+
+Counted is the whole process: start, composition of the configuration, reading, deciding, writing. Two stories: one in
+which every event is a prediction that changes all bitrates, and a drive as it is logged, in which time, positions and
+link measurements come between the predictions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+WANTED = 7000  # events a second
+RUNS = 3
+
+
+def prediction(t: float) -> dict[str, Any]:
+    return {"t": t, "event": "bitrate_predicted", "kbps": round(5500 + 2500 * math.sin(t / 5), 1)}
+
+
+def predictions(count: int) -> Iterator[dict[str, Any]]:
+    return (prediction(round(index * 0.1, 1)) for index in range(count))
+
+
+def drive(count: int) -> Iterator[dict[str, Any]]:
+    for index in range(count):
+        t = round(index * 0.025, 3)
+        if index % 20 == 0:
+            yield prediction(t)
+        elif index % 4 == 0:
+            yield {"t": t, "event": "clock_advanced"}
+        elif index % 4 == 2:
+            yield {"t": t, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3}
+        else:
+            yield {"t": t, "event": "link_measured", "camera": "front_left", "kbps": 780, "loss": 0.01}
+
+
+def seconds(modes: str, events: Path) -> float:
+    """Best of some runs."""
+    command = [sys.executable, "-m", "runner", "replay", "vehicle=tum_q7", f"modes={modes}", f"input={events}"]
+    times = []
+    for _ in range(RUNS):
+        began = time.perf_counter()
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def main() -> None:
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 50_000
+    with tempfile.TemporaryDirectory() as directory:
+        for story in (predictions, drive):
+            events = Path(directory) / f"{story.__name__}.jsonl"
+            events.write_text("".join(json.dumps(event) + "\n" for event in story(count)))
+            for modes in ("paper", "safe", "steady"):
+                rate = count / seconds(modes, events)
+                verdict = "" if rate >= WANTED else f"  below the wanted {WANTED}"
+                print(f"{story.__name__:12} modes={modes:7} {rate:8.0f} events/s{verdict}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""Shared by the tests: vehicles, drives through the pure core, the command line, configuration files to break."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from runner.__main__ import main
+from runner.config import load
+from runner.decision import Setting
+from runner.events import parse
+from runner.model import Vehicle
+from runner.resources import directory
+from runner.step import Run, start, step
+
+CONF = directory("conf")
+
+
+@cache
+def vehicle(*overrides: str) -> Vehicle:
+    return load(["source=test", *overrides])
+
+
+class Drive:
+    """A run that events are told to, as JSON says them; time stands still unless `t` says otherwise."""
+
+    def __init__(self, *overrides: str) -> None:
+        self.vehicle = vehicle(*overrides)
+        self.run = start(self.vehicle)
+
+    def tell(self, event: str, **keys: Any) -> Run:
+        self.run = step(self.vehicle, self.run, parse({"t": self.run.state.t, "event": event} | keys))
+        return self.run
+
+    def accept(self, event: str, **keys: Any) -> Run:
+        run = self.tell(event, **keys)
+        assert run.refused == ""
+        return run
+
+    @property
+    def total(self) -> Any:
+        return self.run.decision.total
+
+    def __getitem__(self, camera: str) -> Setting:
+        return self.run.decision.settings[camera]
+
+    def sent(self, camera: str) -> tuple[int, float | None]:
+        """What a camera is sent with: whole kbit/s, factor."""
+        setting = self[camera]
+        return setting.kbps, None if setting.scaling is None else float(setting.scaling)
+
+
+class Result(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+    @property
+    def problems(self) -> list[str]:
+        """The problems told, after checking that everything else is as it is for wrong input."""
+        *problems, summary = self.err.splitlines()
+        count = len(problems)
+        assert self.status == 2, self.err
+        assert self.out == ""
+        assert summary == f"{count} problem{'s' * (count != 1)}, nothing was started"
+        return problems
+
+
+class Command:
+    def __init__(self, capture: pytest.CaptureFixture[str]) -> None:
+        self._capture = capture
+
+    def __call__(self, *words: str) -> Result:
+        self._capture.readouterr()
+        status = main(words)
+        return Result(status, *self._capture.readouterr())
+
+
+def process(*words: str, stdin: str | bytes = b"", **options: Any) -> Result:
+    """The command line as a process."""
+    data = stdin.encode() if isinstance(stdin, str) else stdin
+    words = (sys.executable, "-m", "runner", *words)
+    done = subprocess.run(words, input=data, capture_output=True, check=False, **options)
+    return Result(done.returncode, done.stdout.decode(), done.stderr.decode())
+
+
+class UserConf:
+    """A user's configuration directory, made when something is written to it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def word(self) -> str:
+        return f"conf={self.path}"
+
+    def write(self, name: str, text: str | bytes) -> UserConf:
+        path = self.path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return self
+
+    def change(self, name: str, changes: Mapping[str, str]) -> UserConf:
+        """A copy of a packaged file, or of one written before, with some texts replaced, the first of each."""
+        own = self.path / name
+        text = (own if own.exists() else CONF / name).read_text()
+        for old, new in changes.items():
+            assert old in text, f"{name} has no {old!r}"
+            text = text.replace(old, new, 1)
+        return self.write(name, text)

@@ -1,0 +1,508 @@
+"""Configuration: Table I, files of the user's own, and the exact words for everything that can be wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from helpers import CONF, Command, Drive, UserConf, process, vehicle
+
+from runner.config import load
+from runner.errors import ConfigError, Problem
+from runner.model import Mode
+
+TOP_KEYS = "mode, fps_max, media, control, name, cameras, modes, graph, source, pqos"
+CAMERA_KEYS = "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, ..."
+QUOTE = """; quote a value with special characters: 'key="value"'"""
+KNOB_VALUES = (
+    "kbps, bps, left, right, top, bottom, on, off (quote these two), or a caps template over {width} and {height}"
+)
+MINE = """# @package _global_
+defaults:
+  - /cameras@cameras.a: top_view
+  - _self_
+name: mine
+"""
+
+# --- Table I ----------------------------------------------------------------------------------------------------------
+
+FRONT, TOP = ("0.125 0.25 0.5", (1920, 1040), 40), ("0.25 0.375 0.5", (1280, 800), 30)
+TABLE_1 = {  # S, size in px, Hz, b_min,r and b_full in kbit/s
+    "front_left": (*FRONT, "0 300 950", 6000),
+    "front_center": (*FRONT, "0 200 450", 5000),
+    "front_right": (*FRONT, "0 300 950", 6000),
+    "rear_center": ("0.125 0.25 0.5", (1920, 1200), 40, "0 400 1800", 4000),
+    "top_front": (*TOP, "0 150 400", 3000),
+    "top_left": (*TOP, "0 150 400", 3000),
+    "top_right": (*TOP, "0 150 400", 3000),
+    "top_rear": (*TOP, "0 200 400", 3000),
+}
+
+
+def test_the_papers_vehicle_is_table_1_digit_by_digit() -> None:
+    def numbers(values: tuple[object, ...]) -> str:
+        return " ".join(f"{float(value):g}" for value in values)  # type: ignore[arg-type]
+
+    cameras = vehicle("vehicle=tum_q7").cameras
+    assert {
+        name: (
+            numbers(c.rate_quality.scaling),
+            (c.width, c.height),
+            c.fps,
+            numbers(c.rate_quality.b_min),
+            c.rate_quality.b_full,
+        )
+        for name, c in cameras.items()
+    } == TABLE_1
+    assert list(cameras) == list(TABLE_1)
+    assert {c.weight for c in cameras.values()} == {1}
+
+
+def test_the_second_vehicle_is_of_other_shape() -> None:
+    cameras = vehicle("vehicle=delivery_robot").cameras
+    assert len(cameras) == 3
+    assert len({(c.width, c.height, c.rate_quality.scaling) for c in cameras.values()}) == 3
+
+
+def test_modes_safe_is_the_default_and_automatic_the_mode() -> None:
+    assert vehicle().mode is Mode.AUTOMATIC
+    names = [call.rule.name for call in vehicle().modes[Mode.AUTOMATIC]]
+    assert {"fade_when_stale", "cap_at_lower_bound", "pause_without_operator"} <= set(names)
+    paper = {call.rule.name for calls in vehicle("modes=paper").modes.values() for call in calls}
+    assert not paper & {"fade_when_stale", "cap_at_lower_bound", "pause_without_operator", "hold_upscaling"}
+
+
+def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
+    cameras = vehicle("fps_max=33.3", "cameras.front_left.weight=0.1").cameras
+    assert str(cameras["front_left"].weight) == "1/10"
+    assert (str(cameras["front_left"].fps), cameras["top_left"].fps) == ("333/10", 30)
+
+
+# --- a directory of the user's own ------------------------------------------------------------------------------------
+
+
+def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> None:
+    conf.change("cameras/front_center.yaml", {"b_full_kbps: 5000": "b_full_kbps: 7000"})
+    cameras = load(["source=test"], conf.path).cameras
+    assert cameras["front_center"].rate_quality.b_full == 7000
+    assert cameras["front_left"].rate_quality.b_full == 6000
+    assert vehicle().cameras["front_center"].rate_quality.b_full == 5000
+
+
+def test_a_user_adds_vehicle_camera_graph_modes_and_source(conf: UserConf) -> None:
+    conf.change("cameras/front_center.yaml", {"1920": "640", "1040": "480"})
+    (conf.path / "cameras/front_center.yaml").rename(conf.path / "cameras/tiny.yaml")
+    conf.change("graph/h264_rtsp.yaml", {"first_port: 5600": "first_port: 7000"})
+    (conf.path / "graph/h264_rtsp.yaml").rename(conf.path / "graph/own.yaml")
+    conf.write("modes/own.yaml", "defaults: [paper, _self_]\n")
+    conf.write("source/own.yaml", "elements: [{name: source, element: videotestsrc, properties: {pattern: ball}}]\n")
+    conf.write("vehicle/mine.yaml", MINE.replace("top_view", "tiny"))
+    mine = load(["vehicle=mine", "graph=own", "modes=own", "source=own"], conf.path)
+    assert (mine.name, list(mine.cameras)) == ("mine", ["a"])
+    camera = mine.cameras["a"]
+    assert (camera.width, camera.graph.settings["first_port"]) == (640, 7000)
+    assert camera.source.elements[0].properties == {"pattern": "ball"}
+
+
+def test_a_modes_file_builds_on_another(conf: UserConf) -> None:
+    conf.write(
+        "modes/own.yaml",
+        "defaults: [paper, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 700}\n"
+        "  - demand_from_roi: {}\n  - share_by_demand: {}\n  - scaling_from_rate_quality: {}\n",
+    )
+    modes = load(["source=test", "modes=own"], conf.path).modes
+    paper = vehicle("modes=paper").modes
+    assert modes[Mode.AUTOMATIC][0].parameters == {"start_kbps": 700}
+    assert modes[Mode.COLLECTIVE] == paper[Mode.COLLECTIVE]
+    assert len(modes[Mode.AUTOMATIC]) == len(paper[Mode.AUTOMATIC])
+
+
+def test_a_vehicle_builds_on_another(conf: UserConf) -> None:
+    conf.write(
+        "vehicle/mine.yaml",
+        "# @package _global_\ndefaults:\n  - tum_q7\n  - override /cameras@cameras.rear_center: top_view\n  - _self_\n"
+        "name: mine\ncameras: {front_left: {weight: 3}}\n",
+    )
+    cameras = load(["source=test", "vehicle=mine"], conf.path).cameras
+    assert (len(cameras), cameras["front_left"].weight, cameras["rear_center"].width) == (8, 3, 1280)
+
+
+def test_a_mounted_camera_may_have_its_own_graph_and_source(conf: UserConf) -> None:
+    own = "  - /graph@cameras.a.graph: h264_srt\n  - /source@cameras.a.source: appsrc\n"
+    conf.write(
+        "vehicle/mine.yaml", MINE.replace("  - _self_\n", f"  - /cameras@cameras.b: top_view\n{own}  - _self_\n")
+    )
+    cameras = load(["source=test", "vehicle=mine"], conf.path).cameras
+    assert [c.graph.transport for c in cameras.values()] == ["pipeline", "rtsp"]
+    assert [c.source.elements[0].factory for c in cameras.values()] == ["appsrc", "videotestsrc"]
+
+
+def test_overrides_mount_unmount_and_exchange_cameras() -> None:
+    cameras = vehicle(
+        "+cameras@cameras.extra=top_view", "~cameras.top_rear", "cameras@cameras.top_left=rear_center"
+    ).cameras
+    assert list(cameras) == [*(name for name in TABLE_1 if name != "top_rear"), "extra"]
+    assert (cameras["extra"].width, cameras["top_left"].height) == (1280, 1200)
+
+
+def test_the_environment_names_the_directory_too_and_an_argument_wins(
+    conf: UserConf, tmp_path: Path, tod: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf.write("vehicle/mine.yaml", MINE)
+    words = ("print", "vehicle=mine", "source=test", "format=json")
+    monkeypatch.setenv("TOD_CONF", str(conf.path))
+    assert list(json.loads(tod(*words).out)["cameras"]) == ["a"]
+    other = UserConf(tmp_path / "other").write("vehicle/mine.yaml", MINE.replace("cameras.a", "cameras.b"))
+    assert list(json.loads(tod(*words, other.word).out)["cameras"]) == ["b"]
+
+
+def test_a_relative_directory(conf: UserConf, tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    conf.write("vehicle/mine.yaml", MINE)
+    monkeypatch.chdir(conf.path.parent)
+    assert tod("print", "vehicle=mine", "source=test", f"conf={conf.path.name}").out.startswith(
+        "# mine, mode automatic"
+    )
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
+    """What `print` says is wrong; the user's directory is shown as ~."""
+    found = tod("print", "source=test", *words, *([conf.word] if conf.path.exists() else []))
+    return [problem.replace(str(conf.path), "~") for problem in found.problems]
+
+
+def test_the_three_messages_of_the_style_guide(
+    conf: UserConf, tod: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = UserConf(tmp_path / "conf")
+    own.change("cameras/rear_center.yaml", {"[0, 400, 1800]": "[0, 400, 400]", "height_px": "heigth_px"})
+    own.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
+    monkeypatch.chdir(tmp_path)
+    found = tod("print", "source=test", "modes=paper", "conf=conf")
+    assert (found.status, found.out) == (2, "")
+    *told, summary = found.err.splitlines()
+    assert sorted(told) == [
+        "conf/cameras/rear_center.yaml: heigth_px: unknown key, did you mean height_px?",
+        "conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: must rise from 0",
+        "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+    ]
+    assert summary == "3 problems, nothing was started"
+
+
+REAR, GRAPH, PAPER, ROBOT = (
+    "cameras/rear_center.yaml",
+    "graph/h264_rtsp.yaml",
+    "modes/paper.yaml",
+    "vehicle/delivery_robot.yaml",
+)
+
+
+@pytest.mark.parametrize(
+    "file, changes, told",
+    [
+        # cameras
+        (REAR, {"height_px": "heigth_px"}, "heigth_px: unknown key, did you mean height_px?"),
+        (REAR, {"1920": "wide"}, "width_px: 'wide': must be a whole number"),
+        (REAR, {"1920": "'1920'"}, "width_px: '1920': must be a whole number"),
+        (REAR, {"1920": "8"}, "width_px: 8: must be at least 16"),
+        (REAR, {"fps: 40": "fps:"}, "fps: null: must be a number"),
+        (REAR, {"fps: 40": ""}, "fps: missing: must be given"),
+        (REAR, {"fps: 40": "fps: -4"}, "fps: -4: must be above 0"),
+        (REAR, {"fps: 40": "fps: .nan"}, "fps: nan: must be a finite number"),
+        (REAR, {"4000": "1e400"}, "rate_quality.b_full_kbps: inf: must be a finite number"),
+        (
+            REAR,
+            {"[0, 400, 1800]": "[0, 400]"},
+            "rate_quality.b_min_kbps: [0, 400]: must have 3 entries, one per scaling factor",
+        ),
+        (REAR, {"[0, 400, 1800]": "[0, 400, 400]"}, "rate_quality.b_min_kbps: [0, 400, 400]: must rise from 0"),
+        (REAR, {"[0, 400, 1800]": "[5, 400, 1800]"}, "rate_quality.b_min_kbps: [5, 400, 1800]: must rise from 0"),
+        (REAR, {"[0, 400, 1800]": "[0, a, 1800]"}, "rate_quality.b_min_kbps[1]: 'a': must be a number"),
+        (REAR, {"[0.125, 0.25, 0.5]": "[0, 0.25, 0.5]"}, "rate_quality.scaling[0]: 0: must be above 0"),
+        (REAR, {"[0.125, 0.25, 0.5]": "[0.125, 0.25, 1.5]"}, "rate_quality.scaling[2]: 1.5: must be at most 1"),
+        (REAR, {"[0.125, 0.25, 0.5]": "[0.25, 0.125, 0.5]"}, "rate_quality.scaling: [0.25, 0.125, 0.5]: must rise"),
+        (REAR, {"[0.125, 0.25, 0.5]": "0.5"}, "rate_quality.scaling: 0.5: must be a list"),
+        (REAR, {"4000": "1800"}, "rate_quality.b_full_kbps: 1800: must be above the last b_min, 1800"),
+        (REAR, {"rate_quality:": "rate_qualty:"}, "rate_qualty: unknown key, did you mean rate_quality?"),
+        (REAR, {"fps: 40": "_target_: os.system\nfps: 40"}, f"_target_: unknown key, there is {CAMERA_KEYS}"),
+        (REAR, {"fps: 40": "fps: ${oc.env:HOME}"}, "fps: Unsupported interpolation type oc.env"),
+        (REAR, {"fps: 40": "fps: ${nope}"}, "fps: Interpolation key 'nope' not found"),
+        # graphs
+        (
+            GRAPH,
+            {"gate, property": "gaet, property"},
+            "knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
+        ),
+        (GRAPH, {"value: kbps": "value: kbit"}, f"knobs.bitrate[0].value: 'kbit': {KNOB_VALUES}"),
+        (GRAPH, {"value: kbps": "value: left"}, "knobs.bitrate: 'left': bitrate offers kbps, bps"),
+        (GRAPH, {'value: "off"': "value: off"}, 'knobs.sending[0].value: false: must be text, quote it: "on" or "off"'),
+        (
+            GRAPH,
+            {"{mtu_bytes}": "{mtu_byte}"},
+            "vehicle[6].properties.mtu: '{mtu_byte}': nothing fills {mtu_byte}, did you mean mtu_bytes?",
+        ),
+        (GRAPH, {"name: scaler": "name: crop"}, "vehicle[2].name: 'crop': is already the name of another element"),
+        (
+            GRAPH,
+            {"name: pay0": "name: pay"},
+            "vehicle: 'pay': the last element must be named pay0, as the RTSP server asks",
+        ),
+        (
+            GRAPH,
+            {"transport: rtsp": "transport: rtps"},
+            "transport: 'rtps': must be one of rtsp, pipeline, did you mean rtsp?",
+        ),
+        (GRAPH, {"mtu_bytes: 1200": "mtu_bytes: many"}, "mtu_bytes: 'many': must be a whole number"),
+        (GRAPH, {"mtu_bytes: 1200": "mtu_bites: 1200"}, "mtu_bites: unknown key, did you mean mtu_bytes?"),
+        # modes
+        (
+            PAPER,
+            {"share_by_demand": "share_by_demnd"},
+            "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+        ),
+        (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
+        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: this rule needs it"),
+        (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number from 0"),
+        (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
+        (
+            PAPER,
+            {"  - keep_operator_settings: {}": "  - keep_operator_settings"},
+            "'keep_operator_settings': must be a mapping",
+        ),
+    ],
+)
+def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: dict[str, str], told: str) -> None:
+    conf.change(file, changes)
+    (problem,) = problems(tod, conf, "modes=paper")
+    assert problem.startswith(f"~/{file}: ")
+    assert problem.endswith(told)
+
+
+@pytest.mark.parametrize(
+    "old, new, told",
+    [
+        ("compact_480p", "compact_48p", "defaults: 'cameras/compact_48p': no such file, did you mean compact_480p?"),
+        (
+            "/cameras@cameras.rear",
+            "/camera@cameras.rear",
+            "defaults: 'camera/compact_480p': no such file, "
+            "groups are /vehicle, /cameras, /modes, /graph, /source, /pqos",
+        ),
+        (
+            "@cameras.rear",
+            "@cameras.front",
+            "defaults: '/cameras@cameras.front': is chosen twice; "
+            "to choose again write override /cameras@cameras.front: FILE",
+        ),
+        ("  rear:\n", "  front:\n", "line 18: found duplicate key front"),
+        ("  rear:\n", "  raer:\n", "cameras.raer: no camera of that name is mounted, did you mean rear?"),
+        (
+            "  rear:\n",
+            "  back:\n",
+            "cameras.back: no camera of that name is mounted, "
+            "its kind is named in the defaults list: /cameras@cameras.back: KIND",
+        ),
+        ("  rear:\n", "  on:\n", "cameras.True: a key must be text, quote it"),
+        ("weight: 2", "weigth: 2", "cameras.front.weigth: unknown key, did you mean weight?"),
+        ("weight: 2", "weight: -2", "cameras.front.weight: -2: must be at least 0"),
+        ("weight: 2", "graph: h264_srt", "cameras.front.graph: 'h264_srt': must be a mapping"),
+        ("name: delivery_robot", "name: on", 'name: true: must be text, quote it: "on" or "off"'),
+        ("name: delivery_robot", "name: my robot", "name: 'my robot': must be letters, digits, _ and - only"),
+        ("# @package _global_\n", "", "must begin with the line # @package _global_"),
+        ("{row: 0, column: 0}", "{row: 0}", "cameras.front.place.column: missing: must be given"),
+        ("cameras:\n", "cameras: [\n", "line 14: expected ',' or ']', but got ':'"),
+        ("cameras:\n", "\tcameras:\n", "line 12: found character '\\t' that cannot start any token"),
+        ("defaults:\n", "defaults: robot\nx:\n", "defaults: 'robot': must be a list"),
+        ("  - _self_\n", "  - 3\n", "defaults[3]: 3: must be a file's name or GROUP: NAME"),
+        ("  - _self_\n", "  - delivery_robot\n", "defaults[3]: 'delivery_robot': is this file itself"),
+        ("weight: 2", "weight: '${'", "cameras.front.weight: no viable alternative at input '${'"),
+        ("cameras:\n", "cameras: [1]\nx:\n", "a key is a list here and a mapping in a file that this builds on"),
+        ("weight: 2", "weight: &a [*a]", "an alias, *NAME, stands inside what it refers to"),
+        (
+            ": compact_480p",
+            ": ${oc.env:HOME}",
+            "defaults: ${oc.env:HOME}: a defaults list may refer to a choice above it only, such as ${vehicle}",
+        ),
+    ],
+)
+def test_a_mistake_in_a_vehicle(conf: UserConf, tod: Command, old: str, new: str, told: str) -> None:
+    conf.change(ROBOT, {old: new})
+    assert problems(tod, conf, "vehicle=delivery_robot") == [f"~/{ROBOT}: {told}"]
+
+
+def test_a_native_picture_must_hold_the_crop(conf: UserConf, tod: Command) -> None:
+    conf.change("cameras/wide_720p.yaml", {"top_px: 120": "top_px: 300"})
+    assert problems(tod, conf, "vehicle=delivery_robot") == [
+        "~/cameras/wide_720p.yaml: native: 1280x720 at 0,300: must lie inside the native 1280x960"
+    ]
+
+
+@pytest.mark.parametrize(
+    "content, told",
+    [
+        (b"", "must begin with the line # @package _global_"),
+        (b"name: \xff", "'utf-8' codec can't decode byte 0xff in position 6: invalid start byte"),
+        (b"# @package _global_\n- a\n- b\n", '["a", "b"]: must be a mapping'),
+        (
+            b"# @package _global_\nname: !!python/object/apply:os.getcwd []\n",
+            "line 2: could not determine a constructor",
+        ),
+    ],
+)
+def test_a_file_that_is_no_configuration(conf: UserConf, tod: Command, content: bytes, told: str) -> None:
+    conf.write("vehicle/mine.yaml", content)
+    (problem,) = problems(tod, conf, "vehicle=mine")
+    assert problem.startswith(f"~/vehicle/mine.yaml: {told}")
+
+
+def test_a_rule_list_in_the_wrong_order(conf: UserConf, tod: Command) -> None:
+    conf.write(
+        "modes/mine.yaml",
+        "defaults: [paper, _self_]\ncollective: [share_by_demand: {}, total_from_operator: {start_kbps: 1}]\n",
+    )
+    assert problems(tod, conf, "modes=mine") == [
+        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs demand, no rule before gives it",
+        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs total, no rule before gives it",
+        '~/modes/mine.yaml: collective: ["share_by_demand", "total_from_operator"]: no rule gives demand, scaling',
+    ]
+
+
+def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
+    conf.write("modes/mine.yaml", "defaults: [papr, _self_]\n")
+    assert problems(tod, conf, "modes=mine") == [
+        "~/modes/mine.yaml: defaults: 'modes/papr': no such file, did you mean paper?"
+    ]
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (["vehicle=tum_q8"], "vehicle: tum_q8: no such file in conf/vehicle/, did you mean tum_q7?"),
+        (["modes=saef"], "modes: saef: no such file in conf/modes/, did you mean safe?"),
+        (["pqos=none"], "pqos: none: no such file in conf/pqos/, there is constant, live, map, trace"),
+        (["vehicle=null"], "vehicle: null: no such file in conf/vehicle/, there is delivery_robot, tum_q7"),
+        (["+graph@cameras.front_left.graph=h264_srtt"], "no such file in conf/graph/, did you mean h264_srt?"),
+        (["vehicle=a,b"], "vehicle=a,b: a,b,c is a sweep; write [a,b,c] for a list"),
+        (["mode=single,automatic"], "mode=single,automatic: a,b,c is a sweep; write [a,b,c] for a list"),
+        (["mode=autmatic"], "mode: 'autmatic': must be one of single, automatic, collective, did you mean automatic?"),
+        (["nothing=3"], f"nothing: unknown key, there is {TOP_KEYS}"),
+        (["+_target_=os.system"], f"_target_: unknown key, there is {TOP_KEYS}"),
+        (["hydra.run.dir=/tmp"], "hydra.run.dir=/tmp: no such key"),
+        (["=3"], "=3: no such key"),
+        (["cameras.front_left.heigth_px=3"], "cameras.front_left.heigth_px: unknown key, did you mean height_px?"),
+        (
+            ["cameras.front_lfet.weight=3"],
+            "cameras.front_lfet: no camera of that name is mounted, did you mean front_left?",
+        ),
+        (["cameras.front_left.weight=two"], "cameras.front_left.weight: 'two': must be a number"),
+        (["cameras.front_left.weight=inf"], "cameras.front_left.weight: inf: must be a finite number"),
+        (["cameras.front_left=null"], "cameras.front_left: null: must be a mapping"),
+        (["fps_max=0"], "fps_max: 0: must be above 0"),
+        (["fps_max=on"], "fps_max: 'on': must be a number or null"),
+        (["media.port=0"], "media.port: 0: must be at least 1"),
+        (["media.port=on"], "media.port: 'on': must be a whole number"),
+        (["media.host=on", "media.port=true"], "media.port: true: must be a whole number"),
+        (["name=${oc.env:HOME}"], "name: Unsupported interpolation type oc.env"),
+        (["name=${nope}"], "name: Interpolation key 'nope' not found"),
+        (
+            ["cameras.front_left.clip=/it's.mp4"],
+            f"cameras.front_left.clip=/it's.mp4: token recognition error at: ''s.mp4'{QUOTE}",
+        ),
+        (["a=b=c"], f"a=b=c: mismatched input '=' expecting <EOF>{QUOTE}"),
+        (
+            ["graph.first_port=8550"],
+            "graph.first_port: 8550: camera top_front would get port 8554, already the port of media.port",
+        ),
+        (["control.port=8554"], "control.port: 8554: is already the port of media.port"),
+        (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
+    ],
+)
+def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list[str], told: str) -> None:
+    (problem,) = problems(tod, conf, *words)
+    assert problem.startswith("command line: ")
+    assert problem.endswith(told)
+
+
+def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Command) -> None:
+    conf.write(
+        "vehicle/mine.yaml",
+        MINE.replace(
+            "  - _self_\n", "  - /cameras@cameras.b: top_view\n  - /graph@cameras.b.graph: h264_rtsp\n  - _self_\n"
+        )
+        + "cameras: {b: {graph: {first_port: 5599}}}\n",
+    )
+    assert problems(tod, conf, "vehicle=mine") == [
+        "~/vehicle/mine.yaml: cameras.b.graph.first_port: 5599: "
+        "camera b would get port 5600, already the port of camera a"
+    ]
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (
+            ["source=file"],
+            ["conf/source/file.yaml: clip: null: must be given, here or for each mounted camera as clip"],
+        ),
+        (["source=file", "source.clip=/no.mp4"], ["command line: source.clip: '/no.mp4': no such file"]),
+        (
+            ["source=file", f"source.clip={CONF}/config.yaml", "cameras.top_left.clip=/no.mp4"],
+            ["command line: cameras.top_left.clip: '/no.mp4': no such file"],
+        ),
+        (
+            ["source=rtsp"],
+            ["conf/source/rtsp.yaml: address: null: must be given, here or for each mounted camera as address"],
+        ),
+    ],
+)
+def test_what_a_source_asks_for_must_be_there(tod: Command, words: list[str], told: list[str]) -> None:
+    assert tod("print", *words).problems == told
+
+
+def test_all_problems_are_told_at_once_in_one_run(conf: UserConf, tod: Command) -> None:
+    conf.change(REAR, {"[0, 400, 1800]": "[0, 400]", "fps: 40": "fps: fast"})
+    conf.change("cameras/top_view.yaml", {"3000": "400"})
+    conf.change(GRAPH, {"gate, property": "gaet, property"})
+    conf.change(PAPER, {"single:": "singel:", "share_by_demand": "shareby_demand"})
+    found = problems(tod, conf, "modes=paper", "fps_max=-1", "cameras.top_rear.weigth=2", "media.port=99999")
+    assert sorted(found) == sorted(
+        [
+            f"~/{REAR}: fps: 'fast': must be a number",
+            f"~/{REAR}: rate_quality.b_min_kbps: [0, 400]: must have 3 entries, one per scaling factor",
+            "~/cameras/top_view.yaml: rate_quality.b_full_kbps: 400: must be above the last b_min, 400",
+            f"~/{GRAPH}: knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
+            f"~/{PAPER}: singel: unknown key, did you mean single?",
+            f"~/{PAPER}: automatic[2]: 'shareby_demand': unknown rule, did you mean share_by_demand?",
+            "command line: fps_max: -1: must be above 0",
+            "command line: cameras.top_rear.weigth: unknown key, did you mean weight?",
+            "command line: media.port: 99999: must be at most 65535",
+        ]
+    )
+
+
+def test_the_same_problem_is_told_once() -> None:
+    problem = Problem("a.yaml", "b", "1", "must not")
+    assert str(ConfigError([problem, problem])) == "a.yaml: b: 1: must not\n1 problem, nothing was started"
+    two = ConfigError([problem, Problem("a.yaml", "", None, "must not either")])
+    assert str(two).splitlines()[1:] == ["a.yaml: must not either", "2 problems, nothing was started"]
+
+
+def test_no_part_of_the_environment_comes_into_the_configuration(conf: UserConf) -> None:
+    conf.write("vehicle/mine.yaml", MINE.replace("top_view", "${oc.env:KIND}"))
+    words = ("print", "vehicle=mine", "source=test", conf.word)
+    result = process(*words, env={**os.environ, "KIND": "top_view"})
+    assert (result.status, result.out) == (2, "")
+    conf.write("vehicle/mine.yaml", MINE + "media: {host: '${oc.env:KIND}'}\n")
+    result = process(*words, env={**os.environ, "KIND": "top_view"})
+    assert result.err.splitlines()[0].endswith("media.host: Unsupported interpolation type oc.env")
+
+
+def test_a_drive_of_the_users_own_vehicle(conf: UserConf) -> None:
+    conf.write("vehicle/mine.yaml", MINE)
+    drive = Drive("vehicle=delivery_robot")
+    drive.vehicle = load(["source=test", "vehicle=mine", "modes=paper"], conf.path)
+    assert drive.vehicle.cameras["a"].rate_quality.b_full == 3000

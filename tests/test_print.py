@@ -1,0 +1,166 @@
+"""Dry run: the JSON contract, text that a shell runs, decisions with reasons."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+from helpers import CONF, Command, UserConf
+
+GRAPHS = sorted(path.stem for path in (CONF / "graph").glob("*.yaml"))
+SETTING = {"on", "sending", "demand_kbps", "kbps", "scaling", "roi", "width", "height", "reason"}
+
+
+def printed(tod: Command, *words: str) -> dict[str, Any]:
+    result = tod("print", "format=json", *words)
+    assert result.status == 0, result.err
+    document: dict[str, Any] = json.loads(result.out)
+    return document
+
+
+def test_the_json_contract(tod: Command) -> None:
+    document = printed(tod, "source=test", "total_kbps=3000")
+    assert list(document) == ["mode", "total_kbps", "cameras"]
+    assert (document["mode"], document["total_kbps"]) == ("automatic", 3000)
+    assert len(document["cameras"]) == 8
+    for camera in document["cameras"].values():
+        assert list(camera) == ["vehicle", "operator", "server", "decision"]
+        assert set(camera["decision"]) == SETTING
+    assert document["cameras"]["front_left"]["decision"] == {
+        "on": True,
+        "sending": True,
+        "demand_kbps": 6000,
+        "kbps": 545,
+        "scaling": 0.25,
+        "roi": {"x": 0, "y": 0, "width": 1920, "height": 1040},
+        "width": 480,
+        "height": 260,
+        "reason": "545 of 6000 kbit/s, range [300, 950) -> 0.25",
+    }
+
+
+@pytest.mark.parametrize(
+    "words, decided",
+    [
+        (["total_kbps=8000"], ("automatic", 8000, 1454)),
+        (["total_kbps=8000", "mode=collective"], ("collective", 8000, 1454)),
+        (["total_kbps=8000", "mode=single"], ("single", 7997, 1454)),  # what automatic would decide
+        ([], ("automatic", 3000, 545)),
+        (["mode=single"], ("single", 2995, 545)),
+        (["total_kbps=0"], ("automatic", 0, 0)),
+        (["total_kbps=2999.5"], ("automatic", 2999.5, 545)),
+        (["total_kbps=40000"], ("automatic", 40000, 6000)),
+    ],
+)
+@pytest.mark.parametrize("modes", ["paper", "safe"])
+def test_the_decision(tod: Command, modes: str, words: list[str], decided: tuple[str, float, int]) -> None:
+    document = printed(tod, "source=test", f"modes={modes}", *words)
+    left = document["cameras"]["front_left"]["decision"]
+    assert (document["mode"], document["total_kbps"], left["kbps"]) == decided
+
+
+def test_the_text(tod: Command) -> None:
+    document = printed(tod, "source=test", "total_kbps=3000")
+    result = tod("print", "source=test", "total_kbps=3000")
+    expected = ["# tum_q7, mode automatic, total 3000 kbit/s"]
+    for name, camera in document["cameras"].items():
+        decision = camera["decision"]
+        size = f"{decision['width']}x{decision['height']}"
+        expected += ["", f"# {name}: {size} at {decision['kbps']} kbit/s: {decision['reason']}"]
+        expected += [f"gst-launch-1.0 {camera['vehicle']}", f"gst-launch-1.0 {camera['operator']}"]
+        expected += [f"# server: {camera['server']}"]
+    assert (result.status, result.out.splitlines(), result.err) == (0, expected, "")
+
+
+def test_a_camera_that_is_not_sent_says_so(tod: Command) -> None:
+    lines = tod("print", "source=test", "total_kbps=0").out.splitlines()
+    assert "# front_left: not sending: 0 of 6000 kbit/s, range [0, 300) -> 0.125, below 1 kbit/s: not sending" in lines
+    vehicle = printed(tod, "source=test", "total_kbps=0")["cameras"]["front_left"]["vehicle"]
+    assert "valve name=gate drop-mode=forward-sticky-events drop=true" in vehicle
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+@pytest.mark.parametrize("source", ["test", "appsrc", "v4l2"])
+def test_every_line_is_one_command_of_words(tod: Command, graph: str, source: str) -> None:
+    for camera in printed(tod, f"graph={graph}", f"source={source}")["cameras"].values():
+        for line in (camera["vehicle"], camera["operator"]):
+            words = shlex.split(line)
+            assert shlex.join(words).replace("'!'", "!") == line
+            assert all(word == "!" or "=" in word or word.isidentifier() for word in words)
+            assert "{" not in line
+
+
+@pytest.fixture
+def clip(conf: UserConf) -> str:
+    """A path with everything in it that a shell or Hydra would take for its own."""
+    name = 'it\'s a "clip" with $HOME, {braces}, a=b & ü.mp4'
+    conf.write(name, b"")
+    return str(conf.path / name)
+
+
+def test_quoting_survives_a_shell(tod: Command, conf: UserConf, clip: str) -> None:
+    conf.write("source/mine.yaml", f"defaults: [file, _self_]\nclip: {json.dumps(clip)}\n")
+    line = printed(tod, "source=mine", conf.word)["cameras"]["front_left"]["vehicle"]
+    echoed = subprocess.run(
+        ["sh", "-c", f"for word in {line.replace(' ! ', ' ')}; do printf '%s\\n' \"$word\"; done"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"location={clip}" in echoed.stdout.splitlines()
+    assert shlex.split(line)[:3] == ["filesrc", "name=file", f"location={clip}"]
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(not shutil.which("gst-launch-1.0"), reason="gst-launch-1.0 is not installed")
+def test_gstreamer_reads_the_server_string_as_the_shell_reads_the_line(tod: Command, conf: UserConf, clip: str) -> None:
+    gst = pytest.importorskip("gi.repository.Gst")
+    gst.init(None)
+    conf.write("source/mine.yaml", f"defaults: [file, _self_]\nclip: {json.dumps(clip)}\n")
+    server = printed(tod, "source=mine", conf.word)["cameras"]["front_left"]["server"]
+    description = server.removeprefix("( ").removesuffix(" )")
+    assert gst.parse_launch(description).get_by_name("file").get_property("location") == clip
+
+
+def test_frames_born_in_python_are_stood_in_for_and_it_says_so(tod: Command) -> None:
+    names = "front_left, front_center, front_right, rear_center, top_front, top_left, top_right, top_rear"
+    note = f"videotestsrc stands in for the frames of {names}"
+    result = tod("print", "source=appsrc", "format=json")
+    camera = json.loads(result.out)["cameras"]["front_left"]
+    assert result.err.strip() == note
+    assert camera["vehicle"].startswith("videotestsrc ")
+    assert camera["server"].startswith("( appsrc ")
+    assert f"# {note}" in tod("print", "source=appsrc").out.splitlines()
+
+
+def test_the_default_source_is_stood_in_for_until_it_is_rendered(tod: Command) -> None:
+    camera = printed(tod)["cameras"]["front_left"]
+    assert camera["vehicle"].startswith("videotestsrc ")
+
+
+def test_a_transport_without_a_server(tod: Command) -> None:
+    camera = printed(tod, "source=test", "graph=h264_srt")["cameras"]["front_center"]
+    assert camera["server"] is None
+    assert "srtsink" in camera["vehicle"] and "7101" in camera["vehicle"]
+    assert camera["operator"].startswith("srtsrc ") and "7101" in camera["operator"]
+    assert "# server:" not in tod("print", "source=test", "graph=h264_srt").out
+
+
+@pytest.mark.parametrize(
+    "word, told",
+    [
+        ("total_kbps=many", "command line: total_kbps: 'many': must be a number from 0"),
+        ("total_kbps=-1", "command line: total_kbps: '-1': must be a number from 0"),
+        ("total_kbps=nan", "command line: total_kbps: 'nan': must be a number from 0"),
+        ("total_kbps=inf", "command line: total_kbps: 'inf': must be a number from 0"),
+        ("total_kbps=", "command line: total_kbps: '': must be a number from 0"),
+        ("format=xml", "command line: format: 'xml': must be one of text, json"),
+        ("conf=/nowhere", "command line: conf: /nowhere: no such directory"),
+    ],
+)
+def test_wrong_arguments(tod: Command, word: str, told: str) -> None:
+    assert tod("print", "source=test", word) == (2, "", f"{told}\n")

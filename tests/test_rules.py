@@ -1,0 +1,313 @@
+"""The rules of the modes: the paper's numbers, the safe answers, calmer pictures; rule lists as YAML gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from importlib.metadata import EntryPoint
+from typing import Any
+
+import pytest
+from helpers import Drive, vehicle
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runner import rules
+from runner.events import BitratePredicted
+from runner.model import Mode, ModelError, Roi, Vehicle
+from runner.rules import call_rule, check_order, decide
+from runner.state import State
+
+TUM = vehicle("modes=paper")
+START = State.initial(TUM, Mode.AUTOMATIC)
+STEPS = [1320, 1650, 2200, 2970, 3300, 4400, 5225, 14850]  # worked out from Table I
+
+
+def decided(total: Fraction | int | str, state: State = START) -> rules.Decision:
+    prediction = BitratePredicted(t=0, kbps=Fraction(total))
+    return decide(TUM, rules.replace(state, prediction=prediction), {})[0]
+
+
+def factors(total: Fraction | int | str) -> dict[str, float]:
+    return {name: float(setting.scaling or 0) for name, setting in decided(total).settings.items()}
+
+
+# --- the paper --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "total, camera, kbps, scaling",
+    [
+        (3000, "front_center", 454, 0.5),
+        (3000, "front_left", 545, 0.25),
+        (3000, "front_right", 545, 0.25),
+        (3000, "rear_center", 363, 0.125),
+        (3000, "top_front", 272, 0.375),
+        (3000, "top_rear", 272, 0.375),
+        (8000, "front_left", 1454, 0.5),
+        (33000, "rear_center", 4000, 0.5),
+        (40000, "front_left", 6000, 0.5),  # never above the demand
+    ],
+)
+def test_table_1(total: int, camera: str, kbps: int, scaling: float) -> None:
+    setting = decided(total).settings[camera]
+    assert (setting.kbps, setting.scaling) == (kbps, scaling)
+
+
+def test_the_sweep_steps_up_where_table_1_says_and_nowhere_else() -> None:
+    sweep = [factors(total) for total in range(16_001)]
+    assert [total for total in range(1, 16_001) if sweep[total] != sweep[total - 1]] == STEPS
+
+
+@pytest.mark.parametrize("total", STEPS)
+def test_each_step_is_exact(total: int) -> None:
+    before, at = factors(Fraction(total) - Fraction(1, 1000)), factors(total)
+    assert before == factors(total - 1)
+    assert at != before
+    assert all(at[name] >= before[name] for name in at)
+
+
+def test_at_3000_only_front_center_keeps_one_half() -> None:
+    assert [name for name, factor in factors(3000).items() if factor == 0.5] == ["front_center"]
+
+
+@pytest.mark.parametrize("total", [0, 1, 2.5, 32.999])
+def test_a_tiny_total_stops_cameras_instead_of_opening_them(total: float) -> None:
+    for name, setting in decided(str(total)).settings.items():
+        assert setting.on
+        assert setting.scaling == TUM.cameras[name].rate_quality.scaling[0]
+        assert setting.sending == (setting.kbps >= 1)
+        assert setting.reason.endswith("below 1 kbit/s: not sending") != setting.sending
+
+
+def test_a_tiny_roi_is_not_sent_either_and_takes_the_smallest_factor() -> None:
+    tiny = rules.replace(START, rois={**START.rois, "front_left": Roi(0, 0, 16, 16)})
+    left = decided(40_000, tiny).settings["front_left"]
+    assert (left.on, left.sending, left.kbps, left.scaling) == (True, False, 0, Fraction(1, 8))
+    assert left.reason == "0 of 0.8 kbit/s, range [0, 300) -> 0.125, below 1 kbit/s: not sending"
+
+
+def test_reasons_speak_of_the_numbers() -> None:
+    left = decided(3000).settings["front_left"]
+    assert left.reason == "545 of 6000 kbit/s, range [300, 950) -> 0.25"
+    cut = rules.replace(START, rois={**START.rois, "front_left": Roi(0, 0, 960, 520)})
+    left = decided(3000, cut).settings["front_left"]
+    assert left.reason == "157 of 1500 kbit/s, as 631 for the full image, range [300, 950) -> 0.25"
+
+
+@st.composite
+def states(draw: st.DrawFn) -> State:
+    """The paper's vehicle with any ROIs, cameras on or off, and weights."""
+    on, rois, weights = {}, {}, {}
+    for name, camera in TUM.cameras.items():
+        width, height = draw(st.integers(16, camera.width)), draw(st.integers(16, camera.height))
+        x, y = draw(st.integers(0, camera.width - width)), draw(st.integers(0, camera.height - height))
+        on[name], rois[name] = draw(st.booleans()), Roi(x, y, width, height)
+        weights[name] = draw(st.fractions(0, 5, max_denominator=10))
+    return rules.replace(START, on=on, rois=rois, weights=weights)
+
+
+@settings(max_examples=60)
+@given(states(), st.fractions(0, 40_000, max_denominator=100), st.fractions(0, 5000, max_denominator=100))
+def test_more_bitrate_never_lowers_a_factor(state: State, total: Fraction, more: Fraction) -> None:
+    less, greater = decided(total, state).settings, decided(total + more, state).settings
+    for name in TUM.cameras:
+        assert (less[name].scaling or 0) <= (greater[name].scaling or 0)
+        assert less[name].kbps <= greater[name].kbps
+
+
+@settings(max_examples=60)
+@given(states(), st.fractions(0, 40_000, max_denominator=100))
+def test_what_is_sent_never_exceeds_the_total(state: State, total: Fraction) -> None:
+    decision = decided(total, state)
+    assert decision.total == total
+    assert sum(setting.kbps for setting in decision.settings.values()) <= total
+
+
+# --- safe: stale, missing and lost inputs -----------------------------------------------------------------------------
+
+
+def totals(drive: Drive, *times: float) -> Iterator[float]:
+    for t in times:
+        drive.accept("clock_advanced", t=t)
+        yield float(drive.total)
+
+
+def test_a_stale_prediction_is_halved_down_to_the_floor() -> None:
+    drive = Drive("modes=safe")
+    drive.accept("bitrate_predicted", t=1, kbps=8000)
+    times = (2, 3, 3.01, 3.99, 4, 5, 6, 7, 100, 1e9)
+    assert list(totals(drive, *times)) == [8000, 8000, 4000, 4000, 2000, 1000, 500, 500, 500, 500]
+    assert "total 8000 -> 500: no prediction for 99.0 s, limit 2 s" in drive_at(8000, 100)["front_left"].reason
+    drive.accept("bitrate_predicted", kbps=6000)
+    assert drive.total == 6000
+
+
+def drive_at(kbps: float, t: float, **keys: Any) -> Drive:
+    """A safe drive some time after its only prediction, which came at 1 s."""
+    drive = Drive("modes=safe")
+    drive.accept("bitrate_predicted", t=1, kbps=kbps, **keys)
+    drive.accept("clock_advanced", t=t)
+    return drive
+
+
+def test_fading_never_gives_more_than_was_predicted() -> None:
+    assert [drive_at(300, t).total for t in (1, 4, 50)] == [300, 300, 300]  # below the floor of 500
+    assert drive_at(0, 50).total == 0
+
+
+def test_the_floor_is_not_passed_on_the_way() -> None:
+    assert drive_at(700, 3.5).total == 500  # half of it is 350
+
+
+def test_a_prediction_says_how_long_it_may_be_used() -> None:
+    assert [drive_at(8000, t, valid_s=10).total for t in (11, 11.5)] == [8000, 4000]
+    assert [drive_at(8000, t, valid_s=0.5).total for t in (1.5, 1.6)] == [8000, 4000]
+
+
+def test_without_any_prediction_the_start_value_fades_as_well() -> None:
+    assert list(totals(Drive("modes=safe"), 2, 2.5, 3.5, 60)) == [3000, 1500, 750, 500]
+
+
+def test_only_the_lower_bound_is_trusted() -> None:
+    assert drive_at(8000, 1, lower_kbps=2500).total == 2500
+    assert drive_at(8000, 1, lower_kbps=9000).total == 8000
+    assert drive_at(8000, 1, lower_kbps=0).total == 0
+    assert "total 8000 -> 2500: lower bound of the prediction" in drive_at(8000, 1, lower_kbps=2500)["top_left"].reason
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_nothing_is_sent_while_the_operator_is_gone(mode: Mode) -> None:
+    drive = Drive("modes=safe", "pqos=live", f"mode={mode}")
+    before = {name: drive.sent(name) for name in drive.vehicle.cameras}
+    drive.accept("operator_disconnected", t=10)
+    for t, sending in ((11, True), (15, True), (15.1, False)):
+        drive.accept("bitrate_predicted", t=t, kbps=3000)
+        assert {setting.sending for setting in drive.run.decision.settings.values()} == {sending}
+    assert {(c.knob, c.value) for c in drive.run.commands} == {("sending", False)}
+    assert drive["front_left"].reason.endswith("not sending: operator gone for 5.1 s")
+    assert drive["front_left"].on and drive["front_left"].kbps == 0
+    drive.accept("operator_connected", t=15.2)
+    assert {(c.knob, c.value) for c in drive.run.commands} == {("sending", True)}
+    assert {name: drive.sent(name) for name in drive.vehicle.cameras} == before
+
+
+def test_a_second_loss_does_not_restart_the_clock() -> None:
+    drive = Drive("modes=safe")
+    drive.accept("operator_disconnected", t=0)
+    drive.accept("operator_disconnected", t=4)
+    drive.accept("clock_advanced", t=5.1)
+    assert not drive["front_left"].sending
+
+
+def test_settings_survive_the_operators_absence() -> None:
+    drive = Drive("modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000, valid_s=100)
+    drive.accept("operator_disconnected", t=0)
+    drive.accept("clock_advanced", t=6)
+    drive.accept("mode_selected", mode="single")
+    drive.accept("camera_switched", camera="top_left", on=False)
+    drive.accept("operator_connected", t=7)
+    drive.accept("camera_switched", camera="top_left", on=True)
+    assert drive.sent("front_left") == (545, 0.25)
+    assert drive.sent("top_left") == (272, 0.375)
+
+
+# --- steady -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_greater_factor_is_held_back_and_a_smaller_one_taken_at_once() -> None:
+    drive = Drive("modes=steady")
+
+    def factor(t: float, kbps: int) -> float | None:
+        drive.accept("bitrate_predicted", t=t, kbps=kbps)
+        return drive.sent("front_center")[1]
+
+    assert [factor(0, 3000), factor(1, 2000), factor(2, 3000)] == [0.5, 0.25, 0.25]
+    assert drive["front_center"].reason.endswith("-> 0.5, held at 0.25 until it has been so for 3 s")
+    assert drive.sent("front_center")[0] == 454  # only the factor waits
+    assert [factor(4.9, 3000), factor(5, 3000)] == [0.25, 0.5]
+    assert [factor(6, 2000), factor(7, 3000), factor(8, 2000), factor(10, 3000)] == [0.25] * 4
+    assert [factor(12.9, 3000), factor(13, 3000)] == [0.25, 0.5]  # a break starts the wait anew
+
+
+def test_memory_is_empty_under_the_paper_and_frozen_elsewhere() -> None:
+    paper, steady = Drive("modes=paper"), Drive("modes=steady")
+    for drive in (paper, steady):
+        drive.accept("bitrate_predicted", t=0, kbps=2000)
+    before = steady.run
+    remembered = repr(before.memory)
+    steady.accept("bitrate_predicted", t=1, kbps=3000)
+    assert paper.run.memory == {}
+    assert set(steady.run.memory) == {"hold_upscaling"}
+    assert repr(before.memory) == remembered
+
+
+# --- rule lists -------------------------------------------------------------------------------------------------------
+
+
+def listed(*names: str) -> list[rules.RuleCall]:
+    return [rules.RuleCall(rules.RULES[name]) for name in names]
+
+
+@pytest.mark.parametrize(
+    "names, problems",
+    [
+        (("total_from_prediction", "demand_from_roi", "share_by_demand", "scaling_from_rate_quality"), []),
+        (("demand_from_roi", "keep_operator_settings"), []),
+        (
+            ("total_from_prediction", "share_by_demand", "demand_from_roi", "scaling_from_rate_quality"),
+            ["automatic[1]: 'share_by_demand': needs demand, no rule before gives it"],
+        ),
+        (
+            ("fade_when_stale", "total_from_prediction", "demand_from_roi"),
+            [
+                "automatic[0]: 'fade_when_stale': needs total, no rule before gives it",
+                "automatic: ['fade_when_stale', 'total_from_prediction', 'demand_from_roi']: "
+                "no rule gives bitrate, scaling",
+            ],
+        ),
+    ],
+)
+def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: list[str]) -> None:
+    assert list(map(str, check_order(Mode.AUTOMATIC, listed(*names)))) == problems
+
+
+@pytest.mark.parametrize(
+    "name, parameters, message",
+    [
+        ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?"),
+        ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter, share_by_demand takes none"),
+        ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
+        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: this rule needs it"),
+        ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number from 0"),
+        ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number from 0"),
+        ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number from 0"),
+        ("hold_upscaling", {"for_s": float("nan")}, "hold_upscaling.for_s: nan: must be a number from 0"),
+        ("fade_when_stale", {"halve_every_s": 0}, "fade_when_stale.halve_every_s: 0: must be above 0"),
+    ],
+)
+def test_a_call_is_checked_against_the_rule(name: str, parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError) as refused:
+        call_rule(name, parameters)
+    assert str(refused.value) == message
+
+
+def test_parameters_are_exact() -> None:
+    assert call_rule("hold_upscaling", {"for_s": 0.1}).parameters == {"for_s": Fraction(1, 10)}
+
+
+def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(_: EntryPoint) -> None:
+        @rules.rule(needs=["total"], gives=["total"])
+        def keep_below(vehicle: Vehicle, state: State, draft: Any, memory: Any, *, most_kbps: Fraction) -> Any:
+            return rules.replace(draft, total=min(draft.total, most_kbps)), memory
+
+    entry = EntryPoint("keep_below", "my.rules:keep_below", "tod_runner.rules")
+    monkeypatch.setattr(EntryPoint, "load", load)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group, name: [entry] if name == entry.name else [])
+    monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
+    call = call_rule("keep_below", {"most_kbps": 1000})
+    lists = {**TUM.modes, Mode.AUTOMATIC: (TUM.modes[Mode.AUTOMATIC][0], call, *TUM.modes[Mode.AUTOMATIC][1:])}
+    assert check_order(Mode.AUTOMATIC, lists[Mode.AUTOMATIC]) == []
+    assert decide(rules.replace(TUM, modes=lists), START, {})[0].total == 1000

@@ -1,0 +1,294 @@
+"""One event further: modes without jumps, totals, weights, and nothing commanded twice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from helpers import Drive
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runner import step as step_module
+from runner.commands import wanted
+from runner.events import parse
+from runner.model import Mode
+from runner.step import Run, start, step
+
+PAPER = ("modes=paper",)
+
+
+def predicted(kbps: float, *overrides: str) -> Drive:
+    drive = Drive("modes=paper", *overrides)
+    drive.accept("bitrate_predicted", kbps=kbps)
+    return drive
+
+
+def sent(drive: Drive) -> dict[str, Any]:
+    return {name: drive.sent(name) for name in drive.vehicle.cameras}
+
+
+# --- entering a mode --------------------------------------------------------------------------------------------------
+
+
+def test_entering_single_keeps_every_bitrate_and_factor() -> None:
+    drive = predicted(8000)
+    before = sent(drive)
+    drive.accept("mode_selected", mode="single")
+    assert sent(drive) == before
+    assert drive.run.commands == ()
+    assert drive.total == sum(kbps for kbps, _ in before.values()) == 7997
+
+
+def test_entering_collective_keeps_the_total_in_force() -> None:
+    drive = predicted(8000)
+    drive.accept("mode_selected", mode="collective")
+    assert (drive.total, drive.run.commands) == (8000, ())
+
+
+def test_entering_collective_takes_the_last_total_set() -> None:
+    drive = Drive(*PAPER, "mode=collective")
+    drive.accept("total_set", kbps=4000)
+    drive.accept("mode_selected", mode="automatic")
+    drive.accept("bitrate_predicted", kbps=9000)
+    drive.accept("mode_selected", mode="collective")
+    assert drive.total == 4000
+
+
+def test_entering_collective_from_single_keeps_the_sum() -> None:
+    drive = Drive(*PAPER, "mode=single")
+    drive.accept("camera_configured", camera="front_left", kbps=1000)
+    total = drive.total
+    drive.accept("mode_selected", mode="collective")
+    assert drive.total == total
+
+
+@pytest.mark.parametrize("mode", ["single", "collective"])
+def test_entering_automatic_takes_the_last_prediction(mode: str) -> None:
+    drive = Drive(*PAPER, f"mode={mode}")
+    drive.accept("bitrate_predicted", kbps=7000)  # accepted and remembered in every mode
+    assert drive.total != 7000
+    drive.accept("mode_selected", mode="automatic")
+    assert drive.total == 7000
+
+
+@pytest.mark.parametrize("mode, total", [("automatic", 3000), ("collective", 3000), ("single", 2995)])
+def test_before_any_event_a_run_has_start_kbps(mode: str, total: int) -> None:
+    drive = Drive(*PAPER, f"mode={mode}")
+    assert drive.total == total
+    assert drive.sent("front_center") == (454, 0.5)
+
+
+def test_entering_automatic_without_a_prediction_takes_start_kbps() -> None:
+    drive = Drive(*PAPER, "mode=collective")
+    drive.accept("total_set", kbps=9000)
+    drive.accept("mode_selected", mode="automatic")
+    assert drive.total == 3000
+
+
+def test_selecting_the_mode_in_force_changes_nothing() -> None:
+    drive = Drive(*PAPER, "mode=collective")
+    drive.accept("total_set", kbps=4000)
+    drive.accept("mode_selected", mode="collective")
+    assert (drive.total, drive.run.commands) == (4000, ())
+    drive = Drive(*PAPER, "mode=single")
+    drive.accept("camera_configured", camera="front_left", kbps=1000)
+    drive.accept("mode_selected", mode="single")
+    assert drive.sent("front_left")[0] == 1000
+
+
+def test_single_settings_are_taken_anew_with_each_entering() -> None:
+    drive = Drive(*PAPER, "mode=single")
+    drive.accept("camera_configured", camera="front_left", kbps=1000, scaling=1)
+    drive.accept("mode_selected", mode="automatic")
+    drive.accept("mode_selected", mode="single")
+    assert drive.sent("front_left") == (545, 0.25)
+
+
+def test_a_camera_switched_on_again_in_single_gets_its_last_values() -> None:
+    drive = Drive(*PAPER, "mode=single")
+    drive.accept("camera_configured", camera="front_left", kbps=1000, scaling=0.75)
+    drive.accept("camera_switched", camera="front_left", on=False)
+    drive.accept("camera_switched", camera="front_left", on=False)
+    assert drive.total == 2995 - 545
+    drive.accept("camera_switched", camera="front_left", on=True)
+    assert drive.sent("front_left") == (1000, 0.75)
+
+
+def test_a_camera_switched_off_in_automatic_has_its_last_values_in_single() -> None:
+    drive = predicted(8000)
+    drive.accept("camera_switched", camera="front_left", on=False)
+    drive.accept("bitrate_predicted", kbps=2000)
+    drive.accept("mode_selected", mode="single")
+    drive.accept("camera_switched", camera="front_left", on=True)
+    assert drive.sent("front_left") == (1454, 0.5)
+
+
+# --- totals, demands, weights -----------------------------------------------------------------------------------------
+
+
+def test_the_total_is_told_before_the_cap_at_demand() -> None:
+    drive = predicted(50_000)
+    assert drive.total == 50_000
+    assert sum(kbps for kbps, _ in sent(drive).values()) == 33_000
+
+
+def test_a_camera_switched_off_leaves_its_share_to_the_others() -> None:
+    drive = predicted(3000)
+    drive.accept("camera_switched", camera="front_left", on=False)
+    assert drive.sent("front_left") == (0, None)
+    assert drive.sent("front_right")[0] == 666  # 3000 * 6000 / 27000
+    for name in drive.vehicle.cameras:
+        drive.accept("camera_switched", camera=name, on=False)
+    assert set(sent(drive).values()) == {(0, None)}
+    assert drive.total == 3000
+
+
+def test_bitrates_are_whole_and_rounded_down() -> None:
+    drive = predicted(2999.999)
+    assert drive.total == pytest.approx(2999.999)
+    assert drive.sent("front_center") == (454, 0.5)
+    assert sum(kbps for kbps, _ in sent(drive).values()) <= 2999
+
+
+def test_weights_merge_and_act_in_automatic_and_collective_only() -> None:
+    drive = Drive(*PAPER, "mode=single")
+    before = sent(drive)
+    drive.accept("weights_set", weights={"front_left": 2})
+    drive.accept("weights_set", weights={"front_right": 0})
+    assert (sent(drive), drive.run.commands) == (before, ())
+    for mode in ("automatic", "collective"):
+        drive.accept("mode_selected", mode=mode)
+        assert drive.sent("front_left")[0] == 2 * 3000 * 6000 // 33_000 == 1090
+        assert drive.sent("front_right")[0] == 0
+        assert not drive["front_right"].sending
+
+
+def test_the_vehicles_own_weights_hold_until_others_are_set() -> None:
+    drive = Drive(*PAPER, "cameras.front_left.weight=2", "mode=collective")
+    assert drive.sent("front_left")[0] == 2 * 3000 * 6000 // 39_000
+    drive.accept("weights_set", weights={"front_left": 1})
+    assert drive.sent("front_left")[0] == 545
+
+
+# --- modes=paper: nothing but the paper -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize(
+    "event, keys",
+    [
+        ("operator_connected", {}),
+        ("operator_disconnected", {}),
+        ("clock_advanced", {}),
+        ("link_measured", {"camera": "front_left", "kbps": 1, "loss": 1, "rtt_ms": 9000, "jitter_ms": 500}),
+        ("position_reported", {"lat": 48.2, "lon": 11.6, "speed_mps": 8, "heading_deg": 90}),
+        ("bitrate_predicted", {"kbps": 3000, "lower_kbps": 1, "valid_s": 0}),
+    ],
+)
+def test_under_the_paper_other_inputs_change_nothing(mode: Mode, event: str, keys: dict[str, Any]) -> None:
+    drive = predicted(3000, f"mode={mode}")
+    before = drive.run
+    for t in (0, 10, 1e6):
+        drive.accept(event, t=t, **keys)
+        assert drive.run.decision == before.decision
+        assert drive.run.commands == ()
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_first_event_commands_everything() -> None:
+    drive = predicted(3000)
+    assert [(c.camera, c.knob) for c in drive.run.commands] == [
+        (camera, knob) for camera in drive.vehicle.cameras for knob in ("sending", "roi", "size", "bitrate")
+    ]
+
+
+@pytest.mark.parametrize(
+    "event, keys",
+    [
+        ("bitrate_predicted", {"kbps": 5225}),
+        ("camera_switched", {"camera": "top_left", "on": False}),
+        ("weights_set", {"weights": {"top_left": 3}}),
+        ("mode_selected", {"mode": "single"}),
+    ],
+)
+def test_the_same_event_twice_gives_no_command(event: str, keys: dict[str, Any]) -> None:
+    drive = predicted(3000)
+    drive.accept(event, **keys)
+    assert drive.accept(event, **keys).commands == ()
+
+
+def test_only_what_changes_is_commanded() -> None:
+    drive = predicted(3000)
+    drive.accept("bitrate_predicted", kbps=3010)
+    assert {c.knob for c in drive.run.commands} == {"bitrate"}
+    drive.accept("camera_switched", camera="top_left", on=False)
+    assert [(c.knob, c.value) for c in drive.run.commands if c.camera == "top_left"] == [("sending", False)]
+
+
+def test_off_before_anything_else_is_a_command_for_one_knob() -> None:
+    drive = Drive(*PAPER)
+    drive.accept("camera_switched", camera="top_left", on=False)
+    assert [c.knob for c in drive.run.commands if c.camera == "top_left"] == ["sending"]
+
+
+def test_what_changed_while_off_is_commanded_with_on() -> None:
+    drive = predicted(3000)
+    drive.accept("camera_switched", camera="top_left", on=False)
+    drive.accept("bitrate_predicted", kbps=8000)
+    assert not [c for c in drive.run.commands if c.camera == "top_left"]
+    drive.accept("camera_switched", camera="top_left", on=True)
+    assert [c.knob for c in drive.run.commands if c.camera == "top_left"] == ["sending", "size", "bitrate"]
+
+
+def test_nothing_is_decided_where_no_input_of_the_rules_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = predicted(3000)
+    monkeypatch.setattr(step_module.rules, "decide", lambda *_: pytest.fail("decided again"))
+    drive.accept("clock_advanced", t=5)
+    drive.accept("link_measured", camera="front_left", kbps=3)
+    drive.accept("position_reported", lat=48, lon=11)
+    drive.tell("total_set", kbps=3)
+
+
+events = st.one_of(
+    st.builds(lambda mode: {"event": "mode_selected", "mode": mode}, st.sampled_from(list(Mode))),
+    st.builds(lambda kbps: {"event": "bitrate_predicted", "kbps": kbps}, st.integers(0, 20_000)),
+    st.builds(lambda kbps: {"event": "total_set", "kbps": kbps}, st.integers(0, 20_000)),
+    st.builds(
+        lambda name, on: {"event": "camera_switched", "camera": name, "on": on},
+        st.sampled_from(["front_left", "top_rear"]),
+        st.booleans(),
+    ),
+    st.builds(
+        lambda x, width: {"event": "roi_set", "camera": "front_left", "x": x, "y": 0, "width": width, "height": 99},
+        st.integers(0, 1900),
+        st.integers(1, 1920),
+    ),
+    st.builds(
+        lambda kbps: {"event": "camera_configured", "camera": "top_rear", "kbps": kbps, "scaling": 0.9},
+        st.integers(0, 4000),
+    ),
+    st.builds(lambda w: {"event": "weights_set", "weights": {"front_left": w}}, st.sampled_from([0, 0.5, 1, 7])),
+    st.sampled_from([{"event": e} for e in ("operator_connected", "operator_disconnected", "clock_advanced")]),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(["paper", "safe", "steady"]), st.lists(st.tuples(st.floats(0, 4), events), max_size=25))
+def test_whatever_happens_the_commands_lead_to_the_decision(modes: str, story: list[Any]) -> None:
+    vehicle = Drive(f"modes={modes}").vehicle
+    run: Run = start(vehicle)
+    t = 0.0
+    for passed, event in story:
+        t += passed
+        event = parse({"t": t} | event)  # noqa: PLW2901
+        run = step(vehicle, run, event)
+        for name, setting in run.decision.settings.items():
+            assert wanted(setting).items() <= run.commanded[name].items()
+            assert setting.sending == (setting.kbps >= 1)
+            assert setting.on == (setting.scaling is not None)
+            assert setting.width % 2 == setting.height % 2 == 0
+        assert sum(s.kbps for s in run.decision.settings.values()) <= run.decision.total
+        assert step(vehicle, run, event).commands == ()

@@ -1,0 +1,96 @@
+"""Every file and every combination; files of the user's own with all problems at once."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+from helpers import CONF, Command, UserConf, process
+
+ONE = ("vehicle=delivery_robot", "modes=paper", "graph=h264_rtsp", "source=test")  # a single combination
+
+
+def count(group: str) -> int:
+    return len(list((CONF / group).glob("*.yaml")))
+
+
+def test_everything_that_is_packaged_is_valid() -> None:
+    result = process("validate")
+    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos")))
+    combinations = count("vehicle") * count("modes") * count("graph") * count("source")
+    assert (result.status, result.err) == (0, "")
+    first, *notes = result.out.splitlines()
+    assert first == f"{files} files and {combinations} combinations of vehicle, modes, graph, source are valid"
+    assert all(note.startswith(("not checked: ", "nothing was checked against the GStreamer")) for note in notes)
+
+
+def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
+    return [line.replace(str(conf.path), "~") for line in tod("validate", conf.word, *words).problems]
+
+
+def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
+    conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
+    conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
+    assert problems(tod, conf) == [
+        "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
+        "~/foo.yaml: belongs to no group, the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/",
+        "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",
+        "~/vehicel/x.yaml: belongs to no group, the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/",
+    ]
+
+
+def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
+    conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
+    conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
+    assert problems(tod, conf, *(word for word in ONE if "modes" not in word)) == [
+        "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+        "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must rise from 0",
+    ]
+
+
+def test_a_users_additions_are_combined_with_everything(tod: Command, conf: UserConf) -> None:
+    conf.write("modes/mine.yaml", "defaults: [paper, _self_]\n")
+    result = tod("validate", conf.word, *(word for word in ONE if "modes" not in word))
+    assert result.status == 0
+    assert f"and {count('modes') + 1} combinations" in result.out
+
+
+def test_maps_are_no_configuration(tod: Command, conf: UserConf) -> None:
+    conf.write("maps/opencv.yaml", "%YAML:1.0\n---\na: !!opencv-matrix\n")
+    assert tod("validate", conf.word, *ONE).status == 0
+
+
+@pytest.mark.parametrize(
+    "rows, told",
+    [
+        ("lon,lat,kbps\n", "must have rows, there is none"),
+        ("lon,lat\n1,2\n", None),
+        (None, "no such file"),
+    ],
+)
+def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, told: str | None) -> None:
+    conf.change("pqos/map.yaml", {"maps/demo_loop.csv": "maps/mine.csv"})
+    if rows is not None:
+        conf.write("maps/mine.csv", rows)
+    (problem,) = problems(tod, conf, *ONE)
+    assert problem.startswith("~/pqos/map.yaml: file: ")
+    assert told is None or told in problem
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
+@pytest.mark.parametrize(
+    "old, new, told",
+    [
+        ("element: x264enc", "element: x264encc", "vehicle[4].element: 'x264encc'"),
+        ("quantizer: 10", "quantiser: 10", "vehicle[4].properties.quantiser"),
+        ("quantizer: 10", "quantizer: 100", "vehicle[4].properties.quantizer"),
+        ("speed-preset: superfast", "speed-preset: superfst", "vehicle[4].properties.speed-preset"),
+        ("property: bitrate, value: kbps", "property: threads, value: kbps", "knobs.bitrate[0].property"),
+        ("property: bitrate, value: kbps", "property: bitrat, value: kbps", "knobs.bitrate[0].property"),
+    ],
+)
+def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, told: str) -> None:
+    conf.change("graph/h264_rtsp.yaml", {old: new})
+    found = problems(tod, conf, *ONE)
+    assert any(problem.startswith(f"~/graph/h264_rtsp.yaml: {told}") for problem in found), found
