@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from runner.errors import RunError, UserError
-from runner.verbs import VERBS, Arguments
+from runner.verbs import EXTRAS, VERBS, Arguments
 
 USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
 
@@ -35,6 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except RunError as error:
         print(error, file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        print(f"the Python module {error.name} is not installed: pip install 'tod-runner[{extra}]'", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

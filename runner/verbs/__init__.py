@@ -30,6 +30,9 @@ VERBS = {
 }
 
 
+EXTRAS = {"paho": "live", "rich": "live", "numba": "synthetic"}  # by Python module, the extra of this package
+
+
 @dataclass(frozen=True, slots=True)
 class Arguments:
     """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra."""

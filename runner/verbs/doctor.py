@@ -20,7 +20,7 @@ from runner.errors import RunError
 from runner.model import Endpoint, Vehicle
 from runner.ports import check_port_free
 from runner.sources import compile_plans
-from runner.verbs import Arguments
+from runner.verbs import EXTRAS, Arguments
 
 TYPELIBS = {  # Debian package by typelib
     "Gst": "gir1.2-gstreamer-1.0",
@@ -28,7 +28,6 @@ TYPELIBS = {  # Debian package by typelib
     "GstRtsp": "gir1.2-gst-plugins-base-1.0",
     "GstRtspServer": "gir1.2-gst-rtsp-server-1.0",
 }
-EXTRAS = {"paho.mqtt": "live", "rich": "live", "numba": "synthetic"}  # extra of this package by Python module
 CORE_MPX_S = 180  # what one core crops, scales and encodes in a second at factor 0.5, measured with h264_rtsp
 
 
@@ -65,10 +64,7 @@ def examine(vehicle: Vehicle) -> Iterator[Finding]:
 
 
 def _importable(module: str) -> bool:
-    try:
-        return find_spec(module) is not None
-    except ModuleNotFoundError:
-        return False
+    return find_spec(module) is not None
 
 
 def _bindings() -> Iterator[Finding]:
