@@ -16,7 +16,7 @@ from runner.gst import GLib, Gst
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import Received, Receiver
 from runner.gst.registry import check_plan, missing_plugins
-from runner.gst.server import CameraServer, check_port_free
+from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.model import Endpoint
 
@@ -26,7 +26,6 @@ __all__ = [
     "VehicleSide",
     "check_machine",
     "check_plan",
-    "check_port_free",
     "missing_plugins",
 ]
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from runner.errors import RunError
 from runner.model import Endpoint
+from runner.ports import check_port_free
 
 START_S = 5.0
 
@@ -25,9 +26,11 @@ def private_broker(endpoint: Endpoint) -> Iterator[None]:
     raises  RunError where mosquitto is missing or does not come up
     """
     program = find_mosquitto()
+    check_port_free(endpoint)
     with tempfile.TemporaryDirectory(prefix="tod-broker-") as directory:
         file = Path(directory) / "mosquitto.conf"
-        file.write_text(f"listener {endpoint.port} {endpoint.host}\nallow_anonymous true\npersistence false\n")
+        settings = ("allow_anonymous true", "persistence false", "set_tcp_nodelay true")
+        file.write_text("\n".join((f"listener {endpoint.port} {endpoint.host}", *settings, "")))
         command = [program, "-c", str(file)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
             try:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from runner.errors import RunError
 from runner.model import Endpoint
 
+CONNECT_S = 5.0
 KEEPALIVE_S = 2  # the broker publishes a will after one and a half of these
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
@@ -46,18 +48,20 @@ class Link:
         self._prefix = f"tod/{vehicle}/"
         self._listen = {self._prefix + topic: function for topic, function in listen.items()}
         self._connected = connected
+        self._listening = threading.Event()
         client = Client(CallbackAPIVersion.VERSION2)
         topic, message = will
         client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
         client.on_socket_open = _no_delay
         client.on_connect = self._on_connect
+        client.on_subscribe = lambda *_: self._listening.set()
         client.on_disconnect = lambda *_: connected(False)
         client.on_message = lambda _client, _data, message: self._listen[message.topic](bytes(message.payload))
         client.reconnect_delay_set(min_delay=1, max_delay=2)
         self._client, self._broker = client, broker
 
     def connect(self) -> None:
-        """Connect, and from then on stay connected.
+        """Connect, and from then on stay connected; returns when messages for this side will reach it.
 
         raises  RunError where nobody listens at the broker's address
         """
@@ -68,6 +72,8 @@ class Link:
             rule = "start a broker there (mosquitto), or choose control.host and control.port"
             raise RunError(f"no MQTT broker at {broker.host}:{broker.port}: {error}; {rule}") from None
         self._client.loop_start()
+        if not self._listening.wait(CONNECT_S):
+            raise RunError(f"the MQTT broker at {broker.host}:{broker.port} does not let this side in")
 
     def publish(self, topic: str, message: Document) -> None:
         """Send a message; the state is kept by the broker for who comes later."""
@@ -75,16 +81,16 @@ class Link:
 
     def close(self, topic: str, message: Document) -> None:
         """Say goodbye as the will would have, and disconnect."""
-        retain = topic == "state"
-        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain).wait_for_publish(1)
+        if self._client.is_connected():
+            retain = topic == "state"
+            self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain).wait_for_publish(1)
         self._client.disconnect()
         self._client.loop_stop()
 
     def _on_connect(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
             return
-        for topic in self._listen:
-            client.subscribe(topic, qos=1)
+        client.subscribe([(topic, 1) for topic in self._listen])
         self._connected(True)
 
 

@@ -82,7 +82,7 @@ class Loop:
         self._began = time.monotonic()
         self._warned = 0
         self._run = start(self.vehicle)
-        self._take_run(step(self.vehicle, self._run, ClockAdvanced(t=0.0)), None)
+        self._take(ClockAdvanced(t=0.0))
         next_tick = TICK_S
         while not self._stopped and (duration_s is None or self._now() < duration_s):
             try:
@@ -128,11 +128,10 @@ class Loop:
         if prediction is not None:
             self._take_run(step(self.vehicle, self._run, prediction), prediction)
 
-    def _take_run(self, after: Run, event: Event | None, answer: Answer | None = None) -> None:
+    def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:
         before, self._run = self._run, after
         self.applier.turn(after.commands)
-        if event is not None:
-            self.log.write(to_json(event))
+        self.log.write(to_json(event))
         if after.refused:
             self.refused += 1
             self.report(f"refused: {after.refused}")
@@ -142,13 +141,13 @@ class Loop:
         if after.commands or after.decision != before.decision:
             self._tell(before, event)
 
-    def _tell(self, before: Run, event: Event | None) -> None:
+    def _tell(self, before: Run, event: Event) -> None:
         after = self._run
         decision = {"t": after.state.t, **after.decision.to_json()}
         commands = [command.to_json() for command in after.commands]
         self.log.write({**decision, "log": "decision", "commands": commands})
         self.publish("state", {"online": True, **decision})
-        cause = "start" if event is None else _cause(event)
+        cause = _cause(event)
         for name, now in after.decision.settings.items():
             was = before.decision.settings[name]
             if (was.scaling, was.sending) != (now.scaling, now.sending):

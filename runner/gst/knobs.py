@@ -43,8 +43,9 @@ class Knobs:
             self._waiting |= values
         touched = {element for knob, value in values.items() for element, _, _ in self._assignments(knob, value)}
         first = next(element for element in self._elements if element.get_name() in touched)
-        pad = first.get_static_pad("sink") or first.get_static_pad("src")
-        pad.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
+        # Only a source pad knows that a frame it has pushed is still on its way below.
+        above = first.get_static_pad("sink").get_peer()
+        above.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
 
     def _between_frames(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._set_waiting()

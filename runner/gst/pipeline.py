@@ -28,8 +28,8 @@ class CameraPipeline:
         if plan.loops:
             loop_clip(pipeline, plan)
         self._started = False
-        elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
-        last = next(pad for element in reversed(elements) if (pad := element.get_static_pad("src")))
+        self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
+        last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._stamp(last.get_parent_element())
         self.knobs.set_now(self._allowed(wanted))
         last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
@@ -68,6 +68,7 @@ class CameraPipeline:
 
     def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._started = True
+        self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _keep_below)
         if "sending" in self._wanted:
             self.knobs.turn({"sending": self._wanted["sending"]})
         return Gst.PadProbeReturn.REMOVE
@@ -78,6 +79,15 @@ class CameraPipeline:
             extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
             extension.set_id(1)
             payloader.emit("add-extension", extension)
+
+
+def _keep_below(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    """New caps make every element above negotiate again. The source need not: what it delivers stays as it is.
+
+    And it must not: it asks for caps between two frames, just when the next knobs are turned, and finds half of them.
+    """
+    wanted = info.get_event().type != Gst.EventType.RECONFIGURE
+    return Gst.PadProbeReturn.OK if wanted else Gst.PadProbeReturn.DROP
 
 
 def counted(identity: Gst.Element) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Mapping, Sequence
 
 from gi.repository import Gst, GstRtsp, GstRtspServer
@@ -12,6 +11,7 @@ from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.pipeline import CameraPipeline
 from runner.model import Endpoint
+from runner.ports import check_port_free
 
 Wanted = Callable[[str], Mapping[str, KnobValue]]  # where the knobs of a camera are to be
 Report = Callable[[str, str], None]  # camera, what happened
@@ -83,14 +83,3 @@ def _on_element(_bin: Gst.Bin, _parent: Gst.Bin, element: Gst.Element) -> None:
     if element.find_property("rtcp-sync-send-time"):
         # Packets state when their frame was captured, not when they leave.
         element.set_property("rtcp-sync-send-time", False)
-
-
-def check_port_free(endpoint: Endpoint) -> None:
-    """raises RunError where something else listens already, or the address is not this machine's"""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((endpoint.host, endpoint.port))
-        except OSError as error:
-            what = error.strerror.lower() if error.strerror else str(error)
-            raise RunError(f"cannot listen on {endpoint.host}:{endpoint.port}: {what}; choose another port") from None

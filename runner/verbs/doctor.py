@@ -18,6 +18,7 @@ from runner.broker import find_mosquitto
 from runner.config import load
 from runner.errors import RunError
 from runner.model import Endpoint, Vehicle
+from runner.ports import check_port_free
 from runner.sources import compile_plans
 from runner.verbs import Arguments
 
@@ -59,8 +60,7 @@ def examine(vehicle: Vehicle) -> Iterator[Finding]:
         yield Finding(True, f"MQTT broker {find_mosquitto()}, for the demo")
     except RunError as error:
         yield Finding(False, str(error))
-    if all(finding.fine for finding in bindings):
-        yield from _ports(vehicle)
+    yield from _ports(vehicle)
     yield _cores(vehicle)
 
 
@@ -98,8 +98,6 @@ def _elements(vehicle: Vehicle) -> Iterator[Finding]:
 
 
 def _ports(vehicle: Vehicle) -> Iterator[Finding]:
-    from runner.apply import check_port_free
-
     ports: dict[str, Endpoint] = {"media.port": vehicle.media, "control.port": vehicle.control}
     for key, endpoint in ports.items():
         try:

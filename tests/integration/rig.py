@@ -1,0 +1,119 @@
+"""What the tests with real GStreamer share: free ports, one-camera vehicles, a client that looks at pictures."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "data"))
+CLIPS = sorted((SHARED / "video").glob("*")) if SHARED.is_dir() else []
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def until(done: Callable[[], Any], seconds: float = 15) -> Any:
+    """Wait for something to come to pass; the limit is far above what is normal."""
+    end = time.monotonic() + seconds
+    while not (seen := done()):
+        assert time.monotonic() < end, "it did not come to pass"
+        time.sleep(0.01)
+    return seen
+
+
+def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own."""
+    command = [sys.executable, "-m", "runner", *words]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **options.pop("env", {})}
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, env=environment, cwd=CHECKOUT, **options
+    )
+
+
+@contextmanager
+def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iterator[Any]:
+    """Some cameras of a vehicle behind a real RTSP server. Yields (side, vehicle, plans, what was reported)."""
+    from dataclasses import replace
+
+    from runner.apply import VehicleSide, check_plan
+    from runner.config import load
+    from runner.sources import compile_plans
+
+    words = ["source=test", *overrides, f"media.port={free_port()}"]
+    vehicle = load(words, check=check_plan)
+    vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras or vehicle.cameras})
+    plans = compile_plans(vehicle)
+    reported: list[str] = []
+    side = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(f"{camera}: {what}"))
+    try:
+        yield side, vehicle, plans, reported
+    finally:
+        side.stop()
+
+
+class Client:
+    """Receives and decodes one camera; keeps the size of each frame and, where asked for, the last picture."""
+
+    def __init__(self, plan: Any, *, pictures: bool = False) -> None:
+        from runner.gst import Gst
+
+        self._gst = Gst
+        line = plan.receiver
+        if pictures:
+            head, _, _ = line.rpartition(" ! ")
+            sink = "appsink name=sink sync=false max-buffers=1 drop=true"
+            line = f"{head} ! videoconvert ! video/x-raw,format=RGB ! {sink}"
+        self.sizes: list[tuple[int, int]] = []
+        self.times: list[float] = []
+        self.errors: list[str] = []
+        self.pipeline = Gst.parse_launch(line)
+        self._sink = self.pipeline.get_by_name("sink")
+        self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
+        self.pipeline.get_bus().set_sync_handler(self._on_message)
+        self.pipeline.set_state(Gst.State.PLAYING)
+
+    def _on_frame(self, pad: Any, _info: Any) -> Any:
+        picture = pad.get_current_caps().get_structure(0)
+        self.sizes.append((picture.get_int("width")[1], picture.get_int("height")[1]))
+        self.times.append(time.monotonic())
+        return self._gst.PadProbeReturn.OK
+
+    def _on_message(self, _bus: Any, message: Any) -> Any:
+        if message.type in (self._gst.MessageType.ERROR, self._gst.MessageType.WARNING):
+            self.errors.append(message.get_structure().to_string())
+        return self._gst.BusSyncReply.PASS
+
+    def picture(self) -> Any:
+        """The newest picture as an array of RGB."""
+        import numpy as np
+
+        sample = self._sink.emit("try-pull-sample", 5 * self._gst.SECOND)
+        caps = sample.get_caps().get_structure(0)
+        width, height = caps.get_int("width")[1], caps.get_int("height")[1]
+        data = sample.get_buffer().extract_dup(0, sample.get_buffer().get_size())
+        stride = len(data) // height
+        return np.frombuffer(data, np.uint8).reshape(height, stride)[:, : width * 3].reshape(height, width, 3)
+
+    def close(self) -> None:
+        self.pipeline.set_state(self._gst.State.NULL)
+
+
+@contextmanager
+def watching(plan: Any, *, pictures: bool = False) -> Iterator[Client]:
+    client = Client(plan, pictures=pictures)
+    try:
+        yield client
+    finally:
+        client.close()

@@ -1,0 +1,230 @@
+"""Knobs of real pipelines, turned while they play."""
+
+from __future__ import annotations
+
+import random
+import socket
+import time
+
+import pytest
+
+from rig import CLIPS, Client, streaming, until, watching
+from runner.commands import Command
+from runner.errors import RunError
+from runner.model import Roi
+
+CAMERA = "front_left"
+
+
+def turn(side, **knobs):
+    side.turn([Command(CAMERA, knob, value) for knob, value in knobs.items()])
+
+
+def test_size_changes_without_a_break():
+    with streaming() as (side, _, (plan,), _reported):
+        turn(side, size=(480, 260), bitrate=545)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 10)
+            assert set(client.sizes) == {(480, 260)}
+            for size in ((960, 520), (240, 130), (480, 260)):
+                turn(side, size=size)
+                until(lambda size=size: client.sizes[-1] == size)
+            assert client.errors == []
+            assert side.applied()[CAMERA] == {"size": (480, 260), "bitrate": 545}
+            assert side.faults() == []
+
+
+def test_bitrate_is_read_back_and_on_the_wire():
+    with streaming("source=file", f"source.clip={CLIPS[1]}") if CLIPS else streaming() as (side, _, (plan,), _reported):
+        turn(side, size=(960, 520), bitrate=3000)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 40)
+            turn(side, bitrate=500)
+            until(lambda: side.applied()[CAMERA].get("bitrate") == 500)
+            start, sent = len(client.sizes), side.sent()[CAMERA][1]
+            until(lambda: len(client.sizes) - start >= 80)
+            assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 1.3 * 500_000  # two seconds at 40 Hz
+
+
+def test_all_knobs_of_a_change_act_between_the_same_two_frames():
+    """Sides and size of the crop go together: no frame has the new crop and the old size."""
+    with streaming() as (side, _, (plan,), _reported):
+        whole, half = Roi(0, 0, 1920, 1040), Roi(0, 0, 960, 1040)
+        turn(side, roi=whole, size=(480, 260), bitrate=500)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 10)
+            for n in range(40):
+                roi, size = ((half, (240, 260)), (whole, (480, 260)))[n % 2]
+                turn(side, roi=roi, size=size)
+                until(lambda size=size: client.sizes[-1] == size)
+            assert set(client.sizes) == {(480, 260), (240, 260)}
+            assert client.errors == []
+
+
+def test_random_rois_never_stop_the_stream():
+    chance = random.Random(1)
+    with streaming() as (side, _, (plan,), reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        for n in range(2000):
+            width, height = chance.randrange(16, 1921), chance.randrange(16, 1041)
+            roi = Roi(chance.randrange(1921 - width), chance.randrange(1041 - height), width, height)
+            size = (max(16, 2 * (width // 8)), max(16, 2 * (height // 8)))
+            turn(side, roi=roi, size=size)
+            if n % 10 == 0:
+                time.sleep(0.01)  # some meet a frame on its way, some do not
+        turn(side, roi=Roi(0, 0, 1920, 1040), size=(480, 260))
+        until(lambda: client.sizes[-1] == (480, 260))
+        assert client.errors == []
+        assert side.faults() == []
+        assert reported == [f"{CAMERA}: pipeline built"]
+
+
+def test_switching_off_stops_the_encoder_and_on_resumes_it():
+    with streaming() as (side, _, (plan,), reported), watching(plan) as client:
+        turn(side, sending=True, size=(240, 130), bitrate=200)
+        until(lambda: len(client.sizes) > 10)
+        for _ in range(100):
+            turn(side, sending=False)
+            turn(side, sending=True)
+        count = len(client.sizes)
+        until(lambda: len(client.sizes) > count + 10)
+        turn(side, sending=False)
+        until(lambda: side.applied()[CAMERA]["sending"] is False)
+        time.sleep(0.1)
+        frames = side.sent()[CAMERA][0]
+        time.sleep(0.5)
+        assert side.sent()[CAMERA][0] == frames
+        turn(side, sending=True)
+        until(lambda: side.sent()[CAMERA][0] > frames + 10)
+        assert client.errors == []
+        assert reported == [f"{CAMERA}: pipeline built"]
+
+
+def describe(endpoint, path, seconds=1.0):
+    """First line of the answer to an RTSP DESCRIBE."""
+    with socket.create_connection((endpoint.host, endpoint.port), timeout=seconds) as link:
+        link.settimeout(seconds)
+        url = f"rtsp://{endpoint.host}:{endpoint.port}/{path}"
+        link.sendall(f"DESCRIBE {url} RTSP/1.0\r\nCSeq: 1\r\nAccept: application/sdp\r\n\r\n".encode())
+        return link.recv(4096).decode().splitlines()[0]
+
+
+def test_a_camera_that_is_off_before_the_first_client_answers_at_once():
+    with streaming() as (side, vehicle, (plan,), _reported):
+        turn(side, sending=False)
+        assert describe(vehicle.media, CAMERA) == "RTSP/1.0 200 OK"
+        with watching(plan) as client:
+            until(lambda: side.applied()[CAMERA].get("sending") is False)
+            turn(side, sending=True, size=(240, 130), bitrate=200)
+            until(lambda: (240, 130) in client.sizes)
+
+
+def test_a_rebuilt_pipeline_gets_the_settings_in_force():
+    with streaming() as (side, _, (plan,), reported):
+        turn(side, size=(480, 260), bitrate=545)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 5)
+        until(lambda: f"{CAMERA}: pipeline gone" in reported)
+        turn(side, size=(240, 130), bitrate=300)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 5)
+            assert set(client.sizes) == {(240, 130)}
+            assert side.applied()[CAMERA] == {"size": (240, 130), "bitrate": 300}
+
+
+def test_a_second_viewer_does_not_disturb_the_first():
+    with streaming() as (side, _, (plan,), reported), watching(plan) as first:
+        turn(side, size=(240, 130), bitrate=200)
+        until(lambda: len(first.sizes) > 10)
+        with watching(plan) as second:
+            until(lambda: len(second.sizes) > 10)
+        count = len(first.sizes)
+        until(lambda: len(first.sizes) > count + 20)
+        assert first.errors == []
+        assert reported == [f"{CAMERA}: pipeline built"]
+
+
+def quadrants(width, height):
+    """An I420 frame: top left bright, top right red, bottom left blue, bottom right dark."""
+    import numpy as np
+
+    def plane(w, h, values):
+        made = np.empty((h, w), np.uint8)
+        for (top, left), value in zip(((0, 0), (0, 1), (1, 0), (1, 1)), values, strict=True):
+            made[top * h // 2 : (top + 1) * h // 2, left * w // 2 : (left + 1) * w // 2] = value
+        return made.tobytes()
+
+    luma = plane(width, height, (210, 80, 60, 30))
+    u, v = (128, 90, 200, 128), (128, 220, 110, 128)
+    return luma + plane(width // 2, height // 2, u) + plane(width // 2, height // 2, v)
+
+
+BRIGHT, RED, BLUE, DARK = "bright", "red", "blue", "dark"
+
+
+def colour(pixel):
+    red, green, blue = (int(value) for value in pixel)
+    if red > 150 and green > 150:
+        return BRIGHT
+    return RED if red > blue + 40 else BLUE if blue > red + 40 else DARK
+
+
+@pytest.mark.parametrize(
+    ("roi", "size", "corners"),
+    [
+        (Roi(0, 0, 1920, 1040), (480, 260), (BRIGHT, RED, BLUE, DARK)),
+        (Roi(0, 0, 960, 1040), (240, 260), (BRIGHT, BRIGHT, BLUE, BLUE)),  # left half
+        (Roi(0, 0, 1920, 260), (480, 66), (BRIGHT, RED, BRIGHT, RED)),  # top strip
+        (Roi(960, 520, 960, 520), (480, 260), (DARK, DARK, DARK, DARK)),
+    ],
+)
+def test_an_roi_shows_what_it_names(roi, size, corners):
+    frame = quadrants(1920, 1040)
+    with streaming("source=appsrc") as (side, _, (plan,), _reported):
+        turn(side, roi=roi, size=size, bitrate=2000)
+        client = Client(plan, pictures=True)
+        try:
+            until(lambda: side.push(CAMERA, frame) and (time.sleep(0.02) or len(client.sizes) > 5))
+            picture = client.picture()
+        finally:
+            client.close()
+        assert picture.shape[1::-1] == size
+        height, width = picture.shape[:2]
+        rows, columns = (height // 8, -height // 8), (width // 8, -width // 8)
+        assert tuple(colour(picture[row, column]) for row in rows for column in columns) == corners
+
+
+def test_a_native_crop_comes_before_the_roi():
+    """The robot's front camera cuts 120 px off the top of 960: its full image begins there."""
+    frame = quadrants(1280, 960)
+    words = ("vehicle=delivery_robot", "source=appsrc", "cameras.front.native.top_px=240")
+    with streaming(*words, cameras=("front",)) as (side, _, (plan,), _reported):
+        commands = {"roi": Roi(0, 0, 1280, 720), "size": (640, 360), "bitrate": 2000}
+        side.turn([Command("front", knob, value) for knob, value in commands.items()])
+        client = Client(plan, pictures=True)
+        try:
+            until(lambda: side.push("front", frame) and (time.sleep(0.02) or len(client.sizes) > 5))
+            picture = client.picture()
+        finally:
+            client.close()
+        # Rows 240 to 960 of the native picture: the border between top and bottom at 480 is a third from the top.
+        assert [colour(picture[row, 100]) for row in (20, 100, 140, 340)] == [BRIGHT, BRIGHT, BLUE, BLUE]
+
+
+def test_a_frame_of_another_size_is_refused():
+    rule = "front_left: a frame of 3 bytes must have 2995200, I420 of 1920x1040"
+    with (
+        streaming("source=appsrc") as (side, _, (plan,), _reported),
+        watching(plan),
+        pytest.raises(ValueError, match=rule),
+    ):
+        until(lambda: side.push(CAMERA, b"abc"))
+
+
+def test_a_port_in_use_is_told_in_one_line():
+    from runner.ports import check_port_free
+
+    with streaming() as (_, vehicle, _, _reported), pytest.raises(RunError) as told:
+        check_port_free(vehicle.media)
+    where = f"127.0.0.1:{vehicle.media.port}"
+    assert str(told.value) == f"cannot listen on {where}: address already in use; choose another port"

@@ -1,0 +1,80 @@
+"""What `print` shows runs as it is, and the streams play in foreign clients."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+
+import pytest
+
+from rig import CLIPS, run, streaming, until
+
+GRAPHS = ["h264_rtsp", "openh264_rtsp", "h264_srt"]
+
+
+def printed(*words):
+    done = run("print", "format=json", "total_kbps=6000", *words)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)["cameras"]
+
+
+def start(line):
+    return subprocess.Popen(
+        ["sh", "-c", f"exec gst-launch-1.0 -e -v {line}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def end(process):
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=20)
+    return output
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(graph):
+    camera = printed("source=test", f"graph={graph}", "vehicle=delivery_robot")["rear"]
+    operator = start(camera["operator"])
+    vehicle = start(camera["vehicle"])
+    size = f"width=(int){camera['decision']['width']}, height=(int){camera['decision']['height']}"
+    try:
+        until(lambda: "sink.GstPad:sink: caps" in (line := operator.stdout.readline()) and size in line)
+    finally:
+        end(operator)
+        end(vehicle)
+
+
+@pytest.mark.parametrize("source", ["test", "appsrc", "synthetic"])
+def test_every_line_of_the_paper_s_vehicle_runs(source, tmp_path):
+    """Also where a stand-in is printed: frames born in Python, a drive that is not rendered."""
+    done = run("print", "format=json", f"source={source}", env={"XDG_CACHE_HOME": str(tmp_path)})
+    cameras = json.loads(done.stdout)["cameras"]
+    assert ("stands in" in done.stderr) == (source != "test")
+    processes = [start(camera["vehicle"]) for camera in cameras.values()]
+    for process in processes:
+        until(lambda process=process: "PLAYING" in process.stdout.readline())
+    for process in processes:
+        assert "ERROR" not in end(process)
+
+
+def test_a_clip_with_blanks_in_its_path_plays(tmp_path):
+    clip = tmp_path / "it's a clip.mp4"
+    if CLIPS:
+        shutil.copy(CLIPS[2], clip)
+    else:
+        line = "videotestsrc num-buffers=50 ! x264enc ! mp4mux ! filesink location=clip.mp4"
+        subprocess.run(["gst-launch-1.0", "-q", *line.split()], cwd=tmp_path, check=True)
+        (tmp_path / "clip.mp4").rename(clip)
+    camera = printed("source=file", f'source.clip="{clip}"', "vehicle=delivery_robot")["rear"]
+    process = start(camera["vehicle"])
+    until(lambda: "PLAYING" in process.stdout.readline())
+    assert "ERROR" not in end(process)
+
+
+def test_a_foreign_client_plays_the_stream():
+    with streaming("vehicle=delivery_robot", cameras=("rear",)) as (_, vehicle, _, _reported):
+        url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"
+        command = ["ffprobe", "-v", "error", "-rtsp_transport", "tcp", "-show_entries", "stream=codec_name,width", url]
+        done = subprocess.run([*command, "-of", "json"], capture_output=True, text=True, timeout=60, check=True)
+        assert json.loads(done.stdout)["streams"] == [{"codec_name": "h264", "width": 848}]

@@ -1,0 +1,219 @@
+"""Both sides as processes over real RTSP and a real broker."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from rig import CHECKOUT, CLIPS, SHARED, free_port, run, until
+from runner.broker import private_broker
+from runner.control import Link
+from runner.errors import RunError
+from runner.model import Endpoint
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
+
+
+@contextmanager
+def process(verb, *words):
+    command = [sys.executable, "-m", "runner", verb, *words]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+class Operator:
+    """An operator's side of the control link, as a program would write it."""
+
+    def __init__(self, broker):
+        self.states, self.replies, self.telemetry = queue.Queue(), {}, []
+        listen = {
+            "state": lambda payload: self.states.put(json.loads(payload)),
+            "reply": lambda payload: self.replies.update({(said := json.loads(payload))["id"]: said}),
+            "telemetry": lambda payload: self.telemetry.append(json.loads(payload)),
+        }
+        will = ("request", {"id": "will", "event": "operator_disconnected"})
+        self.link = Link("delivery_robot", broker, will, listen, lambda here: None)
+        self.link.connect()
+
+    def ask(self, identity, **event):
+        self.link.publish("request", {"id": identity, **event})
+        return until(lambda: self.replies.get(identity))
+
+    def state(self, wanted):
+        """The next state of which something is true."""
+        while not wanted(state := self.states.get(timeout=15)):
+            pass
+        return state
+
+
+@pytest.fixture
+def broker():
+    endpoint = Endpoint("127.0.0.1", free_port())
+    with private_broker(endpoint):
+        yield endpoint
+
+
+@pytest.fixture
+def vehicle(broker, tmp_path):
+    ports = (f"control.port={broker.port}", f"media.port={free_port()}")
+    with process("vehicle", *ROBOT, *ports, f"log={tmp_path / 'drive'}") as child:
+        yield child
+
+
+def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
+    operator = Operator(broker)
+    state = operator.state(lambda state: state["online"])
+    assert state["mode"] == "automatic"
+    assert set(state["cameras"]) == {"front", "rear", "mast"}
+
+    assert operator.ask("1", event="mode_selected", mode="collective")["accepted"]
+    assert operator.ask("2", event="total_set", kbps=2000)["accepted"]
+    assert operator.state(lambda state: state["total_kbps"] == 2000)["cameras"]["mast"]["kbps"] == 416
+    assert operator.ask("3", event="camera_switched", camera="rear", on=False)["accepted"]
+    assert not operator.state(lambda state: not state["cameras"]["rear"]["on"])["cameras"]["rear"]["sending"]
+
+    refused = {
+        "4": ({"event": "camera_switched", "camera": "raer", "on": True}, "unknown camera 'raer', did you mean rear?"),
+        "5": (
+            {"event": "roi_set", "camera": "rear", "x": 0, "y": 0, "width": 100, "height": 100},
+            "roi_set is accepted in mode single only, the mode is collective",
+        ),
+        "6": ({"event": "total_set", "kbps": -1}, "kbps: -1: must be at least 0"),
+        "7": ({"event": "total_st", "kbps": 1}, "event: 'total_st': unknown event, did you mean total_set?"),
+        "8": ({"event": "total_set", "kbps": 1, "t": 0}, "t: must not be given, the vehicle stamps events on receipt"),
+    }
+    for identity, (event, reason) in refused.items():
+        reply = operator.ask(identity, **event)
+        assert (reply["accepted"], reply["reason"]) == (False, reason)
+
+    for payload in (b"", b"{", b"[1]", b"x" * 100_000, b'{"event": "total_set", "kbps": 1}', b"\xff\xfe"):
+        operator.link._client.publish("tod/delivery_robot/request", payload, qos=1)
+    assert operator.ask("9", event="total_set", kbps=1500)["accepted"]  # it lives
+    assert vehicle.poll() is None
+
+    vehicle.send_signal(signal.SIGTERM)
+    assert vehicle.wait(timeout=15) == 0
+    assert operator.state(lambda state: not state["online"]) == {"online": False}
+    lines = [json.loads(line) for line in (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()]
+    assert [line["kbps"] for line in lines if line.get("event") == "total_set"] == [2000, 1500]
+    assert [line["t"] for line in lines] == sorted(line["t"] for line in lines)
+
+
+def test_a_killed_vehicle_is_told_by_its_last_will(broker, vehicle):
+    operator = Operator(broker)
+    operator.state(lambda state: state["online"])
+    vehicle.kill()
+    assert operator.state(lambda state: not state["online"]) == {"online": False}
+
+
+def test_the_drive_log_replays_to_the_same_decisions(broker, vehicle, tmp_path):
+    operator = Operator(broker)
+    operator.state(lambda state: state["online"])
+    operator.ask("1", event="weights_set", weights={"rear": 3})
+    operator.ask("2", event="camera_switched", camera="mast", on=False)
+    vehicle.send_signal(signal.SIGTERM)
+    vehicle.wait(timeout=15)
+    log = tmp_path / "drive" / "drive.jsonl"
+    done = run("replay", *ROBOT[:3], f"input={log}")
+    assert done.returncode == 0, done.stderr
+    live = [json.loads(line) for line in log.read_text().splitlines()]
+    live = [line for line in live if line.get("log") == "decision" and line["t"] > 0]
+    replayed = [json.loads(line) for line in done.stdout.splitlines()]
+    replayed = [line for line in replayed if line["commands"]][1:]
+    keys = ("mode", "total_kbps", "cameras", "commands")
+    assert len(live) == len(replayed) == 2
+    for then, now in zip(live, replayed, strict=True):
+        assert {key: then[key] for key in keys} == {key: now[key] for key in keys}
+
+
+def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
+    ports = (f"control.port={broker.port}", f"media.port={free_port()}")
+    with process("operator", *ROBOT, *ports, "duration_s=14") as operator:
+        with process("vehicle", *ROBOT, *ports) as first:
+            time.sleep(4)
+            first.kill()
+        with process("vehicle", *ROBOT, *ports):
+            output, _ = operator.communicate(timeout=60)
+    summary = output[output.rindex("received") :]
+    table = [line.split() for line in summary.splitlines()]
+    rows = {words[0]: words for words in table if words and words[0] in ("front", "rear")}
+    for words in rows.values():
+        assert int(words[1]) > 60  # frames of both lives
+        assert int(words[-1]) >= 1  # pipelines built anew
+        good, _, windows = words[7:10]
+        assert int(windows) >= 2
+        assert int(good) >= int(windows) - 1
+    assert set(rows) == {"front", "rear"}
+
+
+@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp", "h264_srt"])
+def test_the_demo_runs_over_every_transport(graph, tmp_path):
+    words = (*ROBOT[:2], f"graph={graph}", f"media.port={free_port()}", f"control.port={free_port()}")
+    done = run("demo", *words, "duration_s=8", f"log={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    for line in done.stdout[done.stdout.rindex("received") :].splitlines():
+        words = line.split()
+        if words and words[0] in ("front", "rear", "mast"):
+            assert int(words[1]) > 50, line
+            assert words[3] == "0", line  # no second was short of frames
+
+
+@pytest.mark.skipif(not CLIPS, reason="needs the recorded clips")
+def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
+    words = (
+        "source=file",
+        f"source.clip={SHARED / 'video' / 'forward_highway_day_540p25_A.mp4'}",
+        f"pqos.file={SHARED / 'traces' / 'raw' / 'tum_bandwidth_map.yaml'}",
+        f"media.port={free_port()}",
+        f"control.port={free_port()}",
+    )
+    done = run("demo", *words, "duration_s=10", f"log={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert "front_left" in done.stdout
+    lines = [json.loads(line) for line in (tmp_path / "drive.jsonl").read_text().splitlines()]
+    assert {line["kbps"] for line in lines if line.get("event") == "bitrate_predicted"} <= {2500, 4500, 8000}
+
+
+def test_what_is_missing_is_one_line_and_status_1(broker, tmp_path):
+    port = f"control.port={broker.port}"
+    absent = run("vehicle", "source=v4l2", "cameras.front_left.device=/dev/video99", port, f"media.port={free_port()}")
+    assert absent.returncode == 1
+    assert "camera front_left: Cannot identify device '/dev/video99'." in absent.stderr
+    assert "Traceback" not in absent.stderr
+
+    nobody = run("vehicle", *ROBOT, f"control.port={(free := free_port())}", f"media.port={free_port()}")
+    assert nobody.returncode == 1
+    assert nobody.stderr.splitlines()[-1].startswith(f"no MQTT broker at 127.0.0.1:{free}: ")
+
+    taken = run("vehicle", *ROBOT, port, f"media.port={broker.port}")
+    assert taken.returncode == 2  # the same port twice is a mistake in the configuration
+
+    busy = run("demo", *ROBOT, port, f"media.port={free_port()}", "duration_s=2")
+    assert busy.returncode == 1
+    assert f"cannot listen on 127.0.0.1:{broker.port}: address already in use" in busy.stderr
+
+
+def test_a_plugin_that_is_not_installed_is_named_with_its_package(broker):
+    done = run("vehicle", *ROBOT, "graph=h264_va_rtsp", f"control.port={broker.port}", f"media.port={free_port()}")
+    assert done.returncode == 1
+    rule = "the GStreamer element vah264enc is not installed; on Debian: apt-get install gstreamer1.0-plugins-bad"
+    assert done.stderr.splitlines() == [rule]
+
+
+def test_a_broker_that_cannot_start_is_told():
+    with pytest.raises(RunError, match="mosquitto does not come up"), private_broker(Endpoint("127.0.0.1", 1)):
+        pass
