@@ -59,7 +59,7 @@ def after(commanded: Mapping[str, Knobs], commands: list[Command]) -> Mapping[st
     """Where the knobs are commanded to once these commands are given."""
     if not commands:
         return commanded
-    knobs = {name: dict(values) for name, values in commanded.items()}
+    turned: dict[str, dict[str, KnobValue]] = {}
     for command in commands:
-        knobs.setdefault(command.camera, {})[command.knob] = command.value
-    return knobs
+        turned.setdefault(command.camera, {})[command.knob] = command.value
+    return {**commanded, **{name: {**commanded.get(name, {}), **knobs} for name, knobs in turned.items()}}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from decimal import Decimal
 from difflib import get_close_matches
 from enum import StrEnum
 from fractions import Fraction
@@ -39,7 +40,7 @@ def exact(number: float | str | Fraction) -> Fraction:
     """
     if isinstance(number, int | Fraction):
         return Fraction(number)
-    return Fraction(str(number))
+    return Fraction(Decimal(str(number)))
 
 
 def plain(number: Fraction) -> int | float:
@@ -240,17 +241,15 @@ class Camera:
     pose: Pose | None = None
     fov_deg: float = 90.0
     lens: str = "pinhole"
+    full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "full_roi", Roi(0, 0, self.width, self.height))
         if self.native and self.crop:
             width, height = self.native
             if self.crop.x + self.crop.width > width or self.crop.y + self.crop.height > height:
                 found = f"{self.crop.width}x{self.crop.height} at {self.crop.x},{self.crop.y}"
                 raise ModelError("native", found, f"must lie inside the native {width}x{height}")
-
-    @property
-    def full_roi(self) -> Roi:
-        return Roi(0, 0, self.width, self.height)
 
     @property
     def source_size(self) -> tuple[int, int]:

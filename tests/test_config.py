@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from helpers import CONF, Command, Drive, UserConf, process, vehicle
+from helpers import CONF, Command, UserConf, process, vehicle
 
 from runner.config import load
 from runner.errors import ConfigError, Problem
@@ -499,10 +499,3 @@ def test_no_part_of_the_environment_comes_into_the_configuration(conf: UserConf)
     conf.write("vehicle/mine.yaml", MINE + "media: {host: '${oc.env:KIND}'}\n")
     result = process(*words, env={**os.environ, "KIND": "top_view"})
     assert result.err.splitlines()[0].endswith("media.host: Unsupported interpolation type oc.env")
-
-
-def test_a_drive_of_the_users_own_vehicle(conf: UserConf) -> None:
-    conf.write("vehicle/mine.yaml", MINE)
-    drive = Drive("vehicle=delivery_robot")
-    drive.vehicle = load(["source=test", "vehicle=mine", "modes=paper"], conf.path)
-    assert drive.vehicle.cameras["a"].rate_quality.b_full == 3000

@@ -34,6 +34,7 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
+_encode = json.JSONEncoder(ensure_ascii=False).encode
 LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
 
 
@@ -79,7 +80,7 @@ def answer(document: dict[str, Any], now: Run) -> str:
         line["reason"] = now.refused
     line |= now.decision.to_json()
     line["commands"] = [command.to_json() for command in now.commands]
-    return json.dumps(line, ensure_ascii=False) + "\n"
+    return _encode(line) + "\n"
 
 
 def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Event]]:
