@@ -110,9 +110,10 @@ def describe(endpoint, path, seconds=1.0):
 
 
 def test_a_camera_that_is_off_before_the_first_client_answers_at_once():
-    with streaming() as (side, vehicle, (plan,), _reported):
+    with streaming() as (side, vehicle, (plan,), reported):
         turn(side, sending=False)
         assert describe(vehicle.media, CAMERA) == "RTSP/1.0 200 OK"
+        until(lambda: f"{CAMERA}: pipeline gone" in reported)  # the server refuses who comes in this very moment
         with watching(plan) as client:
             until(lambda: side.applied()[CAMERA].get("sending") is False)
             turn(side, sending=True, size=(240, 130), bitrate=200)
