@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
+from math import lcm
 
 from runner.model import Kbps, Roi
 
@@ -40,11 +41,11 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
     The paper leaves two cases open. All cameras off: everyone gets 0. More than demanded: the surplus stays unused.
     """
     waiting = {name: own for name, own in demands.items() if own and weights[name]}
-    wanted = sum(waiting.values())
+    wanted = _sum(waiting.values())
     if total >= wanted:
         return {name: waiting.get(name, ZERO) for name in demands}
     allocated = dict.fromkeys(demands, ZERO)
-    if len({weights[name] for name in waiting}) == 1:
+    if _all_equal([weights[name] for name in waiting]):
         share = total / wanted
         return allocated | {name: own * share for name, own in waiting.items()}
     left = total
@@ -56,3 +57,14 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
         allocated[name] = waiting.pop(name)
         left -= allocated[name]
     return allocated
+
+
+def _sum(bitrates: Iterable[Kbps]) -> Kbps:
+    """Sum over a common denominator: bitrates are mostly whole, and adding fractions one by one is slow."""
+    terms = list(bitrates)
+    denominator = lcm(*(term.denominator for term in terms))
+    return Fraction(sum(term.numerator * (denominator // term.denominator) for term in terms), denominator)
+
+
+def _all_equal(weights: Sequence[Fraction]) -> bool:
+    return all(weight is weights[0] or weight == weights[0] for weight in weights)

@@ -47,12 +47,15 @@ def wanted(setting: Setting) -> Knobs:
 
 def difference(decision: Decision, commanded: Mapping[str, Knobs]) -> list[Command]:
     """Commands that take every camera from where its knobs were commanded to, to where the decision wants them."""
-    return [
-        Command(name, knob, value)
-        for name, setting in decision.settings.items()
-        for knob, value in wanted(setting).items()
-        if commanded.get(name, {}).get(knob) != value
-    ]
+    commands = []
+    for name, setting in decision.settings.items():
+        now = commanded.get(name, {})
+        for knob, value in wanted(setting).items():
+            held = now.get(knob)
+            # Most values are the very object that was commanded; comparing regions one by one is slow.
+            if held is not value and held != value:
+                commands.append(Command(name, knob, value))
+    return commands
 
 
 def after(commanded: Mapping[str, Knobs], commands: list[Command]) -> Mapping[str, Knobs]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from runner.model import Kbps, Mode, Roi, plain
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +68,7 @@ class Decision:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Draft:
+class Draft(NamedTuple):
     """A decision in the making. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
     total    kbit/s of all cameras
@@ -79,13 +81,17 @@ class Draft:
     """
 
     total: Kbps | None = None
-    demand: Mapping[str, Kbps] = field(default_factory=dict)
-    bitrate: Mapping[str, Kbps] = field(default_factory=dict)
-    scaling: Mapping[str, Fraction] = field(default_factory=dict)
+    demand: Mapping[str, Kbps] = NOTHING
+    bitrate: Mapping[str, Kbps] = NOTHING
+    scaling: Mapping[str, Fraction] = NOTHING
     sending: bool = True
     notes: tuple[str, ...] = ()
-    reasons: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str] = NOTHING
+
+    def but(self, **changes: Any) -> Draft:
+        """The draft with these parts replaced."""
+        return self._replace(**changes)
 
     def noted(self, note: str, **changes: Any) -> Draft:
-        """The draft with these changes and the reason for them."""
-        return replace(self, notes=(*self.notes, note), **changes)
+        """The draft with these parts replaced and the reason for it."""
+        return self._replace(notes=(*self.notes, note), **changes)

@@ -86,11 +86,16 @@ class RateQualityModel:
     b_min    R lower bounds in kbit/s, rising from 0
     b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
     raises   ModelError
+
+    Made from them: `whole_b_min`, the bounds as integers where all are, else empty; `ranges`, each range B_r and its
+    factor as a person reads them: "range [300, 950) -> 0.25", "range [950, ...) -> 0.5".
     """
 
     scaling: tuple[Fraction, ...]
     b_min: tuple[Kbps, ...]
     b_full: Kbps
+    whole_b_min: tuple[int, ...] = field(init=False, repr=False)
+    ranges: tuple[str, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         bounds = [plain(b) for b in self.b_min]
@@ -107,6 +112,11 @@ class RateQualityModel:
             raise ModelError("b_min_kbps", bounds, "must rise from 0")
         if self.b_full <= self.b_min[-1]:
             raise ModelError("b_full_kbps", plain(self.b_full), f"must be above the last b_min, {bounds[-1]}")
+        whole = tuple(bound for bound in bounds if isinstance(bound, int))
+        object.__setattr__(self, "whole_b_min", whole if len(whole) == len(bounds) else ())
+        ends = [*bounds[1:], "..."]
+        texts = (f"range [{a}, {b}) -> {s}" for a, b, s in zip(bounds, ends, factors, strict=True))
+        object.__setattr__(self, "ranges", tuple(texts))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -80,13 +80,13 @@ def rule(
 @rule(gives=["total"], reads=["prediction"])
 def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one comes."""
-    return replace(draft, total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+    return draft.but(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
 
 
 @rule(gives=["total"], reads=["collective_total"])
 def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode C: the total is the operator's; `start_kbps` where a run starts in C and none was set yet."""
-    return replace(draft, total=start_kbps if state.collective_total is None else state.collective_total), memory
+    return draft.but(total=start_kbps if state.collective_total is None else state.collective_total), memory
 
 
 @rule(gives=["demand"], reads=["on", "rois"])
@@ -98,14 +98,14 @@ def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
         else allocation.ZERO
         for name, camera in vehicle.cameras.items()
     }
-    return replace(draft, demand=demands), memory
+    return draft.but(demand=demands), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
     assert draft.total is not None
-    return replace(draft, bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
@@ -120,13 +120,10 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
         # What cannot be sent is not a picture to look at: however few its pixels, the smallest factor.
         nothing = draft.bitrate[name] < 1
         r = 0 if nothing else scaling.select_range(model, bitrate)
-        factors[name] = factor = model.scaling[r]
+        factors[name] = model.scaling[r]
         seen = "" if nothing or roi == full else f", as {int(bitrate)} for the full image"
-        reasons[name] = (
-            f"{int(draft.bitrate[name])} of {_short(draft.demand[name])} kbit/s{seen}, "
-            f"range {scaling.bitrate_range(model, r)} -> {plain(factor)}"
-        )
-    return replace(draft, scaling=factors, reasons=reasons), memory
+        reasons[name] = f"{int(draft.bitrate[name])} of {_short(draft.demand[name])} kbit/s{seen}, {model.ranges[r]}"
+    return draft.but(scaling=factors, reasons=reasons), memory
 
 
 @rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
@@ -137,7 +134,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
     total = sum(bitrates.values(), allocation.ZERO)
-    return replace(draft, total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+    return draft.but(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
 # --- answers to inputs that are stale or lost: modes=safe -------------------------------------------------------------
@@ -219,7 +216,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
             now[name] = (held, since)
             factors[name] = held
             reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
-    return replace(draft, scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
+    return draft.but(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
 
 
 # --- running a list ---------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from fractions import Fraction
 
-from runner.model import SMALLEST_SIDE_PX, Kbps, RateQualityModel, Roi, plain
+from runner.model import SMALLEST_SIDE_PX, Kbps, RateQualityModel, Roi
 
 
 def as_full_image(allocated: Kbps, roi: Roi, full: Roi) -> Kbps:
@@ -24,18 +24,15 @@ def select_range(model: RateQualityModel, bitrate: Kbps) -> int:
     bitrate  kbit/s of the full image, see `as_full_image`
     returns  0 to R-1; a bound belongs to the upper range, the last range has no upper end
     """
+    if model.whole_b_min:
+        # A whole bound is reached when the whole part reaches it: the same answer without comparing fractions.
+        return bisect_right(model.whole_b_min, bitrate.numerator // bitrate.denominator) - 1
     return bisect_right(model.b_min, bitrate) - 1
 
 
 def select_scaling(model: RateQualityModel, bitrate: Kbps) -> Fraction:
     """Factor s_r in ]0, 1] of the range that a bitrate of the full image, kbit/s, falls into."""
     return model.scaling[select_range(model, bitrate)]
-
-
-def bitrate_range(model: RateQualityModel, r: int) -> str:
-    """The range B_r as a person reads it: [300, 950) or [450, ...)."""
-    upper = plain(model.b_min[r + 1]) if r + 1 < len(model.b_min) else "..."
-    return f"[{plain(model.b_min[r])}, {upper})"
 
 
 def output_size(roi: Roi, scaling: Fraction) -> tuple[int, int]:

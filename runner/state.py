@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import assert_never
+from typing import Any, assert_never
 
 from runner import events as ev
 from runner.decision import Decision
@@ -67,44 +67,45 @@ def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision)
     in_force  the decision that is applied when the event comes: entering S or C starts from it
     raises    Refused
     """
-    return replace(_changed(vehicle, state, event, in_force), t=event.t)
+    return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
 
 
-def _changed(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:  # noqa: PLR0911, PLR0912
+def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> dict[str, Any]:  # noqa: PLR0911, PLR0912
+    """What an event changes in the state, by field."""
     match event:
         case ev.BitratePredicted():
-            return replace(state, prediction=event)
+            return {"prediction": event}
         case ev.ModeSelected(mode=mode):
             return _enter(state, mode, in_force)
         case ev.TotalSet(kbps=kbps):
             _only_in(Mode.COLLECTIVE, state, event)
-            return replace(state, total_set=kbps, collective_total=kbps)
+            return {"total_set": kbps, "collective_total": kbps}
         case ev.CameraSwitched(camera=name, on=on):
             _known(vehicle, name)
             # Switched on again in S, a camera gets its last values.
             manual = state.manual if on else {**state.manual, **keep(in_force, name)}
-            return replace(state, on={**state.on, name: on}, manual=manual)
+            return {"on": {**state.on, name: on}, "manual": manual}
         case ev.RoiSet(camera=name, roi=roi):
             _only_in(Mode.SINGLE, state, event)
             _check_roi(_known(vehicle, name), roi)
-            return replace(state, rois={**state.rois, name: roi})
+            return {"rois": {**state.rois, name: roi}}
         case ev.CameraConfigured(camera=name):
             _only_in(Mode.SINGLE, state, event)
             configured = _configured(_known(vehicle, name), state.manual[name], event)
-            return replace(state, manual={**state.manual, name: configured})
+            return {"manual": {**state.manual, name: configured}}
         case ev.WeightsSet(weights=weights):
             for name in weights:
                 _known(vehicle, name)
-            return replace(state, weights={**state.weights, **weights})
+            return {"weights": {**state.weights, **weights}}
         case ev.LinkMeasured(camera=name):
             _known(vehicle, name)
-            return replace(state, links={**(state.links or {}), name: event})
+            return {"links": {**(state.links or {}), name: event}}
         case ev.OperatorConnected():
-            return replace(state, operator_lost=None)
+            return {"operator_lost": None}
         case ev.OperatorDisconnected():
-            return state if state.operator_lost is not None else replace(state, operator_lost=event.t)
+            return {} if state.operator_lost is not None else {"operator_lost": event.t}
         case ev.PositionReported() | ev.ClockAdvanced():
-            return state
+            return {}
         case _:
             assert_never(event)  # type: ignore[arg-type]
 
@@ -115,18 +116,18 @@ def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
     return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 
 
-def _enter(state: State, mode: Mode, in_force: Decision) -> State:
+def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
     """Change the mode without a jump: S keeps what is sent, C keeps the total unless the operator has set one."""
     if mode is state.mode:
-        return state
+        return {}
     match mode:
         case Mode.SINGLE:
-            return replace(state, mode=mode, manual={**state.manual, **keep(in_force)})
+            return {"mode": mode, "manual": {**state.manual, **keep(in_force)}}
         case Mode.COLLECTIVE:
             total = in_force.total if state.total_set is None else state.total_set
-            return replace(state, mode=mode, collective_total=total)
+            return {"mode": mode, "collective_total": total}
         case Mode.AUTOMATIC:
-            return replace(state, mode=mode)
+            return {"mode": mode}
 
 
 def _known(vehicle: Vehicle, name: str) -> Camera:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from importlib.metadata import EntryPoint
 from typing import Any
@@ -25,7 +26,7 @@ STEPS = [1320, 1650, 2200, 2970, 3300, 4400, 5225, 14850]  # worked out from Tab
 
 def decided(total: Fraction | int | str, state: State = START) -> rules.Decision:
     prediction = BitratePredicted(t=0, kbps=Fraction(total))
-    return decide(TUM, rules.replace(state, prediction=prediction), {})[0]
+    return decide(TUM, replace(state, prediction=prediction), {})[0]
 
 
 def factors(total: Fraction | int | str) -> dict[str, float]:
@@ -81,7 +82,7 @@ def test_a_tiny_total_stops_cameras_instead_of_opening_them(total: float) -> Non
 
 
 def test_a_tiny_roi_is_not_sent_either_and_takes_the_smallest_factor() -> None:
-    tiny = rules.replace(START, rois={**START.rois, "front_left": Roi(0, 0, 16, 16)})
+    tiny = replace(START, rois={**START.rois, "front_left": Roi(0, 0, 16, 16)})
     left = decided(40_000, tiny).settings["front_left"]
     assert (left.on, left.sending, left.kbps, left.scaling) == (True, False, 0, Fraction(1, 8))
     assert left.reason == "0 of 0.8 kbit/s, range [0, 300) -> 0.125, below 1 kbit/s: not sending"
@@ -90,7 +91,7 @@ def test_a_tiny_roi_is_not_sent_either_and_takes_the_smallest_factor() -> None:
 def test_reasons_speak_of_the_numbers() -> None:
     left = decided(3000).settings["front_left"]
     assert left.reason == "545 of 6000 kbit/s, range [300, 950) -> 0.25"
-    cut = rules.replace(START, rois={**START.rois, "front_left": Roi(0, 0, 960, 520)})
+    cut = replace(START, rois={**START.rois, "front_left": Roi(0, 0, 960, 520)})
     left = decided(3000, cut).settings["front_left"]
     assert left.reason == "157 of 1500 kbit/s, as 631 for the full image, range [300, 950) -> 0.25"
 
@@ -104,7 +105,7 @@ def states(draw: st.DrawFn) -> State:
         x, y = draw(st.integers(0, camera.width - width)), draw(st.integers(0, camera.height - height))
         on[name], rois[name] = draw(st.booleans()), Roi(x, y, width, height)
         weights[name] = draw(st.fractions(0, 5, max_denominator=10))
-    return rules.replace(START, on=on, rois=rois, weights=weights)
+    return replace(START, on=on, rois=rois, weights=weights)
 
 
 @settings(max_examples=60)
@@ -301,7 +302,7 @@ def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest
     def load(_: EntryPoint) -> None:
         @rules.rule(needs=["total"], gives=["total"])
         def keep_below(vehicle: Vehicle, state: State, draft: Any, memory: Any, *, most_kbps: Fraction) -> Any:
-            return rules.replace(draft, total=min(draft.total, most_kbps)), memory
+            return draft.but(total=min(draft.total, most_kbps)), memory
 
     entry = EntryPoint("keep_below", "my.rules:keep_below", "tod_runner.rules")
     monkeypatch.setattr(EntryPoint, "load", load)
@@ -310,4 +311,4 @@ def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest
     call = call_rule("keep_below", {"most_kbps": 1000})
     lists = {**TUM.modes, Mode.AUTOMATIC: (TUM.modes[Mode.AUTOMATIC][0], call, *TUM.modes[Mode.AUTOMATIC][1:])}
     assert check_order(Mode.AUTOMATIC, lists[Mode.AUTOMATIC]) == []
-    assert decide(rules.replace(TUM, modes=lists), START, {})[0].total == 1000
+    assert decide(replace(TUM, modes=lists), START, {})[0].total == 1000
