@@ -139,6 +139,7 @@ def test_interrupt_ends_the_workers_and_keeps_no_half_clip(tmp_path: Path) -> No
     assert {path.name for path in tmp_path.iterdir()} == {"lock", clip_path(TOP, SECONDS, tmp_path).name}
 
 
+@pytest.mark.gst
 def test_failing_worker(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):
         synthetic._share_out([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
