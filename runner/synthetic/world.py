@@ -1,0 +1,561 @@
+"""The street of the synthetic drive: its course, its textures, and the upright faces along it.
+
+The course is one lap of a street that goes on for ever, each lap shifted by `period_m` in x: that closes the loop
+without the full turn of a ring road, where every camera would pan most of the time and a forward one would see nearly
+as much motion as one that looks aside.
+Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.
+"""
+
+# ruff: noqa: PLR0917  (compiled functions take their arguments by position)
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, TypeVar, cast
+
+import numpy as np
+from numba import njit
+
+Array = np.ndarray[Any, Any]
+F = TypeVar("F", bound=Callable[..., Any])
+
+SPEED_MPS = 12.0
+LONGEST_LAP_S = 13.0  # a longer drive repeats the lap: textures stay small and sharp
+LANE_D = -1.2  # the vehicle keeps right
+PARKING_D, ROAD_D, PAVEMENT_D, WALL_D = 3.1, 5.1, 6.6, 7.7  # where parking begins (left only), and where each ends
+HEDGE_D, TREE_D = 6.8, 6.0
+TIGHTEST_M = 14.0  # bend radius of the centre line; above WALL_D, or the inner wall would fold
+VISIBLE_M = 140.0  # the street is repeated that far
+SUN = np.array([0.5, -0.87])  # horizontal direction to the sun
+SUN_SLOPE = 1.8
+LEVELS = 8  # mip levels of each texture; its sides are at least 2**LEVELS texels
+WORLD_BYTES = 145e6
+
+GROUND, WALL, SKY, TREE, LAMP, RAILING, VAN, VAN_END, RED, RED_END, BLUE, BLUE_END, HEDGE = range(13)
+LOG2_SIZE = ((13, 12), (14, 11), (11, 11), (9, 9), (8, 9), (8, 8), *[(9, 8), (8, 8)] * 3, (10, 8))
+# Texture of the side, length, width, height
+BOXES = ((VAN, 5.0, 1.9, 2.35), (RED, 4.3, 1.8, 1.55), (BLUE, 4.5, 1.8, 1.5))
+
+
+def compiled(function: F) -> F:
+    """Compile with numba; the machine code is kept on disk for the next run."""
+    return cast(F, njit(cache=True, fastmath=True, nogil=True)(function))
+
+
+@dataclass(frozen=True)
+class Course:
+    """One lap of the centre line, sampled at equal arc lengths; the first sample of the next lap ends it.
+
+    Two straights at +A and -A to the x axis with a bend between: psi(s) = A tanh(2.2 sin(2 pi s / L)) / tanh(2.2)
+    """
+
+    laps: int
+    length_m: float
+    s: Array
+    x: Array
+    y: Array
+    psi: Array
+    log2_columns: int  # of the ground's texture; that of the walls has twice as many
+
+    @property
+    def period_m(self) -> float:
+        return float(self.x[-1])
+
+    def at(self, share: float) -> tuple[float, float, float]:
+        """Position and heading of the vehicle when that share of the drive, in [0, 1], is done."""
+        s = share * self.laps % 1 * self.length_m
+        x, y, psi = (float(np.interp(s, self.s, values)) for values in (self.x, self.y, self.psi))
+        return x - LANE_D * math.sin(psi), y + LANE_D * math.cos(psi), psi
+
+    def beside(self, d: float) -> tuple[Array, Array]:
+        """The line at offset d."""
+        return self.x - d * np.sin(self.psi), self.y + d * np.cos(self.psi)
+
+
+def plan_course(seconds: float) -> Course:
+    """The course that takes that long at 12 m/s."""
+    laps = math.ceil(seconds / LONGEST_LAP_S)
+    length = SPEED_MPS * seconds / laps
+    s = np.linspace(0, length, 4097)
+    steepest = 2.2 / math.tanh(2.2) * 2 * math.pi / length
+    swing = min(0.3, 1 / (TIGHTEST_M * steepest))
+    psi = swing * np.tanh(2.2 * np.sin(2 * math.pi * s / length)) / math.tanh(2.2)
+
+    def integral(slope: Array) -> Array:
+        return np.concatenate([[0.0], np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(s))])
+
+    return Course(laps, length, s, integral(np.cos(psi)), integral(np.sin(psi)), psi, 13 if length > 80 else 12)
+
+
+# --- textures -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """All textures with their mip levels in one array; chroma has the same layout at half the size each way.
+
+    A luma of 0 is transparent. Rows of upright textures count from the ground up.
+    """
+
+    luma: Array
+    u: Array
+    v: Array
+    base: Array  # [texture, level] -> first texel
+    log2_width: Array  # [texture]
+    log2_height: Array
+    per_m: Array  # [texture]
+
+
+def open_atlas(course: Course, file: Path, mode: Literal["r", "w+"]) -> Atlas:
+    """Map the file with the textures into memory, to read or anew."""
+    sizes = np.array(LOG2_SIZE)
+    sizes[GROUND, 0], sizes[WALL, 0] = course.log2_columns, course.log2_columns + 1
+    areas = [1 << (w + h - 2 * level) for w, h in sizes for level in range(LEVELS)]
+    starts = np.concatenate([[0], np.cumsum([max(4, area) for area in areas])])
+    total = int(starts[-1])
+    texels = np.memmap(file, np.uint8, mode, shape=(total + total // 2,))
+    luma, u, v = texels[:total], texels[total : total * 5 // 4], texels[total * 5 // 4 :]
+    per_m = np.array([1 / course.period_m, 2 / course.length_m, 24.0, 88, 73, 102.4, *[100] * 7])
+    per_m[:2] *= 1 << course.log2_columns
+    base = starts[:-1].reshape(len(sizes), LEVELS)
+    return Atlas(luma, u, v, base, sizes[:, 0], sizes[:, 1], per_m.astype(np.float32))
+
+
+def level_of(atlas: Atlas, texture: int, level: int) -> tuple[Array, Array, Array]:
+    """Luma, U and V of one mip level as pictures."""
+    width, height = (1 << int(log2[texture] - level) for log2 in (atlas.log2_width, atlas.log2_height))
+    start = int(atlas.base[texture, level])
+    whole, half = slice(start, start + width * height), slice(start // 4, (start + width * height) // 4)
+    return (
+        atlas.luma[whole].reshape(height, width),
+        atlas.u[half].reshape(height // 2, width // 2),
+        atlas.v[half].reshape(height // 2, width // 2),
+    )
+
+
+def build_world(seconds: float, file: Path) -> None:
+    """Draw all textures of the drive into a file that the workers share."""
+    course = plan_course(seconds)
+    atlas = open_atlas(course, file, "w+")
+    noise = np.stack([fractal_noise(1024), fractal_noise(1024, 24)[::-1, ::-1]])
+    houses = plan_houses(course)
+    shading = height_along(course, houses)
+    tables = (course.x, course.y, np.cos(course.psi), np.sin(course.psi), np.gradient(course.psi, course.s))
+
+    def ground() -> None:
+        draw_ground(*level_of(atlas, GROUND, 0), noise, course.period_m, course.length_m, *tables, shading)
+        shrink(atlas, GROUND)
+
+    def upright() -> None:
+        draw_facade(*level_of(atlas, WALL, 0), noise, 1 / float(atlas.per_m[WALL]), *houses)
+        draw_sky(level_of(atlas, SKY, 0), noise[1])
+        draw_things(atlas, *noise)
+        for texture in range(WALL, len(LOG2_SIZE)):
+            shrink(atlas, texture)
+
+    with ThreadPoolExecutor() as pool:  # compiled code runs side by side
+        for half in [pool.submit(ground), pool.submit(upright)]:
+            half.result()
+
+
+def shrink(atlas: Atlas, texture: int) -> None:
+    """Fill the mip levels; a texel is opaque when at least two of its four are."""
+    for level in range(1, LEVELS):
+        for from_, to in zip(level_of(atlas, texture, level - 1), level_of(atlas, texture, level), strict=True):
+            halve(np.ascontiguousarray(from_), to)
+
+
+@compiled
+def halve(picture: Array, smaller: Array) -> None:
+    """Mean of each 2x2 texels, of the opaque ones alone."""
+    for j in range(smaller.shape[0]):
+        for i in range(smaller.shape[1]):
+            total = opaque = 0
+            for texel in (
+                picture[2 * j, 2 * i],
+                picture[2 * j, 2 * i + 1],
+                picture[2 * j + 1, 2 * i],
+                picture[2 * j + 1, 2 * i + 1],
+            ):
+                total += int(texel)
+                opaque += int(texel > 0)
+            smaller[j, i] = total // opaque if opaque >= 2 else 0
+
+
+def fractal_noise(size: int, finest: float = 2) -> Array:
+    """Tile of noise with as much contrast in each octave, as surfaces of stone and plants have; mean 0, deviation 1.
+
+    finest  texels of the shortest wave in it
+    """
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
+    frequency[(frequency == 0) | (frequency > 1 / finest)] = np.inf
+    white = np.random.default_rng(7).standard_normal((size, size))
+    tile = np.fft.irfft2(np.fft.rfft2(white) / frequency, (size, size))
+    scaled: Array = (tile / tile.std()).astype(np.float32)
+    return scaled
+
+
+@compiled
+def chance(a: int, b: int) -> float:
+    """A number in [0, 1[ that depends on nothing but a and b."""
+    h = (a * 374761393 + b * 668265263 + 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
+
+
+@compiled
+def put(luma: Array, u: Array, v: Array, j: int, i: int, y: float, blue: float, red: float) -> None:
+    """Write one texel; its chroma (offsets from grey) counts where both coordinates are even."""
+    luma[j, i] = np.uint8(min(max(y, 16.0), 235.0))
+    if j % 2 == 0 and i % 2 == 0:
+        u[j // 2, i // 2] = np.uint8(128.0 + blue)
+        v[j // 2, i // 2] = np.uint8(128.0 + red)
+
+
+@compiled
+def draw_ground(
+    luma: Array, u: Array, v: Array, noise: Array, period: float, length: float,
+    xs: Array, ys: Array, cosines: Array, sines: Array, bends: Array, walls: Array,
+) -> None:  # fmt: skip
+    """Road, kerb, pavement and grass, seen from above; row 0 is y = 0 and the texture repeats both ways.
+
+    xs ... bends  the course: position, direction and curvature at equal arc lengths
+    walls         height of the houses on the right at the same places: their shadow falls on the street
+    """
+    rows, columns = luma.shape
+    texel, samples = period / columns, len(xs) - 1
+    step = length / samples
+    for j in range(rows):
+        nearest = -1
+        for i in range(columns):
+            x = i * texel
+            if nearest < 0:
+                nearest = np.searchsorted(xs, x)
+            s = d = 0.0
+            for _ in range(3):
+                lap, k = nearest // samples, nearest % samples
+                dx, dy = x - xs[k] - lap * period, j * texel - ys[k]
+                dy -= math.floor(dy / (rows * texel) + 0.5) * rows * texel
+                along, d = dx * cosines[k] + dy * sines[k], dy * cosines[k] - dx * sines[k]
+                if abs(d) > 12.0:
+                    break
+                s = nearest * step + along
+                nearest += math.floor(along / (1.0 - bends[k] * d) / step + 0.5)
+            if abs(d) > WALL_D + 0.6:
+                nearest = -1
+                put(luma, u, v, j, i, 80.0, -8.0, -5.0)
+                continue
+            fine, coarse = noise[0, j & 1023, i & 1023], noise[1, (j >> 1) & 1023, (i >> 1) & 1023]
+            y, blue, red = surface(s % length, d, length, fine, coarse, chance(i, j) - 0.5)
+            shadow = (WALL_D + d) / 0.87 * SUN_SLOPE - walls[nearest % samples]
+            y = 16.0 + (y - 16.0) * (0.68 + 0.32 * min(max(shadow / 0.4 + 0.5, 0.0), 1.0))
+            put(luma, u, v, j, i, y, blue, red)
+
+
+@compiled
+def surface(s: float, d: float, length: float, fine: float, coarse: float, grain: float) -> tuple[float, float, float]:
+    """Luma, blue and red difference of the ground at arc length s and offset d."""
+    a = abs(d)
+    worn = 0.7 + 0.3 * min(max(0.9 + fine * 0.6, 0.0), 1.0)
+    road = ROAD_D if d > 0 else PARKING_D
+    kerb = road + 0.2
+    if a < road:
+        y = 92.0 + 2.5 * fine + 3.0 * coarse + 6.0 * grain - 4.0 * math.cos((a - 1.4) * 4.2) * (a < 2.8)
+        crossing = 3.0 < s - 0.5 * length < 6.0 and a < PARKING_D and d % 1.0 < 0.5
+        dash = a < 0.08 and s % 6.0 < 3.0
+        bay = d > 0 and (abs(a - PARKING_D) < 0.06 or (a > PARKING_D and s % 6.0 < 0.1))
+        if crossing or dash or bay:
+            return 205.0 * worn + 12.0 * grain, 0.0, 0.0
+        if d > PARKING_D:  # cobbles
+            row = int(s / 0.16)
+            across = d / 0.22 + 0.5 * (row & 1)
+            joint = 40.0 if s / 0.16 % 1.0 < 0.14 or across % 1.0 < 0.1 else 0.0
+            return 84.0 + 46.0 * chance(row, int(across)) + 9.0 * fine - joint, 0.0, 2.0
+        patch = 9.0 if chance(int(s / 5.0), int(d + 9.0) // 3) > 0.8 else 0.0
+        return y - patch, 1.0, -1.0
+    if a < kerb:
+        joint = 35.0 if s % 1.0 < 0.02 else 0.0
+        return 158.0 + 6.0 * fine + 10.0 * grain - joint, -2.0, 1.0
+    if a < PAVEMENT_D:
+        across, along = (a - kerb) / 0.4, s / 0.4
+        joint = 45.0 if across % 1.0 < 0.035 or along % 1.0 < 0.035 else 0.0
+        tone = 22.0 * chance(int(across) + 5000 * int(d > 0), int(along)) - 11.0
+        return 132.0 + tone + 9.0 * fine + 4.0 * coarse + 14.0 * grain - joint, -3.0, 2.0
+    return 82.0 + 11.0 * fine + 8.0 * coarse + 20.0 * grain, -17.0 - 3.0 * fine, -12.0 + 3.0 * coarse
+
+
+Houses = tuple[Array, Array, Array]  # index of the house at each metre of wall; its first metre; its height
+
+
+def plan_houses(course: Course) -> Houses:
+    """Split the left side of the street, in pieces of about 1 m, into houses 8 to 14 m wide and 2 or 3 floors high.
+
+    The houses on the right are the same, half a lap further on.
+    """
+    pieces = round(course.length_m)
+    random = np.random.default_rng(20)
+    starts = [0]
+    while pieces - starts[-1] > 14:
+        starts.append(starts[-1] + int(random.integers(8, min(14, pieces - starts[-1] - 7) + 1)))
+    house = np.searchsorted(starts, np.arange(pieces), side="right") - 1
+    return house, np.array([*starts, pieces]), 3.2 * random.integers(2, 4, len(starts)) + 0.9
+
+
+def height_along(course: Course, houses: Houses) -> Array:
+    """Height of the right wall beside each sample of the course."""
+    house, _, heights = houses
+    wall = arc_lengths(*course.beside(-WALL_D))
+    piece = np.minimum((wall / wall[-1] * len(house)).astype(int), len(house) - 1)
+    along: Array = heights[house[(piece + len(house) // 2) % len(house)]]
+    return along
+
+
+def arc_lengths(x: Array, y: Array) -> Array:
+    """Length of a line from its start to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+
+
+@compiled
+def draw_facade(
+    luma: Array, u: Array, v: Array, noise: Array, texel: float, house: Array, starts: Array, heights: Array
+) -> None:
+    """Fronts of the houses of one side of the street; columns run along the street, rows up from the ground."""
+    rows, columns = luma.shape
+    piece = texel * columns / len(house)
+    for i in range(columns):
+        h = house[int(i * texel / piece)]
+        x, width = i * texel - starts[h] * piece, (starts[h + 1] - starts[h]) * piece
+        for j in range(rows):
+            fine, coarse = noise[0, j & 1023, i & 1023], noise[1, (j >> 1) & 1023, (i >> 1) & 1023]
+            grain = chance(i, j) - 0.5
+            y, blue, red = front(x, j * texel, width, heights[h], h, fine, coarse)
+            put(luma, u, v, j, i, y + 16.0 * grain, blue, red)
+
+
+@compiled
+def front(  # noqa: PLR0911  one for each thing that a front is made of
+    x: float, z: float, width: float, height: float, h: int, fine: float, coarse: float
+) -> tuple[float, float, float]:
+    """Luma, blue and red difference of house number h at x from its edge and height z."""
+    count = int(width / 2.4)
+    pitch, floor = width / count, int(z / 3.2)
+    column = int(x / pitch)
+    across, up = abs(x - (column + 0.5) * pitch), z - 3.2 * floor
+    luck = chance(h * 64 + column, floor + 7)
+    if height - z < 0.5 or x < 0.12:  # eaves and downpipe
+        return 78.0 + 4.0 * fine, 0.0, 3.0
+    door = floor == 0 and column == h % count
+    bottom, top = (0.0, 2.3) if door else (0.95, 2.55)
+    if floor * 3.2 < height - 3.0 and across < 0.62 and bottom < up < top:
+        if across > 0.54 or not bottom + 0.09 < up < top - 0.08 or (across < 0.035 and not door):
+            return 206.0 + 4.0 * fine, 0.0, 0.0
+        if door:
+            return 70.0 + 8.0 * fine + 12.0 * (across % 0.2 < 0.02), 6.0 - 22.0 * luck, 14.0 * luck
+        if luck > 0.55 and across > 0.28:  # curtain
+            return 150.0 + 22.0 * math.cos(across * 70.0), -4.0, 2.0
+        return 38.0 + 26.0 * (up - 0.95) + 34.0 * luck + 7.0 * coarse, 9.0, -5.0
+    if not door and 0.82 < up < 0.95 and across < 0.72:  # sill
+        return 188.0 + 5.0 * fine, -1.0, 1.0
+    if floor > 0 and up < 0.14:
+        return 176.0 + 5.0 * fine, -3.0, 2.0
+    shade = 8.0 * fine + 5.0 * coarse - 22.0 * math.exp(-2.0 * z) - 26.0 * (z < 0.6)
+    tint = chance(h, 3)
+    if h % 4:  # brick
+        row = int(z / 0.085)
+        along = x / 0.26 + 0.5 * (row & 1)
+        if z / 0.085 % 1.0 < 0.15 or along % 1.0 < 0.06:
+            return 146.0 + shade, -4.0, 5.0
+        return 92.0 + 26.0 * chance(row, int(along) + 977 * h) + 30.0 * tint + shade, -12.0, 20.0 + 8.0 * tint
+    return 138.0 + 52.0 * tint + shade, -4.0 - 18.0 * chance(h, 4), 2.0 + 9.0 * chance(h, 5)
+
+
+def draw_sky(planes: tuple[Array, Array, Array], noise: Array) -> None:
+    """Clouds on a plane far above, seen from below."""
+    luma, u, v = planes
+    smooth = np.clip(noise[np.ix_(np.arange(2048) // 2, np.arange(2048) // 2)] * 0.6 + 0.1, 0, 1)
+    luma[:] = 158 + 60 * smooth
+    u[:] = (146 - 16 * smooth)[::2, ::2]
+    v[:] = (114 + 13 * smooth)[::2, ::2]
+
+
+def draw_things(atlas: Atlas, noise: Array, soft: Array) -> None:
+    """Tree, lamp and parked cars."""
+    z, x = np.mgrid[:512, :512] / 73.0
+    luma, u, v = level_of(atlas, TREE, 0)
+    crown = np.hypot((x - 3.5) / 1.1, z - 4.7) + 0.35 * soft[:512, :512] + 0.15 * noise[:512, :512] < 2.0
+    trunk = (np.abs(x - 3.5) < 0.16 - 0.02 * z) & (z < 4)
+    leaves = 78 + 14 * noise[256:768, 256:768] + 6 * soft[256:768, 256:768] + 7 * (z - 3)
+    luma[:] = np.where(crown, np.clip(leaves, 20, 200), np.where(trunk, 62 + 10 * noise[:512, 512:], 0))
+    green = (z > 2.2)[::2, ::2]  # also what is transparent: chroma is coarser than the rim of the leaves
+    u[:], v[:] = np.where(green, 108, 124), np.where(green, 117, 134)
+    luma, u, v = level_of(atlas, LAMP, 0)
+    x, z = x[:, :256] - 1.75, z[:, :256]
+    head = (np.abs(x) < 0.9) & (np.abs(z - 5.9) < 0.08)
+    luma[:] = np.where((np.abs(x) < 0.07) & (z < 5.9), 84 - 240 * x, np.where(head, 150, 0))
+    u[:] = v[:] = 128
+    luma, u, v = level_of(atlas, RAILING, 0)
+    z, x = np.mgrid[:256, :256] / 102.4
+    bars = ((x % 0.125 < 0.035) & (z < 1)) | (np.abs(z - 0.97) < 0.03) | (np.abs(z - 0.12) < 0.03)
+    luma[:] = np.where(bars, 58 + 30 * (x % 0.125 < 0.015), 0)
+    u[:] = v[:] = 128
+    luma, u, v = level_of(atlas, HEDGE, 0)
+    luma[:] = np.clip(74 + 24 * noise[:256] + 14 * np.mgrid[:256, :1024][0] / 100, 20, 200)
+    u[:], v[:] = 110, 118
+    for (texture, length, width, height), paint in zip(
+        BOXES, ((208, 128, 128), (90, 118, 172), (72, 146, 118)), strict=True
+    ):
+        draw_box(level_of(atlas, texture, 0), length, height, paint, noise)
+        draw_box(level_of(atlas, texture + 1, 0), width, height, paint, noise)
+
+
+def draw_box(
+    planes: tuple[Array, Array, Array], length: float, height: float, paint: tuple[int, int, int], noise: Array
+) -> None:
+    """Side or end of a parked car: windows, wheels, lamps, a seam for each door."""
+    luma, u, v = planes
+    z, x = np.mgrid[: luma.shape[0], : luma.shape[1]] / 100.0
+    side = length > 3
+    middle, wheel = np.abs(x - length / 2), length / 2 - 0.85
+    glass = (np.abs(z - 0.76 * height) < 0.15 * height) & (middle < length / 2 - 0.15 - 0.5 * (z - 0.6 * height))
+    if side:
+        glass &= np.abs((x - 0.5) % 1.15 - 0.05) > 0.05
+    wheels = (np.hypot(middle - wheel, z - 0.32) < 0.33) & side
+    hubs = (np.hypot(middle - wheel, z - 0.32) < 0.19) & side
+    lamps = (middle > length / 2 - (0.12 if side else 0.3)) & (np.abs(z - 0.5 * height) < 0.1)
+    seam = side & (np.abs((x - 0.5) % 1.15 - 0.05) < 0.012) & (z < 0.6 * height)
+    shine = paint[0] + 26 * (z / height - 0.5) + 1.5 * noise[: luma.shape[0], : luma.shape[1]] - 40 * seam
+    body = np.where(z < 0.22, 34, np.where(glass, 44 + 30 * z / height, np.where(lamps, 170, shine)))
+    luma[:] = np.clip(np.where(hubs, 150, np.where(wheels, 30, body)), 16, 235)
+    grey = (glass | wheels | (z < 0.22))[::2, ::2]
+    u[:], v[:] = np.where(grey, 128, paint[1]), np.where(grey, 128, paint[2])
+
+
+# --- upright faces --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Upright rectangles from a to b, standing on the ground; walls come first.
+
+    ends     [face, (ax, ay, bx, by)]
+    along_m  where in its texture the face begins
+    shade    256 is the texture's own light
+    box      number of the box that the face belongs to, -1 for none
+    """
+
+    ends: Array
+    along_m: Array
+    height_m: Array
+    texture: Array
+    shade: Array
+    box: Array
+
+
+def stand_faces(course: Course) -> Faces:
+    """Walls, trees, lamps and parked cars of as many laps as can be seen from one."""
+    rows = [*wall_faces(course, 1), *wall_faces(course, -1), *things_beside(course)]
+    one = np.array(rows, np.float64)
+    reach = math.ceil(VISIBLE_M / course.period_m)
+    laps = []
+    for number, lap in enumerate(range(-reach, reach + 2)):
+        moved = one.copy()
+        moved[:, [0, 2]] += lap * course.period_m
+        moved[:, 8] = np.where(one[:, 8] < 0, -1, one[:, 8] + 1000 * number)
+        laps.append(moved)
+    faces = np.concatenate(laps)
+    faces = faces[np.argsort(faces[:, 6] != WALL, kind="stable")]
+    return Faces(
+        faces[:, :4],
+        faces[:, 4],
+        faces[:, 5].astype(np.float32),
+        faces[:, 6].astype(np.int32),
+        faces[:, 7].astype(np.int32),
+        faces[:, 8].astype(np.int32),
+    )
+
+
+Row = tuple[float, ...]  # ax, ay, bx, by, along_m, height_m, texture, shade, box
+
+
+def face(a: tuple[float, float], b: tuple[float, float], along: float, height: float, texture: int, box: int) -> Row:
+    """One face, lit by the sun if its right-hand side (seen from a to b) is turned to it."""
+    direction = np.array([b[1] - a[1], a[0] - b[0]]) / max(math.dist(a, b), 1e-9)
+    light = 256 * (0.86 + 0.16 * max(0.0, float(direction @ SUN)))
+    return (*a, *b, along, height, texture, light, box)
+
+
+def wall_faces(course: Course, side: int) -> list[Row]:
+    """Fronts of one side of the street, in pieces of equal length, so that no window is stretched in a bend."""
+    house, _, heights = plan_houses(course)
+    x, y = course.beside(side * WALL_D)
+    lengths = arc_lengths(x, y)
+    at = np.linspace(0, lengths[-1], len(house) + 1)
+    points = list(zip(np.interp(at, lengths, x).tolist(), np.interp(at, lengths, y).tolist(), strict=True))
+    step = course.length_m / len(house)
+    rows: list[Row] = []
+    for k, (a, b) in enumerate(pairwise(points)):
+        from_left = k if side > 0 else (k + len(house) // 2) % len(house)
+        height = float(heights[house[from_left]])
+        lit = face(a, b, 0, 0, 0, 0)[7] if side > 0 else face(b, a, 0, 0, 0, 0)[7]
+        rows.append((*a, *b, from_left * step, height, WALL, lit, -1))
+    return rows
+
+
+def things_beside(course: Course) -> list[Row]:
+    """Hedges, railings, trees and lamps on the pavement, cars and vans in some of the parking bays of 6 m."""
+    random = np.random.default_rng(3)
+    rows: list[Row] = []
+    for bay in range(int(course.length_m / 6)):
+        for side in (-1, 1):
+            s = 6 * bay + 3.05
+            crossing = abs(s - 0.5 * course.length_m - 4.5) < 5
+            rows += strip(course, 6 * bay, side * HEDGE_D, HEDGE, 1.0)
+            if not crossing:
+                rows += strip(course, 6 * bay + 0.7, ROAD_D + 0.3 if side > 0 else -PARKING_D - 0.3, RAILING, 1.0)
+            if side > 0 and random.random() < 0.5 and not crossing:
+                rows += parked(course, s, 4.15, bay, BOXES[(bay + bay // 3) % len(BOXES)])
+            if side > 0 or bay % 2 == 0:
+                rows += upright(course, s - 3, side * TREE_D, *((LAMP, 3.5, 7) if bay % 3 == 2 else (TREE, 5.8, 5.8)))
+    return rows
+
+
+def at_offset(course: Course, s: float, d: float) -> tuple[float, float, float]:
+    """Point beside the course, and the direction of the course there."""
+    x, y, psi = (float(np.interp(s, course.s, values)) for values in (course.x, course.y, course.psi))
+    return x - d * math.sin(psi), y + d * math.cos(psi), psi
+
+
+def parked(course: Course, s: float, d: float, box: int, kind: tuple[int, float, float, float]) -> list[Row]:
+    """The four sides of a box, anticlockwise, so that each one's right-hand side looks outward."""
+    texture, length, width, height = kind
+    x, y, psi = at_offset(course, s, d)
+    forward = np.array([math.cos(psi), math.sin(psi)])
+    left = np.array([-forward[1], forward[0]])
+    corners = [
+        tuple((np.array([x, y]) + i * length / 2 * forward + j * width / 2 * left).tolist())
+        for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    return [face(corners[k], corners[(k + 1) % 4], 0, height, texture + k % 2, box) for k in range(4)]
+
+
+def strip(course: Course, s: float, d: float, texture: int, height: float) -> list[Row]:
+    """Hedge of a front garden or railing at the kerb, 4.5 m long, in pieces that follow the bend."""
+    ends = [at_offset(course, s + 1.5 * piece, d)[:2] for piece in range(4)]
+    if d < 0:
+        ends.reverse()  # its right-hand side is the street's
+    return [face(a, b, s + 1.5 * piece, height, texture, -1) for piece, (a, b) in enumerate(pairwise(ends))]
+
+
+def upright(course: Course, s: float, d: float, texture: int, width: float, height: float) -> list[Row]:
+    """Two crossed cut-outs, so that a tree is one from every side."""
+    x, y, psi = at_offset(course, s, d)
+    rows: list[Row] = []
+    for turn in (0.6, 0.6 + math.pi / 2):
+        dx, dy = width / 2 * math.cos(psi + turn), width / 2 * math.sin(psi + turn)
+        rows.append((x - dx, y - dy, x + dx, y + dy, 0.0, height - 0.01, float(texture), 240.0, -1.0))
+    return rows

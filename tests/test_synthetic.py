@@ -1,0 +1,302 @@
+"""The synthetic drive: what lies in its cache, and what the cameras see."""
+
+from __future__ import annotations
+
+import shutil
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner import synthetic
+from runner.model import Pose
+from runner.synthetic import View, clip_path, render
+
+np = pytest.importorskip("numpy")
+
+SECONDS = 4.0
+FORWARD = View(320, 180, Fraction(10), Pose(2.0, 0.0, 1.5, 0.0, 5.0, 0.0), 90.0, "pinhole")
+LEFT = replace(FORWARD, pose=replace(FORWARD.pose, yaw_deg=90.0))
+RIGHT = replace(FORWARD, pose=replace(FORWARD.pose, yaw_deg=-90.0))
+TOP = View(160, 100, Fraction(15, 2), Pose(2.0, 1.0, 1.1, 90.0, 40.0, 0.0), 180.0, "fisheye")
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def nothing(what: str, share: float) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from runner.synthetic.world import build_world
+
+    file = tmp_path_factory.mktemp("world") / "world"
+    build_world(SECONDS, file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def see(world: Path) -> Callable[[View], Any]:
+    """All pictures of a view as luma, [frame, row, column], without any file."""
+    from runner.synthetic.picture import pictures
+
+    def luma(view: View) -> Any:
+        frames = [np.frombuffer(picture, np.uint8) for picture in pictures(view, SECONDS, world)]
+        return np.stack(frames)[:, : view.width * view.height].reshape(-1, view.height, view.width).astype(float)
+
+    return luma
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[tuple[str, float]]]]:
+    """A cache with two clips, and what was reported while they were rendered; FORWARD is asked for twice."""
+    folder, reports = tmp_path_factory.mktemp("cache"), []
+    (folder / "drive-0.mp4.part").write_bytes(b"half a clip")
+    render([FORWARD, TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
+    yield folder, reports
+
+
+# --- the cache ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 322},
+        {"height": 182},
+        {"fps": Fraction(11)},
+        {"fov_deg": 91.0},
+        {"lens": "fisheye"},
+        *({"pose": replace(FORWARD.pose, **{key: 0.25})} for key in Pose.__dataclass_fields__),
+    ],
+)
+def test_each_field_changes_the_path(change: dict[str, Any], tmp_path: Path) -> None:
+    assert clip_path(replace(FORWARD, **change), 4, tmp_path) != clip_path(FORWARD, 4, tmp_path)
+
+
+def test_path_is_content_addressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = clip_path(FORWARD, 4, tmp_path)
+    assert path == clip_path(replace(FORWARD), 4.0, tmp_path)
+    assert path.parent == tmp_path
+    assert path != clip_path(FORWARD, 5, tmp_path)
+    monkeypatch.setattr(synthetic, "RENDERER_VERSION", synthetic.RENDERER_VERSION + 1)
+    assert path != clip_path(FORWARD, 4, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"lens": "mirror"}, "lens: 'mirror': must be"),
+        ({"width": 321}, "size: 321x180: both sides"),
+        ({"fov_deg": 180.0}, "fov_deg: 180: must lie"),
+        ({"pose": replace(FORWARD.pose, z_m=0.0)}, "z_m 0"),
+    ],
+)
+def test_impossible_view(change: dict[str, Any], found: str) -> None:
+    with pytest.raises(ValueError, match=found.replace("]", r"\]")):
+        replace(FORWARD, **change)
+
+
+def test_too_short(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="seconds: 3: must be at least 4"):
+        render([FORWARD], 3, tmp_path, nothing)
+
+
+def test_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 10**6))
+    with pytest.raises(OSError, match=r"rendering the drive needs about \d+ MB, 1 MB are free") as caught:
+        render([FORWARD], SECONDS, tmp_path, nothing)
+    assert str(tmp_path) in str(caught.value)
+    assert not list(tmp_path.glob("drive*"))
+
+
+def test_numba_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synthetic, "find_spec", lambda name: None)
+    with pytest.raises(RuntimeError, match=r"pip install 'tod-runner\[synthetic\]'"):
+        render([FORWARD], SECONDS, tmp_path, nothing)
+
+
+@pytest.mark.gst
+def test_interrupt_ends_the_workers_and_keeps_no_half_clip(tmp_path: Path) -> None:
+    import multiprocessing
+
+    def interrupt(what: str, share: float) -> None:
+        if share > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render([FORWARD, LEFT], SECONDS, tmp_path, interrupt)
+    assert not multiprocessing.active_children()
+    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+    (tmp_path / "drive-0.mp4.part").write_bytes(b"of a run that was killed")
+    render([TOP], SECONDS, tmp_path, nothing)
+    assert {path.name for path in tmp_path.iterdir()} == {"lock", clip_path(TOP, SECONDS, tmp_path).name}
+
+
+@pytest.mark.gst
+def test_failing_worker(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):
+        synthetic._share_out([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
+
+
+# --- the files ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.gst
+def test_only_clips_remain(cache: tuple[Path, list[tuple[str, float]]]) -> None:
+    folder, _ = cache
+    clips = {clip_path(view, SECONDS, folder).name for view in (FORWARD, TOP)}
+    assert {path.name for path in folder.iterdir()} == {*clips, "lock"}
+
+
+@pytest.mark.gst
+def test_progress_rises_to_one(cache: tuple[Path, list[tuple[str, float]]]) -> None:
+    shares = [share for _, share in cache[1]]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert len({share for share in shares if 0 < share < 1}) > 10
+
+
+@pytest.mark.gst
+def test_second_call_does_nothing(
+    cache: tuple[Path, list[tuple[str, float]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = cache
+    monkeypatch.setattr(synthetic, "_render_missing", lambda *args: pytest.fail("rendered again"))
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.mp4")}
+    reports: list[tuple[str, float]] = []
+    render([TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
+    assert reports == [("drive rendered", 1.0)]
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*.mp4")} == before
+
+
+@pytest.mark.gst
+@pytest.mark.parametrize("view", [FORWARD, TOP])
+def test_decoded_clip(view: View, cache: tuple[Path, list[tuple[str, float]]]) -> None:
+    caps, times = decode(clip_path(view, SECONDS, cache[0]))
+    assert (caps.get_int("width"), caps.get_int("height")) == ((True, view.width), (True, view.height))
+    assert caps.get_fraction("framerate") == (True, view.fps.numerator, view.fps.denominator)
+    assert caps.get_string("colorimetry") == "bt709"
+    assert len(times) == view.frames(SECONDS)
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert max(abs(gap - 1e9 / view.fps) for gap in gaps) < 1e6 / 10
+
+
+def decode(clip: Path) -> tuple[Any, list[int]]:
+    """Caps structure and time in ns of each frame of a clip."""
+    import gi
+
+    gi.require_version("Gst", "1.0")
+    from gi.repository import Gst
+
+    Gst.init(None)
+    line = f"filesrc location={clip} ! qtdemux ! h264parse ! avdec_h264 ! appsink name=sink sync=false"
+    pipeline, times, caps = Gst.parse_launch(line), [], None
+    pipeline.set_state(Gst.State.PLAYING)
+    while sample := pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND):
+        times.append(sample.get_buffer().pts)
+        caps = sample.get_caps().get_structure(0).copy()
+    pipeline.set_state(Gst.State.NULL)
+    return caps, times
+
+
+@pytest.mark.gst
+def test_writer_reports_what_gstreamer_says(tmp_path: Path) -> None:
+    from runner.gst.clip_writer import write_clip
+
+    with pytest.raises(RuntimeError, match="writing the clip: Could not open file"):
+        write_clip(tmp_path / "no" / "such.mp4", iter([bytes(32 * 32 * 3 // 2)] * 9), 32, 32, Fraction(10))
+
+
+@pytest.mark.gst
+def test_side_view_needs_more_bits(tmp_path: Path) -> None:
+    """The same encoder at the same quantizer; half left and half right against ahead, a whole default drive."""
+    from runner.gst.clip_writer import write_clip
+    from runner.synthetic.picture import pictures
+    from runner.synthetic.world import build_world
+
+    build_world(12, tmp_path / "world")
+    ahead = replace(FORWARD, width=480, height=260, fps=Fraction(20))
+    sizes = []
+    for yaw in (0.0, 55.0, -55.0):
+        view = replace(ahead, pose=replace(ahead.pose, yaw_deg=yaw))
+        frames = pictures(view, 12, tmp_path / "world")
+        write_clip(tmp_path / "clip.mp4", frames, view.width, view.height, view.fps, quantizer=32)
+        sizes.append((tmp_path / "clip.mp4").stat().st_size)
+    assert min(sizes[1:]) > 1.03 * sizes[0]
+
+
+# --- the pictures ---------------------------------------------------------------------------------------------------
+
+
+def difference(a: Any, b: Any) -> float:
+    return float(np.abs(a - b).mean())
+
+
+@pytest.mark.parametrize("view", [FORWARD, LEFT, TOP])
+def test_loop_is_seamless(view: View, see: Callable[[View], Any]) -> None:
+    pictures = see(view)
+    steps = [difference(a, b) for a, b in pairwise(pictures)]
+    assert difference(pictures[-1], pictures[0]) < 1.15 * max(steps[0], steps[-1])
+
+
+def test_side_view_moves_more_than_forward_view(see: Callable[[View], Any]) -> None:
+    forward, left, right = (
+        np.mean([difference(a, b) for a, b in pairwise(see(view))]) for view in (FORWARD, LEFT, RIGHT)
+    )
+    assert min(left, right) > 1.15 * forward
+
+
+def test_rendering_is_deterministic(see: Callable[[View], Any]) -> None:
+    assert (see(TOP) == see(TOP)).all()
+
+
+def test_turned_camera_sees_the_same_world(see: Callable[[View], Any]) -> None:
+    """A fisheye turned left by 45 degrees shows the same picture an eighth of its 360 degrees further to the right.
+
+    That is only so near the horizon, where equal angles are equal distances; a mirrored picture would move left.
+    """
+    ahead = View(720, 64, Fraction(2), Pose(2.0, 0.0, 1.5, 0.0, 0.0, 0.0), 180.0, "fisheye")
+    turned = replace(ahead, pose=replace(ahead.pose, yaw_deg=45.0))
+    a, b = see(ahead)[:, 31:33], see(turned)[:, 31:33]
+    moved_right, moved_left = difference(a[..., :540], b[..., 180:]), difference(a[..., 180:], b[..., :540])
+    assert moved_right < 4
+    assert moved_left > 3 * moved_right
+
+
+def test_driving_forward_moves_pictures_of_side_cameras_backward(see: Callable[[View], Any]) -> None:
+    """What the left camera sees moves to the left, what the right one sees to the right: nothing is mirrored."""
+    fast = {"fps": Fraction(40), "height": 60}
+    for view, sign in ((replace(LEFT, **fast), -1), (replace(RIGHT, **fast), 1)):
+        pictures = see(view)[::16, 30:45]
+        later = see(view)[1::16, 30:45]
+        shifts = [4 * n for n in range(-5, 6)]
+        errors = [difference(pictures[..., 40:-40], np.roll(later, -s, -1)[..., 40:-40]) for s in shifts]
+        assert shifts[int(np.argmin(errors))] * sign > 0
+
+
+def test_sky_is_up_and_roll_is_clockwise(see: Callable[[View], Any]) -> None:
+    upright = replace(FORWARD, pose=replace(FORWARD.pose, pitch_deg=0.0))
+    level = see(upright).mean(0)
+    assert level[:20].mean() > level[-20:].mean() + 20
+    upside_down = see(replace(upright, pose=replace(upright.pose, roll_deg=180.0)))
+    assert difference(upside_down[:, ::-1, ::-1], see(upright)) < 3
+    # The camera's left edge goes up, so it sees the bright sky.
+    tipped = see(replace(upright, pose=replace(upright.pose, roll_deg=90.0))).mean(0)
+    assert tipped[:, :20].mean() > tipped[:, -20:].mean() + 20
+
+
+def test_pitch_tips_the_view_down(see: Callable[[View], Any]) -> None:
+    up, down = (see(replace(FORWARD, pose=replace(FORWARD.pose, pitch_deg=pitch))).mean() for pitch in (-40.0, 40.0))
+    assert up > down + 20
+
+
+def test_cameras_at_the_same_place_agree_at_the_same_time(see: Callable[[View], Any]) -> None:
+    """Twice the frame rate shows the same world twice as often."""
+    assert (see(replace(FORWARD, fps=Fraction(20)))[::2] == see(FORWARD)).all()
