@@ -6,7 +6,7 @@ for every second pixel of every second row; between four that hit the same surfa
 interpolated, at edges every pixel is traced.
 """
 
-# ruff: noqa: PLR0917  (compiled functions take their arguments by position)
+
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ as much motion as one that looks aside.
 Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.
 """
 
-# ruff: noqa: PLR0917  (compiled functions take their arguments by position)
+
 
 from __future__ import annotations
 
