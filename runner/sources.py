@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from runner.errors import RunError
 from runner.graph import Plan, compile_graph
 from runner.model import Camera, Pose, Progress, Vehicle
 
@@ -32,7 +33,7 @@ def compile_plans(vehicle: Vehicle) -> list[Plan]:
 def render_missing(vehicle: Vehicle, progress: Progress) -> None:
     """Render the clips that are not in the cache yet.
 
-    raises  RunError, OSError
+    raises  RunError
     """
     drives: dict[float, list[View]] = {}
     for camera in vehicle.cameras.values():
@@ -41,7 +42,10 @@ def render_missing(vehicle: Vehicle, progress: Progress) -> None:
     for seconds, views in drives.items():
         from runner.synthetic import render
 
-        render(views, seconds, cache_directory(), progress)
+        try:
+            render(views, seconds, cache_directory(), progress)
+        except (RuntimeError, OSError) as error:
+            raise RunError(f"the synthetic drive cannot be rendered: {error}") from None
 
 
 def _view(camera: Camera) -> View:

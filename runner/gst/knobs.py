@@ -40,8 +40,14 @@ class Knobs:
     def turn(self, values: Mapping[str, KnobValue]) -> None:
         """Set knobs between two frames, soon; returns at once."""
         with self._lock:
+            alone = not self._waiting
             self._waiting |= values
-        touched = {element for knob, value in values.items() for element, _, _ in self._assignments(knob, value)}
+        turned = [turned for knob, value in values.items() for turned in self._assignments(knob, value)]
+        if alone and len(turned) == 1:
+            # One property has nothing to agree with: the encoder takes it up with its next frame by itself.
+            self._set_waiting()
+            return
+        touched = {element for element, _, _ in turned}
         first = next(element for element in self._elements if element.get_name() in touched)
         # Only a source pad knows that a frame it has pushed is still on its way below.
         above = first.get_static_pad("sink").get_peer()
