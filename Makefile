@@ -20,6 +20,7 @@ test: $(READY)
 bench: $(READY)
 	$(BIN)/python bench/live.py
 	$(BIN)/python bench/replay.py
+	$(BIN)/python bench/pqos_map.py
 
 setup: $(READY)
 
