@@ -142,9 +142,9 @@ def _choice_problems(override: Override, directories: Sequence[Path]) -> Iterato
     if not override.choice or override.value is None:
         return
     group = override.key.split("@")[0].lstrip("/")
-    options = sorted({p.stem for d in directories for p in (d / group).glob("*.yaml")})
-    if str(override.value) not in options:
-        rule = f"no such file in conf/{group}/, {suggest(str(override.value), options)}"
+    known = options(group, directories)
+    if str(override.value) not in known:
+        rule = f"no such file in conf/{group}/, {suggest(str(override.value), known)}"
         yield Problem(COMMAND_LINE, override.key, str(override.value), rule)
 
 
@@ -234,8 +234,8 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
     if missing:
         where, wanted = missing.groups()
         group, name = _place(wanted)
-        options = sorted({p.stem for d in directories for p in (d / group).glob("*.yaml")})
-        hint = suggest(name, options) if options else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
+        known = options(group, directories)
+        hint = suggest(name, known) if known else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
         file = label(find_file(directories, *_place(where)), directories)
         return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
     lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
@@ -279,20 +279,20 @@ def _chooser(key: str, directories: Sequence[Path]) -> str:
 
 
 @cache
-def _load(path: Path) -> Any:
-    """A YAML file as OmegaConf reads it: YAML 1.1, duplicate keys refused."""
+def load_file(path: Path) -> Any:
+    """Content of a YAML file as OmegaConf reads it: YAML 1.1, duplicate keys refused.
+
+    raises  yaml.YAMLError, OSError, UnicodeDecodeError
+    """
     from omegaconf._utils import get_yaml_loader
 
     with path.open(encoding="utf-8") as file:
         return yaml.load(file, Loader=get_yaml_loader())
 
 
-def load_file(path: Path) -> Any:
-    """Content of a YAML file.
-
-    raises  yaml.YAMLError, OSError, UnicodeDecodeError
-    """
-    return _load(path)
+def options(group: str, directories: Sequence[Path]) -> list[str]:
+    """Names of the files that may be chosen for a group."""
+    return sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
 
 
 def _files(directories: Sequence[Path]) -> Iterator[Path]:

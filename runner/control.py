@@ -14,11 +14,12 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from paho.mqtt.client import Client
+from paho.mqtt.client import Client, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
 from runner.errors import RunError
 from runner.model import Endpoint
+from runner.schema import read_json
 
 CONNECT_S = 5.0
 KEEPALIVE_S = 2  # the broker publishes a will after one and a half of these
@@ -77,15 +78,17 @@ class Link:
 
     def publish(self, topic: str, message: Document) -> None:
         """Send a message; the state is kept by the broker for who comes later."""
-        self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
+        self._send(topic, message)
 
     def close(self, topic: str, message: Document) -> None:
         """Say goodbye as the will would have, and disconnect."""
         if self._client.is_connected():
-            retain = topic == "state"
-            self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=retain).wait_for_publish(1)
+            self._send(topic, message).wait_for_publish(1)
         self._client.disconnect()
         self._client.loop_stop()
+
+    def _send(self, topic: str, message: Document) -> MQTTMessageInfo:
+        return self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
 
     def _on_connect(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
@@ -108,7 +111,7 @@ def read_request(payload: bytes) -> tuple[dict[str, Any], str, str]:
     if len(payload) > MAX_MESSAGE_BYTES:
         return {}, "", f"{len(payload)} bytes: must be at most {MAX_MESSAGE_BYTES}"
     try:
-        document = json.loads(payload)
+        document = read_json(payload)
     except (ValueError, RecursionError) as error:
         return {}, "", f"not JSON: {error}"
     if not isinstance(document, dict):

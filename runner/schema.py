@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
 
 Path = tuple[str | int, ...]
+LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
 
 _TYPES = {
     "integer": "a whole number",
@@ -89,6 +90,31 @@ def event_validator(name: str) -> Draft202012Validator | None:
     definition = definitions[name]
     properties = definition["properties"] | {"t": definitions["t"]}  # a reference less to follow for each event
     return Draft202012Validator(definition | {"properties": properties})
+
+
+def read_json(text: str | bytes) -> Any:
+    """A JSON document that comes from outside, its numbers finite: NaN, Infinity and 1e999 are none.
+
+    raises  ValueError, RecursionError
+    """
+    return json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is too large")
+    return number
+
+
+def _whole(text: str) -> int:
+    if len(text) > LONGEST_WHOLE:
+        raise ValueError(f"{text[:20]}... is too large")
+    return int(text)
 
 
 def event_problem(document: Any) -> str:

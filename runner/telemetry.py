@@ -58,7 +58,6 @@ class Meter:
     followed: list[float] = field(default_factory=list)
     latencies_ms: list[float] = field(default_factory=list)
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that came, with their count
-    wrong_sizes: int = 0
     short: int = 0  # settled windows with fewer frames than the camera's rate asks for
     windows: int = 0
     _past: deque[tuple[float, Counters]] = field(default_factory=deque)
@@ -93,8 +92,6 @@ class Meter:
         size = (counters.width, counters.height)
         if size == (decided.width, decided.height):
             self.sizes[size] = self.sizes.get(size, 0) + 1
-        else:
-            self.wrong_sizes += 1
         if counters.latency_ms is not None:
             self.latencies_ms.append(counters.latency_ms)
 

@@ -16,7 +16,6 @@ from the positions and times of the input; its events are marked "source": "pqos
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -27,7 +26,7 @@ from runner.config import load, load_run
 from runner.errors import UserError
 from runner.events import BitratePredicted, Event, parse, to_json
 from runner.model import Vehicle
-from runner.schema import event_problem
+from runner.schema import event_problem, read_json
 from runner.step import Run, start, step
 from runner.verbs import Arguments
 
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from runner.pqos import Pqos
 
 _encode = json.JSONEncoder(ensure_ascii=False).encode
-LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
 
 
 def run(arguments: Arguments) -> int:
@@ -104,7 +102,7 @@ def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Ev
 def read_event(line: str) -> tuple[Any, str]:
     """The JSON of a line, and what is wrong with it as an event, or ""."""
     try:
-        document = json.loads(line.rstrip(), parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+        document = read_json(line.rstrip())
     except RecursionError:
         return None, "not JSON: nested too deeply"
     except json.JSONDecodeError as error:
@@ -117,23 +115,6 @@ def read_event(line: str) -> tuple[Any, str]:
 def _is_log(document: Any) -> bool:
     """Whether it is a line of a drive log that tells what the vehicle did: a decision, telemetry."""
     return isinstance(document, dict) and "log" in document and "event" not in document
-
-
-def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is no number")
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text} is too large")
-    return number
-
-
-def _whole(text: str) -> int:
-    if len(text) > LONGEST_WHOLE:
-        raise ValueError(f"{text[:20]}... is too large")
-    return int(text)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from pathlib import Path
 import yaml
 
 from runner import schema
-from runner.compose import GROUPS, conf_directories, label, load_file, yaml_problem
+from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
 from runner.config import Check, load, load_run
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
@@ -97,10 +97,10 @@ def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator
     chosen = {word.partition("=")[0] for word in arguments.overrides}
     axes: list[list[list[str]]] = [[arguments.overrides]]
     for group in COMBINED:
-        options = [[f"{group}={option}"] for option in _options(group, directories)]
-        axes.append([[]] if group in chosen else options)
-    for words in product(*axes):
-        yield [word for part in words for word in part], arguments.conf
+        words = [[f"{group}={option}"] for option in options(group, directories)]
+        axes.append([[]] if group in chosen else words)
+    for parts in product(*axes):
+        yield [word for part in parts for word in part], arguments.conf
 
 
 def _check(combination: tuple[list[str], Path | None]) -> Checked:
@@ -117,16 +117,12 @@ def _check(combination: tuple[list[str], Path | None]) -> Checked:
 def _prediction_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
     """What is wrong with the sources of predictions: maps, traces and tracks are read."""
     chosen = any(word.lstrip("+~").startswith("pqos") for word in arguments.overrides)
-    for option in [""] if chosen else _options("pqos", directories):
+    for option in [""] if chosen else options("pqos", directories):
         words = [*arguments.overrides, f"pqos={option}"] if option else arguments.overrides
         try:
             load_run(words, arguments.conf, runnable=False)
         except ConfigError as error:
             yield from error.problems
-
-
-def _options(group: str, directories: Sequence[Path]) -> list[str]:
-    return sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
 
 
 def _registry_check(notes: list[str]) -> Check | None:

@@ -35,6 +35,10 @@ def process(verb, *words):
             child.kill()
 
 
+NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'
+HUGE = b'{"id": "h", "event": "total_set", "kbps": 1e999}'
+
+
 class Operator:
     """An operator's side of the control link, as a program would write it."""
 
@@ -100,7 +104,7 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
         reply = operator.ask(identity, **event)
         assert (reply["accepted"], reply["reason"]) == (False, reason)
 
-    for payload in (b"", b"{", b"[1]", b"x" * 100_000, b'{"event": "total_set", "kbps": 1}', b"\xff\xfe"):
+    for payload in (b"", b"{", b"[1]", b"x" * 100_000, b'{"event": "total_set", "kbps": 1}', b"\xff\xfe", NAN, HUGE):
         operator.link._client.publish("tod/delivery_robot/request", payload, qos=1)
     assert operator.ask("9", event="total_set", kbps=1500)["accepted"]  # it lives
     assert vehicle.poll() is None
