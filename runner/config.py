@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from runner import rules, schema
+from runner import rules, schema, sources
 from runner.commands import KnobValue
 from runner.compose import Composed, compose, conf_directories
 from runner.errors import ConfigError, Problem
@@ -115,6 +115,8 @@ class _Builder:
         self._check_ports(built, {"media.port": media.port, "control.port": control.port})
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index)
+            if camera.source.render:
+                self.attempt(("cameras", camera.name), lambda c=camera: sources.view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
         if self.problems:

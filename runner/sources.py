@@ -38,7 +38,7 @@ def render_missing(vehicle: Vehicle, progress: Progress) -> None:
     drives: dict[float, list[View]] = {}
     for camera in vehicle.cameras.values():
         if camera.source.render and _rendered(camera) is None:
-            drives.setdefault(camera.source.render_s, []).append(_view(camera))
+            drives.setdefault(camera.source.render_s, []).append(view(camera))
     for seconds, views in drives.items():
         from runner.synthetic import render
 
@@ -48,7 +48,11 @@ def render_missing(vehicle: Vehicle, progress: Progress) -> None:
             raise RunError(f"the synthetic drive cannot be rendered: {error}") from None
 
 
-def _view(camera: Camera) -> View:
+def view(camera: Camera) -> View:
+    """What a camera sees of the synthetic drive.
+
+    raises  ModelError where the drive cannot be rendered so
+    """
     from runner.synthetic import View
 
     width, height = camera.source_size
@@ -60,5 +64,5 @@ def _rendered(camera: Camera) -> str | None:
         return None
     from runner.synthetic import clip_path
 
-    path = clip_path(_view(camera), camera.source.render_s, cache_directory())
+    path = clip_path(view(camera), camera.source.render_s, cache_directory())
     return str(path) if path.exists() else None

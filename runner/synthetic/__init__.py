@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from runner.model import Pose, Progress
+from runner.model import ModelError, Pose, Progress
 
 RENDERER_VERSION = 1  # raise it with every change that changes pictures or files
 SHORTEST_S = 4
@@ -50,13 +50,14 @@ class View:
 
     def __post_init__(self) -> None:
         if self.lens not in ("pinhole", "fisheye"):
-            raise ValueError(f"lens: {self.lens!r}: must be pinhole or fisheye")
+            raise ModelError("lens", repr(self.lens), "must be pinhole or fisheye")
         if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
-            raise ValueError(f"size: {self.width}x{self.height}: both sides must be even and at least 16 px")
+            raise ModelError("size", f"{self.width}x{self.height}", "both sides must be even and at least 16 px")
         if not 0 < self.fov_deg <= (360 if self.lens == "fisheye" else 170):
-            raise ValueError(f"fov_deg: {self.fov_deg:g}: must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye")
+            rule = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
+            raise ModelError("fov_deg", f"{self.fov_deg:g}", rule)
         if self.pose.z_m <= 0 or self.fps <= 0:
-            raise ValueError(f"z_m {self.pose.z_m:g}, fps {self.fps}: must be above 0")
+            raise ModelError("pose.z_m", f"{self.pose.z_m:g}", f"must be above 0, as must fps, {self.fps}")
 
     def frames(self, seconds: float) -> int:
         """Number of frames of a clip of that many seconds."""

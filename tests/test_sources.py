@@ -1,0 +1,27 @@
+"""What cannot be rendered is a mistake in the configuration, told before anything starts."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.config import load
+from runner.errors import ConfigError
+
+LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("cameras.front_left.fov_deg=200", f"command line: cameras.front_left.fov_deg: 200: {LENS}"),
+        (
+            "cameras.rear_center.pose.z_m=-1",
+            "command line: cameras.rear_center.pose.z_m: -1: must be above 0, as must fps, 40",
+        ),
+    ],
+)
+def test_a_camera_that_the_drive_cannot_show(override: str, line: str) -> None:
+    with pytest.raises(ConfigError) as told:
+        load(["source=synthetic", override])
+    assert str(told.value) == f"{line}\n1 problem, nothing was started"
+    load(["source=test", override])  # other sources do not mind
