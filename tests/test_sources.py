@@ -16,7 +16,7 @@ LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
         ("cameras.front_left.fov_deg=200", f"command line: cameras.front_left.fov_deg: 200: {LENS}"),
         (
             "cameras.rear_center.pose.z_m=-1",
-            "command line: cameras.rear_center.pose.z_m: -1: must be above 0, as must fps, 40",
+            "command line: cameras.rear_center.pose.z_m: z_m -1, fps 40: must be above 0",
         ),
     ],
 )

@@ -57,7 +57,7 @@ class View:
             rule = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
             raise ModelError("fov_deg", f"{self.fov_deg:g}", rule)
         if self.pose.z_m <= 0 or self.fps <= 0:
-            raise ModelError("pose.z_m", f"{self.pose.z_m:g}", f"must be above 0, as must fps, {self.fps}")
+            raise ModelError("pose.z_m", f"z_m {self.pose.z_m:g}, fps {self.fps}", "must be above 0")
 
     def frames(self, seconds: float) -> int:
         """Number of frames of a clip of that many seconds."""
