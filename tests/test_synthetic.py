@@ -164,9 +164,7 @@ def test_progress_rises_to_one(cache: tuple[Path, list[tuple[str, float]]]) -> N
 
 
 @pytest.mark.gst
-def test_second_call_does_nothing(
-    cache: tuple[Path, list[tuple[str, float]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_second_call_does_nothing(cache: tuple[Path, list[tuple[str, float]]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, _ = cache
     monkeypatch.setattr(synthetic, "_render_missing", lambda *args: pytest.fail("rendered again"))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*.mp4")}

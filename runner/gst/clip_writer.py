@@ -7,7 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-QUANTIZER = 20  # constant: some 40 Mbit/s for 1920x1040 at 40 Hz, far above what is sent of it, yet cheap to decode
+QUANTIZER = 28  # constant: 37 dB and more, far above what is sent of it, and half as dear to decode as 20
 FRAMES_IN_FLIGHT = 3
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gi.repository import Gst
@@ -19,10 +19,12 @@ class Knobs:
     Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe in front of the first
     element that changes then sets them all at once. Set one after the other while a frame passes, crop edges leave
     moments without any picture, which ends the stream.
+
+    turned  called, from any thread, when knobs were set: `applied` has what was read back
     """
 
-    def __init__(self, pipeline: Gst.Bin, camera: Camera) -> None:
-        self._camera = camera
+    def __init__(self, pipeline: Gst.Bin, camera: Camera, turned: Callable[[], None]) -> None:
+        self._camera, self._turned = camera, turned
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
         # Reentrant: new caps send an event up through the very pad whose probe sets them, which calls it once more.
@@ -65,6 +67,7 @@ class Knobs:
                 self.faults += wrong
                 if not wrong:
                     self.applied[knob] = value
+        self._turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
         return assignments(self._camera, knob, value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gi.repository import Gst, GstRtp
@@ -12,6 +12,7 @@ from runner.graph import Plan
 from runner.gst.knobs import Knobs
 from runner.gst.source import loop_clip
 
+Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
 
 
@@ -19,12 +20,15 @@ class CameraPipeline:
     """What is done to a pipeline that was just built, and the knobs that it has from then on.
 
     wanted  where the knobs are to be
+    turned  called, from any thread, when knobs were set
     """
 
-    def __init__(self, pipeline: Gst.Bin, plan: Plan, wanted: Mapping[str, KnobValue]) -> None:
+    def __init__(
+        self, pipeline: Gst.Bin, plan: Plan, wanted: Mapping[str, KnobValue], turned: Callable[[], None]
+    ) -> None:
         self._pipeline, self._plan = pipeline, plan
         self._wanted = wanted
-        self.knobs = Knobs(pipeline, plan.camera)
+        self.knobs = Knobs(pipeline, plan.camera, turned)
         if plan.loops:
             loop_clip(pipeline, plan)
         self._started = False

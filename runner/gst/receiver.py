@@ -11,6 +11,7 @@ from gi.repository import Gst
 from runner.graph import Plan
 from runner.gst.pipeline import counted
 from runner.gst.supervised import SupervisedPipeline
+from runner.units import AccessUnit, read_unit
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 STALL_S = 2.0  # a camera that should send and is silent for longer is built anew
@@ -39,13 +40,34 @@ class Received:
     rebuilt: int = 0
 
 
-class Receiver:
-    """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream."""
+OnUnit = Callable[[str, AccessUnit], None]  # camera, what came
+OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
+PICTURES = (
+    "videoconvert ! video/x-raw,format=RGB "
+    "! appsink name={name} emit-signals=true sync=false async=false max-buffers=1 drop=true"
+)
 
-    def __init__(self, plan: Plan, report: Callable[[str, str], None]) -> None:
+
+class Receiver:
+    """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream.
+
+    on_unit     told each access unit from the streaming thread
+    on_picture  told each decoded picture from the streaming thread
+    Without these no Python runs per frame.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        report: Callable[[str, str], None],
+        on_unit: OnUnit | None = None,
+        on_picture: OnPicture | None = None,
+    ) -> None:
         self._sink_name = plan.operator[-1].name
-        name = plan.camera.name
-        self._supervised = SupervisedPipeline(plan.receiver, self._on_built, lambda what: report(name, what))
+        self._on_unit, self._on_picture = on_unit, on_picture
+        self._name = name = plan.camera.name
+        launch = f"{plan.decoder} ! {PICTURES.format(name=self._sink_name)}" if on_picture else plan.receiver
+        self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
         self._before = Received()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
@@ -76,8 +98,13 @@ class Receiver:
         self._before = self._count() if self._supervised.rebuilt else Received()
         self._sink = pipeline.get_by_name(self._sink_name)
         self._received = pipeline.get_by_name("received")
+        self._begun = False
         self._jitter_buffers: list[Gst.Element] = []
         pipeline.connect("deep-element-added", self._on_element)
+        if self._on_unit:
+            self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_access_unit)
+        if self._on_picture:
+            self._sink.connect("new-sample", self._on_sample)
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
@@ -100,7 +127,31 @@ class Receiver:
         )
 
     def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        captured = info.get_buffer().get_reference_timestamp_meta(None)
-        if captured:
-            self._latency_ms = 1000 * (time.time() + NTP_EPOCH_S - captured.timestamp / Gst.SECOND)
+        captured = capture_time(info.get_buffer())
+        if captured is not None:
+            self._latency_ms = 1000 * (time.time() - captured)
         return Gst.PadProbeReturn.REMOVE
+
+    def _on_access_unit(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        arrived, buffer = time.time(), info.get_buffer()
+        data = buffer.extract_dup(0, buffer.get_size())
+        # The depayloader marks the first unit of all, and each that packets are missing of.
+        damaged, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
+        unit = read_unit(data, capture_time(buffer), arrived, damaged=damaged)
+        if unit:
+            self._on_unit(self._name, unit)  # type: ignore[misc]
+        return Gst.PadProbeReturn.OK
+
+    def _on_sample(self, sink: Gst.Element) -> Gst.FlowReturn:
+        sample = sink.emit("pull-sample")
+        picture, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
+        width, height = picture.get_int("width")[1], picture.get_int("height")[1]
+        data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder uses its memory again
+        self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
+        return Gst.FlowReturn.OK
+
+
+def capture_time(buffer: Gst.Buffer) -> float | None:
+    """When a frame was captured, s since 1970 by the vehicle's clock; None where the line does not carry it."""
+    meta = buffer.get_reference_timestamp_meta(None)
+    return meta.timestamp / Gst.SECOND - NTP_EPOCH_S if meta else None

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from gi.repository import Gst, GstRtsp, GstRtspServer
 
-from runner.commands import KnobValue
 from runner.errors import RunError
 from runner.graph import Plan
-from runner.gst.pipeline import CameraPipeline
+from runner.gst.pipeline import Build, CameraPipeline
 from runner.model import Endpoint
 from runner.ports import check_port_free
 
-Wanted = Callable[[str], Mapping[str, KnobValue]]  # where the knobs of a camera are to be
 Report = Callable[[str, str], None]  # camera, what happened
 
 
 class CameraServer:
     """RTSP server with one mount point per camera.
 
-    wanted  asked for the settings of a camera whenever its pipeline is built
+    build   makes a `CameraPipeline` of each that was built
     report  told of pipelines that come and go
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Endpoint, wanted: Wanted, report: Report) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Endpoint, build: Build, report: Report) -> None:
         check_port_free(media)
-        self._wanted, self._report = wanted, report
+        self._build, self._report = build, report
         self.pipelines: dict[str, CameraPipeline] = {}
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
@@ -65,7 +63,7 @@ class CameraServer:
         bus = element.get_parent().get_bus()
         bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
         bus.connect("sync-message::error", lambda _bus, message: self._report(name, message.parse_error()[0].message))
-        self.pipelines[name] = CameraPipeline(element, plan, self._wanted(name))
+        self.pipelines[name] = self._build(element, plan)
         media.connect("unprepared", self._on_unprepared, name, self.pipelines[name])
         self._report(name, "pipeline built")
 

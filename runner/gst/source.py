@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import threading
 
-from gi.repository import Gst
+from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+
+CHECK_MS = 1000
+BEHIND_S = 0.3  # a clip that is behind by more has lost it
 
 
 def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
@@ -15,9 +18,12 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     A segment seek tells the demuxer to say SEGMENT_DONE in place of EOS; the next seek then queues the clip behind
     itself. Python runs once per round, not per frame.
     """
-    pace = pipeline.get_by_name(plan.source[-1].name).get_static_pad("sink")
+    identity = pipeline.get_by_name(plan.source[-1].name)
+    pace = identity.get_static_pad("sink")
     _Loop(pace.get_peer())
     _born_on_release(pace)
+    clip = _Pace(identity, float(plan.camera.fps))
+    GLib.timeout_add(CHECK_MS, clip.keep)
 
 
 class _Loop:
@@ -54,6 +60,35 @@ class _Loop:
         event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
         # Not from the streaming thread, which the seek has to wait for. A source pad takes it from below.
         threading.Thread(target=self._pad.send_event, args=(event,), daemon=True).start()
+
+
+class _Pace:
+    """Lets a clip lose the time that it is behind, as a camera loses frames.
+
+    A machine that was too busy for a while would else play what is overdue as fast as it can, and stay too busy.
+    """
+
+    def __init__(self, identity: Gst.Element, fps: float) -> None:
+        self._identity, self._fps = identity.weak_ref(), fps  # of the element, not of its Python wrapper
+        self._usual: float | None = None  # s between the clock and the frames released so far
+
+    def keep(self) -> bool:
+        """Once a second; ends with the pipeline."""
+        identity = self._identity()
+        if identity is None:
+            return False
+        clock, pad = identity.get_clock(), identity.get_static_pad("sink")
+        frames = identity.get_property("stats").get_value("num-buffers")
+        if identity.get_state(0).state != Gst.State.PLAYING or clock is None or not frames:
+            return True
+        behind = (clock.get_time() - identity.get_base_time()) / Gst.SECOND - frames / self._fps
+        if self._usual is None or behind < self._usual:
+            self._usual = behind
+        elif behind > self._usual + BEHIND_S:
+            lost = int((behind - self._usual) * Gst.SECOND)
+            pad.get_peer().set_offset(pad.get_peer().get_offset() + lost)
+            self._usual = behind
+        return True
 
 
 def _born_on_release(pad: Gst.Pad) -> None:

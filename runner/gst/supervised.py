@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from gi.repository import GLib, Gst
 
-from runner.commands import KnobValue
 from runner.graph import Plan
-from runner.gst.pipeline import CameraPipeline
+from runner.gst.pipeline import Build, CameraPipeline
 
 RETRY_MS = 500
 
@@ -69,12 +68,13 @@ class SupervisedPipeline:
 
 
 class CameraCaller:
-    """One camera's supervised pipeline on the vehicle."""
+    """One camera's supervised pipeline on the vehicle.
 
-    def __init__(
-        self, plan: Plan, wanted: Callable[[str], Mapping[str, KnobValue]], report: Callable[[str, str], None]
-    ) -> None:
-        self._plan, self._wanted = plan, wanted
+    build  makes a `CameraPipeline` of each that was built
+    """
+
+    def __init__(self, plan: Plan, build: Build, report: Callable[[str, str], None]) -> None:
+        self._plan, self._build = plan, build
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: report(name, what))
@@ -87,4 +87,4 @@ class CameraCaller:
         self._supervised.stop()
 
     def _on_built(self, pipeline: Any) -> None:
-        self.pipeline = CameraPipeline(pipeline, self._plan, self._wanted(self._plan.camera.name))
+        self.pipeline = self._build(pipeline, self._plan)

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from runner.model import ModelError, Pose, Progress
 
-RENDERER_VERSION = 1  # raise it with every change that changes pictures or files
+RENDERER_VERSION = 2  # raise it with every change that changes pictures or files
 SHORTEST_S = 4
 BYTES_PER_PIXEL = 0.15  # upper estimate of a clip's size, for the check of the disk
 UNFINISHED = ".part"

@@ -6,8 +6,6 @@ for every second pixel of every second row; between four that hit the same surfa
 interpolated, at edges every pixel is traced.
 """
 
-
-
 from __future__ import annotations
 
 import math

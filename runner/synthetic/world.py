@@ -6,8 +6,6 @@ as much motion as one that looks aside.
 Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.
 """
 
-
-
 from __future__ import annotations
 
 import math
