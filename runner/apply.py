@@ -14,7 +14,7 @@ from runner.errors import RunError
 from runner.graph import Plan, launch
 from runner.gst import GLib, Gst
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.receiver import Received, Receiver
+from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
 from runner.gst.registry import check_plan, missing_plugins
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
@@ -93,19 +93,22 @@ class VehicleSide:
 
     report  told, from another thread, when a camera's pipeline comes, goes or fails
     raises  RunError where the port is in use
+
+    `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
     def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report) -> None:
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
+        self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
         self._server: CameraServer | None = None
-        self._callers = {p.camera.name: CameraCaller(p, self._wanted_of, report) for p in plans if not p.serves}
+        self._callers = {p.camera.name: CameraCaller(p, self._build, report) for p in plans if not p.serves}
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._wanted_of, report)
+                self._server = CameraServer(served, media, self._build, report)
             for caller in self._callers.values():
                 caller.start()
 
@@ -158,6 +161,13 @@ class VehicleSide:
         self._glib.call(stop)
         self._glib.quit()
 
+    def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
+        """A pipeline that was just built, with every knob where it is wanted."""
+        return CameraPipeline(pipeline, plan, self._wanted_of(plan.camera.name), self._turned)
+
+    def _turned(self) -> None:
+        self.on_turned()  # as it is then, not as it was when the pipeline was built
+
     def _wanted_of(self, name: str) -> Mapping[str, KnobValue]:
         with self._lock:
             return dict(self._wanted[name])
@@ -169,11 +179,23 @@ class VehicleSide:
 
 
 class OperatorSide:
-    """All cameras of the vehicle, received and decoded."""
+    """All cameras of the vehicle, received and decoded.
 
-    def __init__(self, plans: Sequence[Plan], report: Report) -> None:
+    report      told, from another thread, what happens to a camera
+    on_unit     told, from the camera's streaming thread, each access unit that comes
+    on_picture  told, from the camera's streaming thread, each decoded picture
+    Without these no Python runs per frame.
+    """
+
+    def __init__(
+        self,
+        plans: Sequence[Plan],
+        report: Report,
+        on_unit: OnUnit | None = None,
+        on_picture: OnPicture | None = None,
+    ) -> None:
         self._glib = _Glib()
-        self._receivers = {plan.camera.name: Receiver(plan, report) for plan in plans}
+        self._receivers = {plan.camera.name: Receiver(plan, report, on_unit, on_picture) for plan in plans}
 
         def start() -> None:
             for receiver in self._receivers.values():

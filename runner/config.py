@@ -20,6 +20,7 @@ from runner.model import (
     Graph,
     Mode,
     ModelError,
+    Page,
     Place,
     Pose,
     RateQualityModel,
@@ -108,11 +109,13 @@ class _Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not (self.fine("media") and self.fine("control")):
+        if not (self.fine("media") and self.fine("control") and self.fine("page")):
             return None
         media, control = (Endpoint(**document[key]) for key in ("media", "control"))
         built = {name: camera for name, camera in cameras.items() if camera}
-        self._check_ports(built, {"media.port": media.port, "control.port": control.port})
+        page = Page(**document["page"])
+        listening = {"page.port": page.port} if page.serve else {}
+        self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index)
             if camera.source.render:
@@ -128,6 +131,7 @@ class _Builder:
             modes=modes,
             media=media,
             control=control,
+            page=page,
             pqos=document["pqos"],
         )
 

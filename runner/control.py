@@ -2,8 +2,9 @@
 
 Topics of a vehicle are tod/<vehicle>/request, reply, state and telemetry. A request is an event of
 schemas/event.schema.json with an `id` and without `t`, never retained; the vehicle stamps it on receipt and answers
-with the same id. The state is retained, so that who comes late knows what is applied. Last wills say that a side is
-gone: the vehicle's state says {"online": false}, the operator's request says operator_disconnected.
+with the same id: applied (read back from the elements), refused or timed out. State (decided and applied) and telemetry
+are retained, so that who comes late knows them. Last wills say that a side is gone: the vehicle's state says
+{"online": false}, the operator's request says operator_disconnected.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ CONNECT_S = 5.0
 KEEPALIVE_S = 2  # the broker publishes a will after one and a half of these
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
+RETAINED = ("state", "telemetry")
 MAX_MESSAGE_BYTES = 65_536  # the longest event is a hundredth of it
 
 Document = Mapping[str, Any]
@@ -52,7 +54,7 @@ class Link:
         self._listening = threading.Event()
         client = Client(CallbackAPIVersion.VERSION2)
         topic, message = will
-        client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
+        client.will_set(self._prefix + topic, json.dumps(message), qos=1, retain=topic in RETAINED)
         client.on_socket_open = _no_delay
         client.on_connect = self._on_connect
         client.on_subscribe = lambda *_: self._listening.set()
@@ -77,8 +79,12 @@ class Link:
             raise RunError(f"the MQTT broker at {broker.host}:{broker.port} does not let this side in")
 
     def publish(self, topic: str, message: Document) -> None:
-        """Send a message; the state is kept by the broker for who comes later."""
-        self._send(topic, message)
+        """Send a message; state and telemetry are kept by the broker for who comes later.
+
+        Without a connection nothing is sent and nothing queued: who reconnects wants what is, not what was.
+        """
+        if self._client.is_connected():
+            self._send(topic, message)
 
     def close(self, topic: str, message: Document) -> None:
         """Say goodbye as the will would have, and disconnect."""
@@ -88,7 +94,8 @@ class Link:
         self._client.loop_stop()
 
     def _send(self, topic: str, message: Document) -> MQTTMessageInfo:
-        return self._client.publish(self._prefix + topic, json.dumps(message), qos=1, retain=topic == "state")
+        qos = 0 if topic == "telemetry" else 1
+        return self._client.publish(self._prefix + topic, json.dumps(message), qos=qos, retain=topic in RETAINED)
 
     def _on_connect(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
@@ -103,19 +110,31 @@ def _no_delay(_client: object, _data: object, sock: Any) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
+def read_message(payload: bytes) -> dict[str, Any]:
+    """A mapping, as JSON from somebody who may send anything.
+
+    raises  ValueError that says what is wrong
+    """
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise ValueError(f"{len(payload)} bytes: must be at most {MAX_MESSAGE_BYTES}")
+    try:
+        document = read_json(payload)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"not JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise ValueError("must be a mapping with id and event")
+    return document
+
+
 def read_request(payload: bytes) -> tuple[dict[str, Any], str, str]:
     """A request as it came: the event without its id, the id ("" if there is none), and what is wrong ("" if nothing).
 
     The event itself is checked when its time is known.
     """
-    if len(payload) > MAX_MESSAGE_BYTES:
-        return {}, "", f"{len(payload)} bytes: must be at most {MAX_MESSAGE_BYTES}"
     try:
-        document = read_json(payload)
-    except (ValueError, RecursionError) as error:
-        return {}, "", f"not JSON: {error}"
-    if not isinstance(document, dict):
-        return {}, "", "must be a mapping with id and event"
+        document = read_message(payload)
+    except ValueError as problem:
+        return {}, "", str(problem)
     identity = document.pop("id", None)
     if not isinstance(identity, str) or not identity:
         return document, "", "id: must be given, as text"

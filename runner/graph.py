@@ -63,6 +63,11 @@ class Plan:
         """The operator's side as GStreamer parses it."""
         return launch(self.operator)
 
+    @property
+    def decoder(self) -> str:
+        """The same without its sink."""
+        return launch(self.operator[:-1])
+
     def vehicle_line(self, knobs: Mapping[str, KnobValue]) -> str:
         """Arguments for gst-launch-1.0 with the knobs turned, quoted for a shell, ending in a network sink."""
         turned = [a for knob, value in knobs.items() for a in assignments(self.camera, knob, value)]

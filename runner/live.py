@@ -1,9 +1,9 @@
 """A vehicle that streams: cameras, loop and control link together. The verb `vehicle` runs it; so may your program.
 
-    with live_vehicle(["source=appsrc"]) as vehicle:
-        vehicle.start()                               # the loop runs in a thread of its own
-        while driving:
-            vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
+with live_vehicle(["source=appsrc"]) as vehicle:
+    vehicle.start()                               # the loop runs in a thread of its own
+    while driving:
+        vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
 """
 
 from __future__ import annotations
@@ -87,16 +87,18 @@ def live_vehicle(
             link.publish("reply", {"id": identity, **said})
 
         if problem:
-            answer({"accepted": False, "reason": problem})
+            loop.refuse(problem, answer)
         else:
             loop.post(document, answer)
 
     def on_connected(here: bool) -> None:
         if not here:
             loop.post({"event": "operator_disconnected"})  # for the vehicle, who cannot be heard is gone
+        loop.tell_again()  # the broker has told the last will, or forgotten everything
 
     link = Link(vehicle.name, vehicle.control, ("state", OFFLINE), {"request": on_request}, on_connected)
     loop = Loop(vehicle, side, pqos, track, Log(log), link.publish, say)
+    side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:
         link.connect()

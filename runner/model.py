@@ -274,6 +274,22 @@ class Endpoint:
     port: int
 
 
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The operator's page, on 127.0.0.1.
+
+    late_ms  age of a picture when it is drawn, above which it is marked as late
+    """
+
+    serve: bool
+    port: int
+    late_ms: float
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return Endpoint("127.0.0.1", self.port)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicle:
     """Everything the runner needs to know, valid once built.
@@ -288,6 +304,7 @@ class Vehicle:
     modes: Mapping[Mode, tuple[RuleCall, ...]]
     media: Endpoint
     control: Endpoint
+    page: Page
     pqos: Mapping[str, Any]
 
 

@@ -182,9 +182,7 @@ def fade_when_stale(
 
 
 @rule(reads=["operator_lost", "t"])
-def pause_without_operator(
-    vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, after_s: Fraction
-) -> Step:
+def pause_without_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, after_s: Fraction) -> Step:
     """Nothing is sent while the operator's side has been gone for longer than `after_s`; it resumes with its return."""
     lost = state.operator_lost
     if lost is None or state.t - lost <= after_s:

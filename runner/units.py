@@ -1,0 +1,118 @@
+"""Access units on their way to a viewer, and what one who comes late must decode first. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from runner.keyframe import Bits, grey_idr
+
+SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
+RECOVERY_POINT = 6  # SEI payload type (D.1.8)
+PERIODS = 2  # of refresh, that make any picture exact: the second holds a whole wave, wherever the first began
+LONGEST_S = 20.0  # what is kept of a stream that never starts anew and states no refresh period
+
+
+class AccessUnit(NamedTuple):
+    """One encoded picture, H.264 Annex B.
+
+    captured  when it was captured, s since 1970 by the vehicle's clock; None where the line does not carry it
+    arrived   when it came, s since 1970 by this machine's clock
+    key       whether a decoder can start with it (IDR)
+    recovery  frames after which a decoder that follows from here is exact, where a refresh wave begins; else None
+    exact     False: decoded, it still shows something that was never sent
+    """
+
+    data: bytes
+    captured: float | None
+    arrived: float
+    key: bool
+    recovery: int | None = None
+    exact: bool = True
+
+
+def read_unit(data: bytes, captured: float | None, arrived: float, *, damaged: bool = False) -> AccessUnit | None:
+    """An access unit that has come, in Annex B: whether it starts anew is read from its NAL units.
+
+    damaged  packets of it were lost
+    returns  None for one that is of no use: browsers' decoders give up on half a picture, and bear one that is missing.
+             Half an IDR picture becomes a grey one, over which the next refresh wave paints.
+
+    Parameter sets do not tell an IDR picture: encoders repeat them at every wave.
+    """
+    recovery = None
+    for kind, at in _nal_units(data):
+        if kind == IDR and damaged:
+            grey = grey_idr(data)
+            return AccessUnit(grey, captured, arrived, key=True, exact=False) if grey else None
+        if SLICE <= kind <= IDR:
+            return None if damaged else AccessUnit(data, captured, arrived, kind == IDR, recovery)
+        if kind == SEI:
+            recovery = _recovery(data[at : at + 16]) if recovery is None else recovery
+    return None
+
+
+def _nal_units(data: bytes) -> Iterator[tuple[int, int]]:
+    """Type and place of the first byte after the header of each NAL unit."""
+    at = data.find(b"\0\0\1")
+    while 0 <= at < len(data) - 3:
+        yield data[at + 3] & 0x1F, at + 4
+        at = data.find(b"\0\0\1", at + 3)
+
+
+def _recovery(message: bytes) -> int | None:
+    """recovery_frame_cnt of an SEI message that is a recovery point (D.1.8)."""
+    return Bits(message[2:]).ue() if len(message) > 2 and message[0] == RECOVERY_POINT else None
+
+
+class Recent:
+    """The units of one camera that a late decoder needs: the last IDR, and what came since or in the last periods.
+
+    With intra-refresh an IDR comes only when the picture changes its size. Shown alone it mixes an old picture with
+    new changes; after two refresh periods, or one whole wave that the stream announces, nothing of the old one is left.
+    A stream that others watched before has no IDR at all for who joins: it starts from a grey one.
+
+    refresh_s  length of a refresh wave or distance of key frames, s; None where the graph does not state it
+    """
+
+    def __init__(self, refresh_s: float | None) -> None:
+        self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
+        self._key: AccessUnit | None = None
+        self._since: deque[AccessUnit] = deque()
+        self._exact_from = 0.0  # a grey start: when two periods have passed
+
+    def add(self, unit: AccessUnit) -> AccessUnit:
+        """Keep a unit that has just come; returns it with `exact` as it is for a decoder that follows from here."""
+        if unit.key:
+            self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
+            self._since.clear()
+            return unit
+        if self._key is None and (grey := grey_idr(unit.data)):
+            self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
+            self._exact_from = unit.arrived + self._window
+        if self._key is None:
+            return unit._replace(exact=False)
+        self._since.append(unit)
+        while self._since[0].arrived < unit.arrived - self._window:
+            self._since.popleft()
+        if unit.arrived < self._exact_from and self._wave() is not None:
+            self._exact_from = unit.arrived
+        if unit.arrived < self._exact_from:
+            self._since[-1] = unit = unit._replace(exact=False)
+        return unit
+
+    def burst(self) -> list[AccessUnit]:
+        """Units to decode in order, of which the last is the newest; none before there is one to start with."""
+        if self._key is None:
+            return []
+        units = list(self._since)
+        return [self._key, *units[self._wave() or 0 :]]
+
+    def _wave(self) -> int | None:
+        """Where the last wave began that has run to its end by now; None if there is none."""
+        for at in range(len(self._since) - 1, -1, -1):
+            recovery = self._since[at].recovery
+            if recovery is not None and len(self._since) - 1 - at >= recovery:
+                return at
+        return None
