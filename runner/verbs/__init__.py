@@ -24,13 +24,14 @@ VERBS = {
     "validate": Verb("check every file and every combination", "runner.verbs.validate", ()),
     "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
-    "operator": Verb("the operator's side: receive, decode, measure", "runner.verbs.operator", ("log", "duration_s")),
+    "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "duration_s")),
     "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", ()),
 }
 
 
-EXTRAS = {"paho": "live", "rich": "live", "numba": "synthetic"}  # by Python module, the extra of this package
+# By Python module, the extra of this package that brings it.
+EXTRAS = {"paho": "live", "rich": "live", "aiohttp": "page", "plotly": "page", "numba": "synthetic"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from runner.broker import find_mosquitto
 from runner.config import load
 from runner.errors import RunError
-from runner.model import Endpoint, Vehicle
+from runner.model import Vehicle
 from runner.ports import check_port_free
 from runner.sources import compile_plans
 from runner.verbs import EXTRAS, Arguments
@@ -94,7 +94,9 @@ def _elements(vehicle: Vehicle) -> Iterator[Finding]:
 
 
 def _ports(vehicle: Vehicle) -> Iterator[Finding]:
-    ports: dict[str, Endpoint] = {"media.port": vehicle.media, "control.port": vehicle.control}
+    ports = {"media.port": vehicle.media, "control.port": vehicle.control}
+    if vehicle.page.serve:
+        ports["page.port"] = vehicle.page.endpoint
     for key, endpoint in ports.items():
         try:
             check_port_free(endpoint)

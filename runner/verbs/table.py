@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich import box
 from rich.console import Console, Group
@@ -15,29 +15,21 @@ from rich.live import Live
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from runner.model import Vehicle
-from runner.telemetry import Decided, Meter, Rates, middle, percentile
+from runner.station import Row
+from runner.telemetry import Meter, middle, percentile
 
 PLAIN_EVERY_S = 5.0
 NOTES = 4
-
-
-class Row(NamedTuple):
-    """One camera as the table shows it; `received` is its counters, `setting` what the vehicle says of it."""
-
-    name: str
-    rates: Rates
-    received: Any
-    decided: Decided | None
-    setting: Mapping[str, Any]
+KEPT_NEWS = 1000
 
 
 class Table:
     """Shown in place on a terminal, every few seconds elsewhere."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self) -> None:
         self._console = Console(width=None if sys.stdout.isatty() else 150)
         self._live = Live(console=self._console, auto_refresh=False) if sys.stdout.isatty() else None
+        self._news: deque[str] = deque(maxlen=KEPT_NEWS)  # not shown yet
         self._notes: deque[str] = deque(maxlen=NOTES)
         self._shown = 0.0
 
@@ -50,14 +42,17 @@ class Table:
         if self._live:
             self._live.__exit__(kind, error, at)
 
-    def note(self, what: str) -> None:
-        """One line of news below the table."""
-        line = f"{time.strftime('%H:%M:%S')} {what}"
-        self._notes.append(line)
-        if not self._live:
-            self._console.print(line, markup=False, highlight=False)
+    def tell(self, kind: str, message: Mapping[str, Any]) -> None:
+        """News of the station, from any thread: one line below the table, when it is shown next."""
+        if kind == "note":
+            self._news.append(f"{time.strftime('%H:%M:%S', time.localtime(message['time']))} {message['text']}")
 
     def show(self, rows: Sequence[Row], headline: str) -> None:
+        while self._news:
+            line = self._news.popleft()
+            self._notes.append(line)
+            if not self._live:
+                self._console.print(line, markup=False, highlight=False)
         if self._live:
             self._live.update(Group(_table(rows, headline), *map(Text, self._notes)), refresh=True)
         elif time.monotonic() - self._shown >= PLAIN_EVERY_S:

@@ -1,0 +1,35 @@
+/**
+ * Starts the worker before anything else: it connects and decodes while the rest of the page is still loading. No module,
+ * since those wait for the whole document.
+ */
+"use strict";
+
+const canShowVideo =
+  typeof VideoDecoder !== "undefined" && typeof HTMLCanvasElement.prototype.transferControlToOffscreen === "function";
+const early = []; // what the worker tells until somebody listens
+const worker = new Worker("/static/video.js", { type: "module" });
+globalThis.boot = { canShowVideo, early, worker };
+
+worker.onmessage = ({ data }) => early.push(data);
+worker.postMessage({
+  order: "start",
+  url: liveUrl(),
+  origin: performance.timeOrigin,
+  video: canShowVideo,
+  keep: location.hash === "#measure",
+});
+
+function liveUrl() {
+  const url = new URL(`/live?viewer=${token()}`, location.href);
+  url.protocol = url.protocol.replace("http", "ws");
+  return url.href;
+}
+
+/** A random name of this viewer, the same after a reload. */
+function token() {
+  const key = "tod-viewer";
+  const kept = sessionStorage.getItem(key);
+  const made = kept ?? [...crypto.getRandomValues(new Uint8Array(16))].map((b) => b.toString(16).padStart(2, "0")).join("");
+  sessionStorage.setItem(key, made);
+  return made;
+}

@@ -1,0 +1,170 @@
+/** Charts of the last five minutes and the map. Plotly is large: it comes after the first pictures, and draws when seen. */
+
+import { listen, store } from "./store.js";
+import { colourOf, themed } from "./colours.js";
+import { make, spoken } from "./format.js";
+
+const SHOWN_S = 300;
+const SETTLE_MS = 1500; // from the first picture to loading the charts
+const AT_LATEST_MS = 4000; // without any picture
+const BETWEEN_MS = 60; // from one chart to the next: no long task
+const EARTH_M = 6371000;
+
+const by = (id) => document.getElementById(id);
+const visible = new Set();
+let loading = false;
+
+// --- traces -----------------------------------------------------------------------------------------------------------
+
+const ages = () => {
+  const { time } = store.series;
+  return time.map((each) => each - time.at(-1));
+};
+
+const line = (x, y, name, colour, more = {}) =>
+  ({ type: "scatter", mode: "lines", x, y, name, line: { color: colour, width: 2, ...more }, hovertemplate: `%{y:.6~g} ${name}<extra></extra>` });
+
+function totals() {
+  const { predicted_kbps, allocated_kbps, actual_kbps } = store.series;
+  const x = ages();
+  return [
+    line(x, predicted_kbps, "predicted", themed("predicted"), { dash: "dash", shape: "hv" }),
+    line(x, allocated_kbps, "allocated", themed("allocated"), { shape: "hv" }),
+    line(x, actual_kbps, "actual", themed("actual")),
+  ];
+}
+
+function cameras() {
+  const x = ages();
+  return perCamera((name, columns, colour, width) => [
+    line(x, columns.allocated_kbps, `${spoken(name)} allocated`, colour, { dash: "dot", width: width * 0.7, shape: "hv" }),
+    line(x, columns.kbps, spoken(name), colour, { width }),
+  ]);
+}
+
+function factors() {
+  const x = ages();
+  return perCamera((name, { scaling }, colour, width) => [line(x, scaling, spoken(name), colour, { shape: "hv", width })]);
+}
+
+/** Traces of all cameras, the selected one last and thicker. */
+function perCamera(traces) {
+  const names = Object.keys(store.series.cameras);
+  const order = [...names.filter((name) => name !== store.selected), ...names.filter((name) => name === store.selected)];
+  return order.flatMap((name) =>
+    traces(name, store.series.cameras[name], colourOf(names.indexOf(name)), name === store.selected ? 3 : 1.5));
+}
+
+/** Positions in metres east and north of the first one; on the scale of a drive the earth is flat. */
+function metres() {
+  const { lat, lon, actual_kbps } = store.series;
+  const known = lat.flatMap((each, i) => (each === null || lon[i] === null ? [] : [i]));
+  if (!known.length) return null;
+  const radians = Math.PI / 180;
+  const [first] = known;
+  return {
+    x: known.map((i) => (lon[i] - lon[first]) * radians * EARTH_M * Math.cos(lat[first] * radians)),
+    y: known.map((i) => (lat[i] - lat[first]) * radians * EARTH_M),
+    kbps: known.map((i) => actual_kbps[i]),
+  };
+}
+
+function drive() {
+  const points = metres();
+  if (!points) return [];
+  const { x, y, kbps } = points;
+  const bar = { title: { text: "kbit/s", side: "top" }, thickness: 10, outlinewidth: 0, tickfont: { size: 12 }, nticks: 5 };
+  return [
+    { type: "scatter", mode: "markers", x, y, marker: { color: kbps, colorscale: "Viridis", size: 7, colorbar: bar },
+      hovertemplate: "%{x:.0f} m east, %{y:.0f} m north<br>%{marker.color:.0f} kbit/s<extra></extra>" },
+    { type: "scatter", mode: "markers", x: [x.at(-1)], y: [y.at(-1)], hovertemplate: "now<extra></extra>",
+      marker: { symbol: "circle-open", size: 18, color: themed("text"), line: { width: 3 } } },
+  ];
+}
+
+// --- layouts ----------------------------------------------------------------------------------------------------------
+
+const axis = (title, more = {}) => ({
+  title: { text: title, standoff: 6, font: { size: 12 } }, gridcolor: themed("grid"), linecolor: themed("grid"), zeroline: false,
+  tickfont: { size: 12 }, fixedrange: true, ...more,
+});
+
+function base(x, y, more = {}) {
+  return {
+    autosize: true, margin: { l: 58, r: 10, t: 6, b: 40 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: themed("text") }, xaxis: x, yaxis: y,
+    showlegend: false, hovermode: "closest", hoverlabel: { font: { size: 12 } }, ...more,
+  };
+}
+
+const time = () => axis("seconds before now", { range: [-SHOWN_S, 0], dtick: 60, tickangle: 0 });
+
+function mapLayout() {
+  const empty = metres() === null;
+  const annotations = empty
+    ? [{ text: "no position yet", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5, font: { size: 15 } }]
+    : [];
+  return base(axis("m east"), axis("m north", { scaleanchor: "x" }), { annotations });
+}
+
+const charts = [
+  { id: "chart-totals", traces: totals, layout: () => base(time(), axis("kbit/s", { rangemode: "tozero" })) },
+  { id: "chart-cameras", traces: cameras, layout: () => base(time(), axis("kbit/s", { rangemode: "tozero" })) },
+  { id: "chart-factors", traces: factors, layout: () => base(time(), axis("factor", { rangemode: "tozero" })) },
+  { id: "chart-map", traces: drive, layout: mapLayout },
+];
+const config = { displaylogo: false, displayModeBar: false, responsive: false, doubleClick: false };
+
+// --- when they draw ---------------------------------------------------------------------------------------------------
+
+function draw(chart) {
+  const element = by(chart.id);
+  if (!globalThis.Plotly || !visible.has(chart.id) || document.hidden || !element.clientHeight) return;
+  const size = { width: element.clientWidth, height: element.clientHeight, autosize: false };
+  Plotly.react(element, chart.traces(), { ...chart.layout(), ...size }, config);
+}
+
+function drawAll() {
+  for (const [i, chart] of charts.entries()) setTimeout(draw, i * BETWEEN_MS, chart);
+}
+
+function load() {
+  if (loading) return;
+  loading = true;
+  const script = make("script", { src: "/plotly.js" });
+  script.addEventListener("load", () => {
+    drawAll();
+    setInterval(drawAll, 1000);
+  });
+  script.addEventListener("error", () => charts.forEach(({ id }) => by(id).replaceChildren("charts are not available: /plotly.js is missing")));
+  document.head.append(script);
+}
+
+function showLegend() {
+  const entries = (store.hello?.cameras ?? []).map(({ name }, i) => {
+    const swatch = make("span", { class: "swatch", style: `background:${colourOf(i)}` });
+    return make("span", {}, swatch, spoken(name));
+  });
+  by("legend").replaceChildren(...entries);
+}
+
+export function startCharts() {
+  const watcher = new IntersectionObserver((entries) => {
+    for (const { target, isIntersecting } of entries) {
+      if (isIntersecting) visible.add(target.id);
+      else visible.delete(target.id);
+      if (isIntersecting) draw(charts.find(({ id }) => id === target.id));
+    }
+  });
+  for (const { id } of charts) watcher.observe(by(id));
+  let first = false;
+  listen("status", ({ status }) => {
+    if (first || status !== "live") return;
+    first = true;
+    setTimeout(load, SETTLE_MS);
+  });
+  setTimeout(load, AT_LATEST_MS);
+  listen("hello theme", showLegend);
+  listen("theme selected", drawAll);
+  new ResizeObserver(drawAll).observe(by("side"));
+}

@@ -1,0 +1,47 @@
+/** Numbers and small pieces of the page. */
+
+const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0, useGrouping: false });
+
+/** A whole number, "–" where unknown. */
+export const whole = (value) => (Number.isFinite(value) ? WHOLE.format(value) : "–");
+
+/** A factor as short as it is exact: 0.25, 0.125. */
+export const factor = (value) => (Number.isFinite(value) ? String(Math.round(value * 1e4) / 1e4) : "–");
+
+export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
+
+export const region = (roi) => (roi ? `${size(roi.width, roi.height)} at ${roi.x}, ${roi.y}` : "–");
+
+export const sameRegion = (a, b) => ["x", "y", "width", "height"].every((key) => a?.[key] === b?.[key]);
+
+export const clockTime = (seconds) => new Date(seconds * 1000).toTimeString().slice(0, 8);
+
+/** Words for a camera's name: front_left -> front left. */
+export const spoken = (name) => name.replaceAll("_", " ");
+
+/**
+ * An element: make("button", {class: "on", title: "..."}, "text", child).
+ * Keys that begin with "on" are listeners; false and null leave an attribute out.
+ */
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (value !== false && value !== null) element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children);
+  return element;
+}
+
+/** Write a text only where it differs: the page is written four times a second, and mostly the same. */
+export function write(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** Set or take away an attribute, only where it differs. */
+export function mark(element, name, value) {
+  const text = value === false || value === null || value === undefined ? null : String(value);
+  if (element.getAttribute(name) === text) return;
+  if (text === null) element.removeAttribute(name);
+  else element.setAttribute(name, text);
+}

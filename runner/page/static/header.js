@@ -1,0 +1,95 @@
+/** The header: vehicle, mode, totals, who is in control; and the banner when something is not there. */
+
+import { inControl, listen, mode, publish, store } from "./store.js";
+import { pending, request, whyNoControl } from "./requests.js";
+import { send } from "./link.js";
+import { mark, whole, write } from "./format.js";
+
+const START_MS = 800; // no alarm while the page is just opening
+const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
+
+const by = (id) => document.getElementById(id);
+const buttons = [...document.querySelectorAll("#modes button")];
+
+/** Ask for another mode. What is highlighted stays what the vehicle says. */
+export function selectMode(wanted) {
+  if (wanted === mode() && !pending("mode")) return;
+  request("mode", { event: "mode_selected", mode: wanted }, `mode ${wanted}`);
+}
+
+export function toggleControl() {
+  if (!store.connected) return;
+  if (store.holder === "you") return send({ release_control: true });
+  if (store.holder === "nobody") return send({ take_control: true });
+  write(by("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
+  by("confirm").showModal();
+}
+
+function refresh() {
+  write(by("vehicle"), store.hello?.vehicle ?? "…");
+  document.title = `${store.hello?.vehicle ?? "tod-runner"} · tod-runner`;
+  refreshModes();
+  refreshControl();
+  refreshBanner();
+}
+
+function refreshModes() {
+  const now = mode();
+  const asked = pending("mode")?.event.mode;
+  for (const button of buttons) {
+    const own = button.dataset.mode;
+    mark(button, "aria-checked", own === now);
+    mark(button, "data-pending", own === asked ? "" : null);
+    mark(button, "tabindex", own === (now ?? "single") ? 0 : -1);
+    mark(button, "aria-disabled", inControl() && now ? null : "true");
+  }
+}
+
+function refreshControl() {
+  const button = by("take-control");
+  write(by("holder"), store.connected ? HOLDERS[store.holder] : "");
+  mark(by("holder"), "data-holder", store.holder);
+  write(button, store.holder === "you" ? "Release" : "Take control");
+  button.classList.toggle("strong", store.connected && store.holder !== "you");
+  button.disabled = !store.connected;
+  button.title = `${store.connected ? "take or release control (t)" : whyNoControl()}`;
+}
+
+function refreshBanner() {
+  const away = store.connected ? store.state && !store.state.online : performance.now() > START_MS;
+  const text = store.connected
+    ? "THE VEHICLE IS NOT THERE: no control link, the pictures are not live"
+    : "NO CONNECTION TO THE STATION: the pictures are not live; trying again";
+  by("banner").hidden = !away;
+  write(by("banner"), away ? `✕ ${text}` : "");
+  const words = !store.connected ? "no station" : !store.state ? "no state yet" : away ? "vehicle away" : "connected";
+  write(by("connection"), `${words === "connected" ? "●" : "✕"} ${words}`);
+  mark(by("connection"), "data-state", words === "connected" ? "fine" : "bad");
+}
+
+function refreshTotals() {
+  for (const key of ["predicted", "allocated", "actual"]) write(by(key), whole(store.connected ? store.sample?.[`${key}_kbps`] : NaN));
+}
+
+function moveFocus(event) {
+  const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+  if (!step) return;
+  event.preventDefault();
+  const at = buttons.indexOf(document.activeElement);
+  buttons[(at + step + buttons.length) % buttons.length].focus();
+}
+
+export function startHeader() {
+  for (const button of buttons) button.addEventListener("click", () => selectMode(button.dataset.mode));
+  by("modes").addEventListener("keydown", moveFocus);
+  by("take-control").addEventListener("click", toggleControl);
+  by("confirm").addEventListener("close", ({ target }) => {
+    if (target.returnValue === "yes") send({ take_control: true });
+    target.returnValue = "";
+  });
+  by("help-open").addEventListener("click", () => publish("help"));
+  listen("hello state control requests socket", refresh);
+  listen("sample socket", refreshTotals);
+  setTimeout(refresh, START_MS + 50);
+  refresh();
+}

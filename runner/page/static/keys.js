@@ -1,0 +1,81 @@
+/** The keyboard, and the dialog that lists its keys. */
+
+import { camera, enlarge, listen, publish, select, store } from "./store.js";
+import { selectMode, toggleControl } from "./header.js";
+import { focusTile, switchCamera } from "./tiles.js";
+import { sendFull } from "./panel.js";
+import { toggleTheme } from "./theme.js";
+import { make } from "./format.js";
+
+const MODES = { s: "single", a: "automatic", c: "collective" };
+const CHORD_MS = 2500;
+const LIST = [
+  ["1 … 9", "select a camera"],
+  ["o", "switch the selected camera on or off"],
+  ["Enter, double click", "enlarge the selected camera"],
+  ["Esc", "back from the enlarged picture"],
+  ["drag on a picture", "choose the ROI (mode S)"],
+  ["f", "full image of the selected camera (mode S)"],
+  ["Shift+S, Shift+A, Shift+C", "mode Single, Automatic, Collective"],
+  ["m, then s, a or c", "the same"],
+  ["t", "take or release control"],
+  ["n", "night or day"],
+  ["Tab", "from control to control; arrows within modes, tabs and sliders"],
+  ["?", "this list"],
+];
+
+let chord = -Infinity;
+
+const plain = {
+  o: () => store.selected && switchCamera(store.selected),
+  f: sendFull,
+  t: toggleControl,
+  n: toggleTheme,
+  "?": () => publish("help"),
+  m() {
+    chord = performance.now();
+    publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
+  },
+  Escape: () => store.enlarged && enlarge(null),
+  Enter: enlargeSelected,
+};
+
+/** Enter on a button presses the button. */
+function enlargeSelected(event) {
+  const { target } = event;
+  if (target !== document.body && !target.classList.contains("tile")) return;
+  event.preventDefault();
+  if (store.selected) enlarge(store.enlarged === store.selected ? null : store.selected);
+}
+
+const typing = ({ target }) =>
+  target.matches?.("textarea, select, input:not([type=range]):not([type=checkbox]):not([type=radio])");
+
+function pressed(event) {
+  if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
+  if (document.querySelector("dialog[open]") || (typing(event) && event.key !== "Escape")) return;
+  const { key } = event;
+  const mode = MODES[key.toLowerCase()];
+  const chorded = performance.now() - chord < CHORD_MS;
+  if (key !== "Shift") chord = -Infinity;
+  if (mode && (event.shiftKey || chorded)) return selectMode(mode);
+  if (/^[1-9]$/.test(key)) return selectNumber(+key);
+  plain[key]?.(event);
+}
+
+function selectNumber(number) {
+  const name = store.hello?.cameras[number - 1]?.name;
+  if (!camera(name)) return;
+  if (store.enlarged) enlarge(name);
+  select(name);
+  focusTile(name);
+}
+
+export function startKeys() {
+  const help = document.getElementById("help");
+  const rows = LIST.map(([key, what]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, what)));
+  const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
+  help.append(make("h2", { id: "help-title" }, "Keys"), make("table", {}, make("tbody", {}, ...rows)), close);
+  listen("help", () => help.open || help.showModal());
+  addEventListener("keydown", pressed);
+}

@@ -1,0 +1,59 @@
+/** Wires the page: one module for each part of it, all fed by what the worker hands on from the station. */
+
+import { ask, send, start } from "./link.js";
+import { listen, store } from "./store.js";
+import { requests } from "./requests.js";
+import { startTheme } from "./theme.js";
+import { startHeader } from "./header.js";
+import { startTiles } from "./tiles.js";
+import { startTotal } from "./total.js";
+import { startPanel } from "./panel.js";
+import { startTabs } from "./tabs.js";
+import { startNews } from "./news.js";
+import { startCharts } from "./charts.js";
+import { startKeys } from "./keys.js";
+
+startTheme();
+startHeader();
+startTiles();
+startTotal();
+startPanel();
+startTabs();
+startNews();
+startCharts();
+startKeys();
+start();
+
+/** For tests and benchmarks. With #measure in the address the first picture of each camera is kept as well. */
+const answers = new Map();
+listen("reply", ({ id, result, reason }) => {
+  answers.get(id)?.({ result, reason });
+  answers.delete(id);
+});
+window.tod = {
+  measure: () => ask("measure"),
+  stages: () => ask("stages"),
+  picture: (name) => ask("picture", name),
+  first: (name) => ask("first", name),
+  request: (event) =>
+    new Promise((resolve) => {
+      const id = crypto.randomUUID();
+      answers.set(id, resolve);
+      send({ id, ...event });
+    }),
+  get state() {
+    return store.state;
+  },
+  get sample() {
+    return store.sample;
+  },
+  get history() {
+    return store.series;
+  },
+  get control() {
+    return store.holder;
+  },
+  get requests() {
+    return { pending: [...requests.pending.values()].map(({ timer, ...kept }) => kept), answered: requests.answered };
+  },
+};

@@ -1,0 +1,57 @@
+/** News, newest first, and toasts for what needs a look now. */
+
+import { listen, store } from "./store.js";
+import { clockTime, make, write } from "./format.js";
+
+const TOAST_MS = { hint: 4000, problem: 8000 };
+const MOST = 4;
+
+const list = document.getElementById("news");
+const toasts = document.getElementById("toasts");
+const latest = make("p", { id: "latest" });
+const roomy = matchMedia("(min-width: 1700px) and (min-height: 900px)");
+
+const line = ({ time, text, level }) =>
+  make("li", { "data-level": level }, make("time", {}, clockTime(time)), " ", level === "problem" ? `✕ ${text}` : text);
+
+function refresh() {
+  list.replaceChildren(...store.notes.map(line));
+  const [newest] = store.notes;
+  write(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no news yet");
+}
+
+function toast({ text, level }) {
+  const same = [...toasts.children].find((each) => each.dataset.text === text);
+  same?.remove();
+  const shape = level === "problem" ? "✕ " : "";
+  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, shape + text);
+  element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
+  toasts.append(element);
+  while (toasts.children.length > MOST) toasts.firstChild.remove();
+  setTimeout(() => element.remove(), TOAST_MS[level]);
+}
+
+/** Where there is room, the whole list stands below the tiles; else its newest line does, and the list has a tab. */
+function place() {
+  const strip = document.getElementById("strip");
+  if (roomy.matches) strip.replaceChildren(list);
+  else {
+    document.getElementById("news-panel").append(list);
+    strip.replaceChildren(latest);
+  }
+}
+
+export function startNews() {
+  roomy.addEventListener("change", place);
+  place();
+  let waits = false;
+  listen("note hello", () => {
+    if (waits) return;
+    waits = true; // several come at once after hello
+    requestAnimationFrame(() => {
+      waits = false;
+      refresh();
+    });
+  });
+  listen("toast", toast);
+}

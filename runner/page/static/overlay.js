@@ -1,0 +1,83 @@
+/**
+ * Alarms, drawn by the worker into the picture itself: they come even when the page's main thread is busy.
+ * Colour, word and shape say the same: LOST a cross, FROZEN a hatch, LATE a dashed frame.
+ */
+
+const RED = "#e01b24";
+const AMBER = "#ffb000";
+
+/** Draw the alarm or notice of a status over what the canvas shows. */
+export function drawOverlay(context, status, text) {
+  const { width, height } = context.canvas;
+  const side = Math.min(width, height);
+  if (status === "late") return drawLate(context, width, height, side, text);
+  if (status === "frozen" || status === "lost") return drawAlarm(context, width, height, side, status, text);
+  dim(context, width, height, 0.72);
+  plate(context, width / 2, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
+}
+
+function drawAlarm(context, width, height, side, status, text) {
+  dim(context, width, height, 0.5);
+  if (status === "frozen") hatch(context, width, height, side);
+  else cross(context, width, height, side);
+  frame(context, width, height, side * 0.06, RED, []);
+  plate(context, width / 2, height / 2, side * 0.17, text, RED, "#fff");
+}
+
+function drawLate(context, width, height, side, text) {
+  frame(context, width, height, side * 0.06, AMBER, [side * 0.16, side * 0.08]);
+  plate(context, width / 2, height - side * 0.15, side * 0.13, text, AMBER, "#000");
+}
+
+/** Take colour and light from the last picture: it must not be taken for a live one. */
+function dim(context, width, height, dark) {
+  context.globalCompositeOperation = "saturation";
+  context.fillStyle = "#000";
+  context.fillRect(0, 0, width, height);
+  context.globalCompositeOperation = "source-over";
+  context.fillStyle = `rgba(0,0,0,${dark})`;
+  context.fillRect(0, 0, width, height);
+}
+
+function hatch(context, width, height, side) {
+  stroke(context, side * 0.03, "rgba(224,27,36,0.55)", () => {
+    for (let x = -height; x < width; x += side * 0.16) {
+      context.moveTo(x, height);
+      context.lineTo(x + height, 0);
+    }
+  });
+}
+
+function cross(context, width, height, side) {
+  stroke(context, side * 0.04, "rgba(224,27,36,0.8)", () => {
+    context.moveTo(0, 0);
+    context.lineTo(width, height);
+    context.moveTo(0, height);
+    context.lineTo(width, 0);
+  });
+}
+
+function frame(context, width, height, thick, colour, dashes) {
+  context.setLineDash(dashes);
+  stroke(context, thick, colour, () => context.rect(thick / 2, thick / 2, width - thick, height - thick));
+  context.setLineDash([]);
+}
+
+function stroke(context, thick, colour, path) {
+  context.lineWidth = thick;
+  context.strokeStyle = colour;
+  context.beginPath();
+  path();
+  context.stroke();
+}
+
+function plate(context, x, y, size, text, back, fore) {
+  context.font = `700 ${Math.round(size)}px system-ui, "DejaVu Sans", sans-serif`;
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  const width = context.measureText(text).width + size;
+  context.fillStyle = back;
+  context.fillRect(x - width / 2, y - size * 0.8, width, size * 1.6);
+  context.fillStyle = fore;
+  context.fillText(text, x, y + size * 0.05);
+}

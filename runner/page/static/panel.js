@@ -1,0 +1,234 @@
+/** The side panel of the selected camera: what is decided, why, what was read back, and what the operator may set. */
+
+import { camera, decided, inControl, listen, mode, store } from "./store.js";
+import { pending, request, whyNoControl, complain } from "./requests.js";
+import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js";
+import { makeSlider } from "./slider.js";
+import { SHAPES, switchCamera, unapplied } from "./tiles.js";
+import { colourOf } from "./colours.js";
+import { factor, make, mark, region, size, whole, write } from "./format.js";
+
+const SIDES = ["x", "y", "width", "height"];
+const WHY = {
+  automatic: "Set by the prediction in mode A; choose S to set it by hand.",
+  collective: "Shared from the total in mode C; choose S to set it by hand.",
+};
+
+const name = () => store.selected;
+const whyNot = () => (!decided(name()) ? "The vehicle is not there." : inControl() ? null : `${capital(whyNoControl())}.`);
+const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
+
+// --- parts ------------------------------------------------------------------------------------------------------------
+
+const title = make("h2");
+const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
+const status = make("span", { class: "status" });
+const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
+const reason = make("p", { class: "why-decided" });
+const byHand = make("p", { class: "why" });
+const bitrate = makeSlider({
+  label: "bitrate",
+  data: "kbps",
+  control: () => `kbps:${name()}`,
+  send: (kbps) => configure("kbps", kbps, `${kbps} kbit/s`),
+});
+const choices = make("span", { class: "choices", role: "group", "aria-label": "factors of this camera" });
+const free = number("scaling", "factor", { min: 0.01, max: 1, step: "any" });
+const weight = number("weight", "weight", { min: 0, step: "any" });
+const weightNote = make("span", { class: "muted" });
+const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
+const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
+const full = make("button", { "data-control": "roi-full", onclick: () => sendFull(), title: "full image (f)" }, "Full image");
+const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), is: make("i", { class: "is" }), wish: make("i", { class: "wish" }) };
+const differing = make("p", { class: "differing" });
+const rows = new Map();
+let edited = new Set(); // inputs that the operator is changing: not to be overwritten
+
+function number(control, label, limits) {
+  const input = make("input", { type: "number", "data-control": control, "aria-label": label, ...limits });
+  input.addEventListener("input", () => edited.add(input));
+  return input;
+}
+
+function field(label, ...content) {
+  return make("div", { class: "field" }, make("span", { class: "label" }, label), ...content);
+}
+
+function comparison() {
+  const body = make("tbody");
+  for (const [key, label] of [["sending", "Sending"], ["bitrate", "kbit/s"], ["size", "Size"], ["ROI", "ROI"]]) {
+    const cells = [make("td"), make("td")];
+    rows.set(key, { row: make("tr", {}, make("th", { scope: "row" }, label), ...cells), cells });
+    body.append(rows.get(key).row);
+  }
+  const head = make("tr", {}, ...["", "Decided", "Applied"].map((text) => make("th", { scope: "col" }, text)));
+  return make("table", { class: "facts" }, make("caption", { class: "unseen" }, "decided and applied values"), make("thead", {}, head), body);
+}
+
+// --- requests ---------------------------------------------------------------------------------------------------------
+
+function configure(key, value, words) {
+  request(`${key}:${name()}`, { event: "camera_configured", camera: name(), [key]: value }, `${name()} ${words}`);
+}
+
+function setFactor(value) {
+  edited.delete(free);
+  if (!(value > 0 && value <= 1)) return complain("a factor is above 0 and at most 1");
+  configure("scaling", value, `factor ${factor(value)}`);
+}
+
+function setWeight() {
+  edited.delete(weight);
+  const value = +weight.value;
+  if (weight.value === "" || !(value >= 0)) return complain("a weight is a number from 0");
+  request(`weight:${name()}`, { event: "weights_set", weights: { [name()]: value } }, `${name()} weight ${value}`);
+}
+
+function sendSides() {
+  const { width, height } = camera(name());
+  const roi = Object.fromEntries(SIDES.map((side) => [side, Math.round(+sides[side].value)]));
+  const inside = roi.x >= 0 && roi.y >= 0 && roi.x + roi.width <= width && roi.y + roi.height <= height;
+  if (!inside) return complain(`the ROI leaves the image of ${width}×${height}`);
+  if (Math.min(roi.width, roi.height) < SMALLEST) return complain(`an ROI has at least ${SMALLEST}×${SMALLEST} pixels`);
+  sendRegion(name(), roi);
+  edited = new Set();
+}
+
+/** Ask for the full image of the selected camera. */
+export function sendFull() {
+  if (!name()) return;
+  const why = whyNotByHand();
+  if (why) return complain(why);
+  sendRegion(name(), fullRegion(name()));
+  edited = new Set();
+}
+
+// --- what is shown ----------------------------------------------------------------------------------------------------
+
+function refresh() {
+  const about = camera(name());
+  if (!about) return;
+  const now = decided(name());
+  refreshHead(now);
+  refreshSettings(about, now);
+  refreshComparison(now);
+  refreshDiagram(about, now);
+}
+
+function refreshHead(now) {
+  const word = store.status[name()] ?? "synchronising";
+  const asked = pending(`on:${name()}`);
+  write(title, name());
+  swatch.style.background = colourOf(store.hello.cameras.findIndex((each) => each.name === name()));
+  write(status, `${SHAPES[word]} ${word.toUpperCase()}`);
+  mark(status, "data-status", word);
+  mark(on, "aria-checked", now?.on === true);
+  mark(on, "aria-label", `${name()} on`);
+  mark(on, "data-pending", asked ? "" : null);
+  on.disabled = Boolean(whyNot());
+  on.title = whyNot() ?? "switch this camera on or off (o)";
+  write(on, asked ? (asked.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
+  write(reason, now?.reason || "–");
+}
+
+function refreshSettings(about, now) {
+  const why = whyNotByHand();
+  write(byHand, why ?? "Set by you in mode S.");
+  bitrate.update({ value: now?.kbps, max: about.b_full_kbps, why });
+  refreshFactors(about, now, why);
+  fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
+  for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
+  apply.disabled = full.disabled = Boolean(why);
+  apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
+  fill(weight, now?.weight ?? about.weight, whyNot(), pending(`weight:${name()}`));
+  write(weightNote, whyNot() ?? (mode() === "single" ? "acts in A and C, not in S" : "share of the total"));
+}
+
+/** A number shows what is in force, except while it is being changed or asked for. */
+function fill(input, value, why, asked) {
+  input.disabled = Boolean(why);
+  input.title = why ?? "";
+  mark(input, "data-pending", asked ? "" : null);
+  if (why) edited.delete(input);
+  if (!edited.has(input) && !asked && input.value !== String(value)) input.value = value;
+}
+
+function refreshFactors(about, now, why) {
+  const text = about.scaling.join();
+  if (choices.dataset.of !== text) {
+    choices.dataset.of = text;
+    const button = (value) => make("button", { "data-factor": value, onclick: () => setFactor(value) }, factor(value));
+    choices.replaceChildren(...about.scaling.map(button));
+  }
+  const asked = pending(`scaling:${name()}`)?.event.scaling;
+  for (const button of choices.children) {
+    const value = +button.dataset.factor;
+    button.disabled = Boolean(why);
+    mark(button, "aria-pressed", now?.scaling === value);
+    mark(button, "data-pending", asked === value ? "" : null);
+  }
+}
+
+function refreshComparison(now) {
+  const applied = now?.applied ?? {};
+  const yes = (value) => (value === undefined ? "–" : value ? "yes" : "no");
+  const differs = now ? unapplied(now) : [];
+  const values = {
+    sending: [yes(now?.sending), yes(applied.sending)],
+    bitrate: [whole(now?.kbps), whole(applied.bitrate)],
+    size: [size(now?.width, now?.height), size(applied.size?.width, applied.size?.height)],
+    ROI: [region(now?.roi), region(applied.roi)],
+  };
+  for (const [key, { row, cells }] of rows) {
+    write(cells[0], values[key][0]);
+    write(cells[1], differs.includes(key) ? `◌ ${values[key][1]}` : values[key][1]);
+    mark(row, "data-differs", differs.includes(key) ? "" : null);
+  }
+  write(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
+}
+
+/** Where the region lies in the full image: solid what is seen, dashed what is asked for. */
+function refreshDiagram(about) {
+  diagram.box.style.aspectRatio = `${about.width} / ${about.height}`;
+  const place = (element, roi) => {
+    element.hidden = !roi;
+    if (!roi) return;
+    const percent = (part, of) => `${(100 * part) / of}%`;
+    Object.assign(element.style, {
+      left: percent(roi.x, about.width),
+      top: percent(roi.y, about.height),
+      width: percent(roi.width, about.width),
+      height: percent(roi.height, about.height),
+    });
+  };
+  place(diagram.is, seenRegion(name()));
+  place(diagram.wish, waiting(name()));
+}
+
+function forget() {
+  edited = new Set();
+  bitrate.reset();
+  refresh();
+}
+
+export function startPanel() {
+  diagram.box.append(diagram.is, diagram.wish);
+  free.addEventListener("change", () => setFactor(+free.value));
+  weight.addEventListener("change", setWeight);
+  for (const side of SIDES) sides[side].addEventListener("keydown", ({ key }) => key === "Enter" && sendSides());
+  const numbers = SIDES.map((side) => make("label", {}, make("span", {}, side), sides[side]));
+  const controls = make(
+    "div", { class: "controls" }, byHand,
+    field("Bitrate", bitrate.element),
+    field("Factor", choices, free),
+    field("ROI", make("div", { class: "sides" }, ...numbers)),
+    make("div", { class: "beside" },
+      make("div", {}, field("", apply, full), field("Weight", weight, weightNote)),
+      diagram.box),
+  );
+  const head = make("div", { class: "head" }, swatch, title, status, on);
+  document.getElementById("camera-panel").append(head, reason, controls, comparison(), differing);
+  listen("hello state sample control requests socket status theme", refresh);
+  listen("selected", forget);
+}

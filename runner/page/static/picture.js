@@ -1,0 +1,108 @@
+/**
+ * A decoded picture that can be painted, in one of two ways. With a GPU the VideoFrame itself is drawn. Without one,
+ * Chromium's drawImage(VideoFrame) in a worker waits for the page's main thread, so that a busy page would stop all
+ * video and its alarms: there the planes are copied out of the frame and turned into pixels here, which waits for nobody.
+ */
+
+import { toRgba } from "./yuv.js";
+
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
+const FORMATS = ["I420", "NV12"];
+const SPARES = 16;
+const ASK_MS = 3000;
+const spare = []; // memory of pictures that are closed
+
+/** A frame, as it is; closed when the next one is shown. */
+class FramePicture {
+  constructor(frame) {
+    const { displayWidth: width, displayHeight: height } = frame;
+    Object.assign(this, { frame, width, height, painted: { width, height } });
+  }
+
+  paint(context, width, height) {
+    context.drawImage(this.frame, 0, 0, width, height);
+  }
+
+  /** Planes of the frame, as they were decoded: {width, height, format, bytes, planes}. */
+  async decoded() {
+    const bytes = new Uint8Array(this.frame.allocationSize());
+    const planes = await this.frame.copyTo(bytes);
+    return { width: this.width, height: this.height, format: this.frame.format, bytes, planes };
+  }
+
+  close() {
+    this.frame.close();
+  }
+}
+
+/** The planes of a frame; turned into pixels when first painted, since not every decoded picture is. */
+class PlanePicture {
+  constructor(memory, planes, { format, colorSpace, width, height }) {
+    const { width: wide, height: high } = memory.image;
+    Object.assign(this, { memory, planes, format, colorSpace, width, height, converted: false });
+    this.painted = { width: wide, height: high };
+  }
+
+  paint(context, width, height) {
+    const { bytes, image } = this.memory;
+    if (!this.converted) toRgba(bytes, this.planes, this.format, this.colorSpace, image, this.width);
+    this.converted = true;
+    if (width === image.width && height === image.height) return context.putImageData(image, 0, 0);
+    const still = new OffscreenCanvas(image.width, image.height);
+    still.getContext("2d", { alpha: false, willReadFrequently: true }).putImageData(image, 0, 0);
+    context.drawImage(still, 0, 0, width, height);
+  }
+
+  async decoded() {
+    const { width, height, format, planes } = this;
+    return { width, height, format, bytes: this.memory.bytes.slice(), planes };
+  }
+
+  close() {
+    spare.push(this.memory);
+    if (spare.length > SPARES) spare.shift(); // of another size, most likely
+  }
+}
+
+/** Whether this browser draws with a GPU. Asking takes a while, so the first pictures are drawn without knowing. */
+export let hasGpu = false;
+setTimeout(() => (hasGpu = askForGpu()), ASK_MS);
+
+function askForGpu() {
+  const context = typeof OffscreenCanvas === "undefined" ? null : new OffscreenCanvas(1, 1).getContext("webgl");
+  if (!context) return false;
+  const more = context.getExtension("WEBGL_debug_renderer_info");
+  const name = context.getParameter(more ? more.UNMASKED_RENDERER_WEBGL : context.RENDERER);
+  context.getExtension("WEBGL_lose_context")?.loseContext();
+  return !SOFTWARE.test(name);
+}
+
+function memoryFor(width, height, size) {
+  const fits = ({ bytes, image }) => bytes.length === size && image.width === width && image.height === height;
+  const found = spare.findIndex(fits);
+  return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
+}
+
+/** Square pixels in a known format: what can be turned into pixels here. */
+function isPlain({ displayWidth, displayHeight, visibleRect, format }) {
+  return FORMATS.includes(format) && visibleRect.width === displayWidth && visibleRect.height === displayHeight;
+}
+
+/**
+ * The picture of a frame, which is closed here or with the picture. Where the screen shows less than half of its pixels
+ * and they are turned into colours here, every fourth is enough.
+ * @param {VideoFrame} frame  @param {number} shown width on the screen, px
+ * @returns {Promise<FramePicture|PlanePicture>}
+ */
+export async function pictureOf(frame, shown) {
+  if (hasGpu || !isPlain(frame)) return new FramePicture(frame);
+  try {
+    const { format, colorSpace, displayWidth: width, displayHeight: height } = frame;
+    const step = shown > 0 && 2 * shown <= width ? 2 : 1;
+    const memory = memoryFor(width / step, height / step, frame.allocationSize());
+    const planes = await frame.copyTo(memory.bytes);
+    return new PlanePicture(memory, planes, { format, colorSpace, width, height });
+  } finally {
+    frame.close();
+  }
+}

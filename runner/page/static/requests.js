@@ -1,0 +1,63 @@
+/**
+ * Requests to the vehicle, each with the control it came from. A request is a wish: what is shown as set is what the
+ * vehicle's state says, and until the answer comes the control is shown as pending.
+ */
+
+import { inControl, listen, note, publish, store } from "./store.js";
+import { send } from "./link.js";
+
+const GIVE_UP_MS = 6000; // the station itself says "timed out" long before
+const PREFIX = Math.random().toString(36).slice(2, 8);
+
+export const requests = { pending: new Map(), answered: [] };
+let count = 0;
+
+/**
+ * Send an event.
+ * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it takes the place of an older
+ * @param {object} event without id
+ * @param {string} words what is asked for, for the news where it fails
+ */
+export function request(control, event, words) {
+  if (!inControl()) return complain(whyNoControl());
+  const id = `${PREFIX}-${++count}`;
+  const timer = setTimeout(() => answer({ id, result: "timed out", reason: "no answer from the station" }), GIVE_UP_MS);
+  requests.pending.set(id, { id, control, event, words, timer, sent: Date.now() });
+  send({ id, ...event });
+  publish("requests");
+}
+
+/** The newest request that waits for an answer and sets this control. */
+export function pending(control) {
+  return [...requests.pending.values()].findLast((each) => each.control === control);
+}
+
+export function whyNoControl() {
+  if (!store.connected) return "no connection to the station";
+  if (store.holder === "another") return "another page holds control";
+  return "take control first (t)";
+}
+
+/** Say that something did not go, in a toast and in the news. */
+export function complain(text) {
+  publish("toast", { text, level: "problem" });
+}
+
+function answer({ id, result, reason }) {
+  const asked = requests.pending.get(id);
+  if (!asked) return;
+  clearTimeout(asked.timer);
+  requests.pending.delete(id);
+  const { timer, ...kept } = asked;
+  requests.answered = [...requests.answered, { ...kept, result, reason, answered: Date.now() }].slice(-200);
+  if (result !== "applied") failed(`${asked.words}: ${result}${reason ? `: ${reason}` : ""}`);
+  publish("requests");
+}
+
+function failed(text) {
+  note({ text, level: "problem" });
+  complain(text);
+}
+
+listen("reply", answer);
+listen("unsent", (id) => answer({ id, result: "timed out", reason: "no connection to the station" }));

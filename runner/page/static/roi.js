@@ -1,0 +1,122 @@
+/** Choosing a region of interest by dragging a rectangle on the picture, in mode S. */
+
+import { camera, decided, inControl, listen, mode, publish } from "./store.js";
+import { pending, request, whyNoControl } from "./requests.js";
+import { make, sameRegion } from "./format.js";
+
+const START_PX = 6; // a hand that clicks trembles less than this
+export const SMALLEST = 16;
+const views = new Map(); // by camera: shows the region that is waited for
+
+/** What is on the picture: the region that was read back, else the one decided. */
+export const seenRegion = (name) => {
+  const now = decided(name);
+  return now?.applied.roi ?? now?.roi ?? null;
+};
+
+/** The picture's own rectangle inside its box (object-fit: contain), in pixels of the box. */
+function contentOf(box, roi) {
+  const { clientWidth: width, clientHeight: height } = box;
+  const scale = Math.min(width / roi.width, height / roi.height);
+  const shown = { width: roi.width * scale, height: roi.height * scale };
+  return { scale, x: (width - shown.width) / 2, y: (height - shown.height) / 2, ...shown };
+}
+
+/** A region of the full image from two corners on the box, in whole pixels, inside the image and not too small. */
+export function regionOf(box, roi, full, a, b) {
+  const content = contentOf(box, roi);
+  const across = [a.x, b.x].map((x) => roi.x + (x - content.x) / content.scale).sort((p, q) => p - q);
+  const down = [a.y, b.y].map((y) => roi.y + (y - content.y) / content.scale).sort((p, q) => p - q);
+  const [x, width] = snap(across, roi.x, roi.x + roi.width, full.width);
+  const [y, height] = snap(down, roi.y, roi.y + roi.height, full.height);
+  return { x, y, width, height };
+}
+
+/** Whole numbers between the bounds of what is seen; never smaller than the smallest, never outside the image. */
+function snap([from, to], low, high, end) {
+  const start = Math.round(Math.max(low, Math.min(from, high - 1)));
+  const stop = Math.round(Math.min(high, Math.max(to, low + 1)));
+  const length = Math.max(SMALLEST, stop - start);
+  return [Math.max(0, Math.min(start, end - length)), length];
+}
+
+export function sendRegion(name, roi) {
+  const { x, y, width, height } = roi;
+  request(`roi:${name}`, { event: "roi_set", camera: name, x, y, width, height }, `ROI of ${name}`);
+}
+
+export const fullRegion = (name) => ({ x: 0, y: 0, width: camera(name).width, height: camera(name).height });
+
+export function whyNoRegion() {
+  if (!inControl()) return whyNoControl();
+  return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
+}
+
+/** Let a box with a picture be dragged on. */
+export function dragRegion(name, box) {
+  const rectangle = make("div", { class: "roi-drag", hidden: true });
+  box.append(rectangle);
+  let from = null;
+  let dragging = false;
+
+  const point = (event) => {
+    const bounds = box.getBoundingClientRect();
+    return { x: event.clientX - bounds.x, y: event.clientY - bounds.y };
+  };
+  const place = (roi) => {
+    const seen = seenRegion(name);
+    const content = contentOf(box, seen);
+    Object.assign(rectangle.style, {
+      left: `${content.x + (roi.x - seen.x) * content.scale}px`,
+      top: `${content.y + (roi.y - seen.y) * content.scale}px`,
+      width: `${roi.width * content.scale}px`,
+      height: `${roi.height * content.scale}px`,
+    });
+    rectangle.hidden = false;
+  };
+  const region = (event) => regionOf(box, seenRegion(name), camera(name), from, point(event));
+  const end = () => {
+    from = null;
+    dragging = false;
+    refresh();
+  };
+  const refresh = () => {
+    if (dragging) return;
+    const wish = waiting(name);
+    if (wish && seenRegion(name)) place(wish);
+    else rectangle.hidden = true;
+  };
+
+  box.addEventListener("pointerdown", (event) => {
+    if (event.button === 0 && seenRegion(name)) from = point(event);
+  });
+  box.addEventListener("pointermove", (event) => {
+    if (!from) return;
+    const here = point(event);
+    if (!dragging && Math.hypot(here.x - from.x, here.y - from.y) < START_PX) return;
+    if (!dragging && whyNoRegion()) {
+      publish("toast", { text: `${name}: ${whyNoRegion()}`, level: "hint" });
+      return end();
+    }
+    dragging = true;
+    box.setPointerCapture(event.pointerId);
+    place(region(event));
+  });
+  box.addEventListener("pointerup", (event) => {
+    const wish = dragging ? region(event) : null;
+    end();
+    if (wish) sendRegion(name, wish);
+  });
+  box.addEventListener("pointercancel", end);
+  views.set(name, refresh);
+}
+
+listen("requests state", () => views.forEach((refresh) => refresh()));
+
+/** The region that was asked for, or decided, and is not yet the one on the picture. */
+export function waiting(name) {
+  const asked = pending(`roi:${name}`)?.event;
+  if (asked) return asked;
+  const now = decided(name);
+  return now?.applied.roi && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
+}

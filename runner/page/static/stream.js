@@ -1,0 +1,297 @@
+/** One camera in the worker: its decoder, its canvas, its status. */
+
+import { codecOf, spsOf } from "./h264.js";
+import { now } from "./clock.js";
+import { pictureOf } from "./picture.js";
+import { judge, words } from "./status.js";
+import { drawOverlay } from "./overlay.js";
+
+export const KEY = 1;
+export const CATCH_UP = 2;
+export const RESTART = 4;
+
+const QUEUE = 40; // units waiting in the decoder: beyond this, starting again from a burst is quicker
+const LAG_MS = 2000; // older than usual by this much: as long as the burst that would come instead
+const RESYNC_EVERY_MS = 2000; // doubled each time that it did not help: a burst costs more than what it repairs
+const RESYNC_SELDOM_MS = 16000;
+const SETTLE_MS = 2000; // after a restart the decoder may take this long for the burst
+const LATE_HOLD_MS = 500; // one late picture is seen as long as this
+const STAGES = 1200;
+
+export class Stream {
+  /**
+   * @param {object} camera as hello tells
+   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), wake() asks for a drawing
+   */
+  constructor(camera, station) {
+    Object.assign(this, { camera, name: camera.name, station });
+    this.canvas = this.context = this.decoder = this.sps = null;
+    this.display = { width: 0, height: 0, ratio: 1 };
+    this.waiting = null; // newest decoded picture, not drawn yet: {picture, meta}
+    this.shown = null; // picture last drawn, kept for alarms and for tests
+    this.meta = new Map(); // by timestamp: what is known of a unit in the decoder
+    this.timestamp = 0;
+    this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
+    this.error = ""; // of the decoder, the last one
+    this.stages = [];
+    this.first_drawn = null;
+    this.first = null; // for tests, the first picture drawn
+    this.last_resync = this.restarted = -Infinity;
+    this.patience = RESYNC_EVERY_MS;
+    this.transit = null; // usual time from the station to here
+    this.on = this.sending = null;
+    this.status = this.told = "synchronising";
+    this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
+    this.late_age = NaN; // of the last picture that was late
+    this.started();
+  }
+
+  /** The stream begins, or begins again: silence counts from now. */
+  started() {
+    this.arrived = this.decoded = now();
+    this.drawn = false;
+    this.late_until = 0;
+  }
+
+  /** The vehicle's decision about this camera. */
+  decide({ on, sending }) {
+    const begins = on && sending && (this.on === false || this.sending === false);
+    Object.assign(this, { on, sending });
+    if (begins) this.started();
+  }
+
+  attach(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
+    this.painted = null;
+    this.station.wake();
+  }
+
+  // --- from the station into the decoder ------------------------------------------------------------------------------
+
+  /** @param {{flags: number, sequence: number, captured: number, arrived: number, data: Uint8Array}} unit */
+  receive(unit) {
+    const received = now();
+    this.counts.received++;
+    this.arrived = received;
+    if (!this.station.video) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
+    if (unit.flags & RESTART) this.restart();
+    if (unit.flags & KEY) this.configure(unit.data);
+    if (!this.decoder || this.decoder.state !== "configured") return this.resync();
+    if (this.lags(unit, received)) this.resync();
+    this.decode(unit, received);
+  }
+
+  restart() {
+    this.close();
+    this.drawn = false;
+    this.transit = null;
+    this.restarted = now();
+  }
+
+  /** A key unit sets the decoder up, anew where its parameters are others. */
+  configure(data) {
+    const sps = spsOf(data);
+    if (!sps || (this.decoder && String(sps) === this.sps)) return;
+    this.close();
+    this.sps = String(sps);
+    const codec = codecOf(sps);
+    const decoder = new VideoDecoder({
+      output: (frame) => (decoder === this.decoder ? this.output(frame) : frame.close()),
+      error: (error) => decoder === this.decoder && this.failed(error),
+    });
+    this.decoder = decoder;
+    decoder.configure({ codec, optimizeForLatency: true });
+  }
+
+  decode(unit, received) {
+    this.timestamp += 1000;
+    this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
+    const type = unit.flags & KEY ? "key" : "delta";
+    try {
+      this.decoder.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
+    } catch (error) {
+      this.failed(error); // a delta where the decoder wants a key
+    }
+  }
+
+  lags(unit, received) {
+    if (unit.flags & CATCH_UP || this.settling()) return false;
+    if (this.decoder.decodeQueueSize > QUEUE) return true;
+    const transit = this.station.clock.server(received) - unit.arrived;
+    if (!Number.isFinite(transit)) return false;
+    this.transit = this.transit === null ? transit : Math.min(transit, this.transit + 0.5);
+    return transit > this.transit + LAG_MS;
+  }
+
+  /** The decoder is still busy with the burst that came first. */
+  settling() {
+    return !this.drawn && now() - this.restarted < SETTLE_MS;
+  }
+
+  failed(error) {
+    this.counts.errors++;
+    this.error = String(error);
+    this.close();
+    this.resync();
+  }
+
+  resync() {
+    const since = now() - this.last_resync;
+    if (since < this.patience) return;
+    this.patience = since > 2 * this.patience ? RESYNC_EVERY_MS : Math.min(RESYNC_SELDOM_MS, 2 * this.patience);
+    this.last_resync = now();
+    this.counts.resyncs++;
+    this.station.resync(this.name);
+  }
+
+  close() {
+    if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
+    this.decoder = null;
+    this.waiting?.picture.close();
+    this.waiting = null;
+    this.meta.clear();
+  }
+
+  // --- from the decoder to the eye ------------------------------------------------------------------------------------
+
+  output(frame) {
+    const meta = this.meta.get(frame.timestamp);
+    for (const key of this.meta.keys()) if (key <= frame.timestamp) this.meta.delete(key);
+    this.counts.decoded++;
+    this.decoded = now();
+    const behind = this.settling() && this.decoder.decodeQueueSize > 1; // there is a newer one already
+    if (!meta || meta.flags & CATCH_UP || behind) return frame.close();
+    this.wait(frame, { ...meta, decoded: this.decoded }, this.decoder);
+  }
+
+  async wait(frame, meta, decoder) {
+    const picture = await pictureOf(frame, this.display.width * this.display.ratio).catch(() => null);
+    if (!picture) return void this.counts.errors++;
+    if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
+    this.waiting?.picture.close();
+    this.waiting = { picture, meta };
+    this.station.wake();
+  }
+
+  /** Draw the newest frame; called in the worker's animation frame. */
+  draw() {
+    if (!this.waiting || !this.context) return;
+    this.shown?.picture.close();
+    this.shown = this.waiting;
+    this.waiting = null;
+    this.drawn = true;
+    this.age(this.shown.meta, now());
+    this.status = judge(this.times(), this.station.limits, now());
+    this.paint(now());
+    this.note(this.shown.meta, now());
+    if (this.station.keep) this.first ??= this.picture();
+  }
+
+  age({ captured }, time) {
+    const { clock, limits } = this.station;
+    const age = clock.server(time) - captured;
+    if (age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
+  }
+
+  note(meta, drawn) {
+    this.counts.drawn++;
+    this.first_drawn ??= drawn;
+    const page = [meta.received, meta.decoded, drawn].map((time) => this.station.clock.server(time));
+    this.stages.push([meta.captured, meta.arrived, ...page]);
+    if (this.stages.length > STAGES) this.stages.shift();
+  }
+
+  times() {
+    const { connected, online } = this.station;
+    const { on, sending, drawn, arrived, decoded, late_until } = this;
+    return { connected, online, on, sending, drawn, arrived, decoded, late_until, fps: this.camera.fps };
+  }
+
+  /** Judge the status; returns whether it is another one. Called by a timer. */
+  watch() {
+    const time = now();
+    this.status = judge(this.times(), this.station.limits, time);
+    const text = this.overlay(time);
+    if (this.context && text !== this.painted) this.paint(time);
+    const changed = this.status !== this.told;
+    this.told = this.status;
+    return changed;
+  }
+
+  overlay(time) {
+    if (this.status === "live") return "";
+    return words(this.status, time - this.arrived, this.late_age);
+  }
+
+  paint(time) {
+    const text = this.overlay(time);
+    this.size(this.status === "frozen" || this.status === "lost");
+    const { width, height } = this.canvas;
+    if (this.shown && this.status !== "off") this.shown.picture.paint(this.context, width, height);
+    else this.blank(width, height);
+    if (text) drawOverlay(this.context, this.status, text);
+    this.painted = text;
+  }
+
+  blank(width, height) {
+    this.context.fillStyle = "#0b0e11";
+    this.context.fillRect(0, 0, width, height);
+  }
+
+  /**
+   * The canvas has the picture's size. For an alarm that stands it is a whole multiple of it, near to what the screen
+   * shows, so that words are sharp while the aspect, and with it the page's layout, stays.
+   */
+  size(sharp) {
+    const { width: wide, height: high, ratio } = this.display;
+    const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
+    const own = this.shown?.picture.painted ?? box;
+    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(box.width / own.width))) : 1;
+    const width = own.width * times;
+    const height = own.height * times;
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+  }
+
+  // --- for tests and benchmarks ---------------------------------------------------------------------------------------
+
+  measure(origin) {
+    const picture = this.shown?.picture;
+    return {
+      status: this.status,
+      ...this.counts,
+      error: this.error,
+      width: picture?.width ?? 0,
+      height: picture?.height ?? 0,
+      drawn_size: { width: this.canvas?.width ?? 0, height: this.canvas?.height ?? 0 },
+      first_drawn_ms: this.first_drawn === null ? null : this.first_drawn - origin,
+    };
+  }
+
+  /** The picture last drawn, as it was decoded: its luma, and when it was captured. */
+  async picture() {
+    return this.shown && described(await this.shown.picture.decoded(), this.shown.meta);
+  }
+
+  end() {
+    this.close();
+    this.shown?.picture.close();
+    this.shown = null;
+  }
+}
+
+function described({ width, height, bytes, planes }, { sequence, captured }) {
+  const [{ offset, stride }] = planes;
+  const luma = new Uint8Array(width * height);
+  for (let row = 0; row < height; row++) {
+    const from = offset + row * stride;
+    luma.set(bytes.subarray(from, from + width), row * width);
+  }
+  return { width, height, sequence, captured, luma: base64(luma) };
+}
+
+function base64(bytes) {
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 0x8000) text += String.fromCharCode(...bytes.subarray(i, i + 0x8000));
+  return btoa(text);
+}

@@ -1,0 +1,26 @@
+/** Day or night: the operator's choice is kept, else the system's is followed. */
+
+import { publish } from "./store.js";
+
+const KEY = "tod-theme";
+const light = matchMedia("(prefers-color-scheme: light)");
+
+const chosen = () => localStorage.getItem(KEY);
+
+function show() {
+  const theme = chosen() ?? (light.matches ? "day" : "night");
+  document.documentElement.dataset.theme = theme;
+  document.getElementById("theme").textContent = theme === "day" ? "Night" : "Day";
+  publish("theme", theme);
+}
+
+export function toggleTheme() {
+  localStorage.setItem(KEY, document.documentElement.dataset.theme === "day" ? "night" : "day");
+  show();
+}
+
+export function startTheme() {
+  light.addEventListener("change", show);
+  document.getElementById("theme").addEventListener("click", toggleTheme);
+  show();
+}

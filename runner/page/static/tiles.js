@@ -1,0 +1,198 @@
+/** The tiles: one per camera, with its status, its picture and what is known of its stream. */
+
+import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { giveCanvas, tellSize } from "./link.js";
+import { pending, request, whyNoControl } from "./requests.js";
+import { dragRegion } from "./roi.js";
+import { heightsOf, rowsOf } from "./layout.js";
+import { colourOf } from "./colours.js";
+import { factor, make, mark, size, spoken, whole, write } from "./format.js";
+
+export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌" };
+const SHORT = { synchronising: "SYNC" }; // the picture has the whole word
+const ALARMS = ["late", "frozen", "lost"];
+const THIN = "\u2009"; // space
+const CHROME = 66; // header and caption of a tile, as in the style sheet
+
+const { canShowVideo } = globalThis.boot;
+const area = document.getElementById("tiles");
+const tiles = new Map();
+let rows = [];
+let described = "";
+let hinted = false; // how to come back from an enlarged picture
+
+const sizes = new ResizeObserver((entries) => {
+  for (const { target } of entries) tellSize(target.dataset.name, target.clientWidth, target.clientHeight);
+});
+
+// --- building ---------------------------------------------------------------------------------------------------------
+
+function build({ cameras }) {
+  const text = JSON.stringify(cameras);
+  if (text === described) return;
+  described = text;
+  sizes.disconnect();
+  tiles.clear();
+  rows = rowsOf(cameras);
+  area.replaceChildren(...rows.map((row) => make("div", { class: "row" }, ...row.map(({ camera }) => tile(camera)))));
+  lay();
+  refreshAll();
+}
+
+function sayNoVideo() {
+  const text = "Video needs a browser with WebCodecs: Chromium, Chrome or Edge 94 or newer, on localhost or over TLS.";
+  area.before(make("p", { class: "no-video", role: "alert" }, text));
+}
+
+function tile({ name }) {
+  const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${spoken(name)}` });
+  const parts = {
+    swatch: make("span", { class: "swatch", "aria-hidden": "true" }),
+    status: make("span", { class: "status" }),
+    on: make("button", { class: "switch", role: "switch", tabindex: "0", onclick: () => switchCamera(name) }),
+    box: make("div", { class: "picture", "data-name": name }, canvas),
+    rates: make("span", { class: "rates" }),
+    form: make("span", { class: "form" }),
+  };
+  const reason = make("div", { class: "reason", role: "tooltip" });
+  parts.box.append(reason);
+  if (!canShowVideo) parts.box.append(make("p", { class: "no-picture" }, "no video in this browser"));
+  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.status, parts.on);
+  const foot = make("div", { class: "caption" }, parts.rates, parts.form);
+  const element = make(
+    "article",
+    { class: "tile", "data-camera": name, "data-status": "synchronising", tabindex: "0", "aria-label": `camera ${spoken(name)}`,
+      onclick: () => select(name), onfocus: () => select(name) },
+    head, parts.box, foot,
+  );
+  parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
+  parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
+  tiles.set(name, { element, reason, ...parts });
+  giveCanvas(name, canvas);
+  dragRegion(name, parts.box);
+  sizes.observe(parts.box);
+  return element;
+}
+
+/** Ask to switch a camera on or off: the other of what the vehicle says. */
+export function switchCamera(name) {
+  const on = !decided(name)?.on;
+  request(`on:${name}`, { event: "camera_switched", camera: name, on }, `${name} ${on ? "on" : "off"}`);
+}
+
+// --- layout -----------------------------------------------------------------------------------------------------------
+
+function lay() {
+  const scene = area.parentElement;
+  const heights = heightsOf(rows, area.clientWidth, area.clientHeight, CHROME);
+  for (const [i, row] of rows.entries()) {
+    for (const { camera: { name, width, height } } of row) {
+      const { box, element } = tiles.get(name);
+      const wide = Math.floor((heights[i] * width) / height);
+      element.style.width = `${wide}px`;
+      box.style.height = `${heights[i]}px`;
+    }
+  }
+  layEnlarged(scene);
+}
+
+function layEnlarged(scene) {
+  for (const [name, { element, box }] of tiles) {
+    const large = store.enlarged === name;
+    element.classList.toggle("enlarged", large);
+    if (!large) continue;
+    element.style.width = "";
+    box.style.height = `${scene.clientHeight - CHROME}px`;
+  }
+  area.classList.toggle("has-enlarged", store.enlarged !== null);
+}
+
+// --- what is shown ----------------------------------------------------------------------------------------------------
+
+function refreshAll() {
+  for (const [i, { name }] of (store.hello?.cameras ?? []).entries()) refresh(name, i);
+}
+
+function refresh(name, index) {
+  const part = tiles.get(name);
+  if (!part) return;
+  part.swatch.style.background = colourOf(index);
+  part.element.classList.toggle("selected", store.selected === name);
+  mark(part.element, "aria-current", store.selected === name ? "true" : null);
+  refreshStatus(name, part);
+  refreshSwitch(name, part);
+  refreshCaption(name, part);
+}
+
+function refreshStatus(name, { element, status }) {
+  const word = store.status[name] ?? "synchronising";
+  mark(element, "data-status", word);
+  write(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
+}
+
+function refreshSwitch(name, { on }) {
+  const asked = pending(`on:${name}`);
+  const now = decided(name);
+  mark(on, "aria-checked", now?.on === true);
+  mark(on, "aria-label", `${spoken(name)} on`);
+  mark(on, "data-pending", asked ? "" : null);
+  on.disabled = !inControl() || !now;
+  write(on, asked ? (asked.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
+  mark(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is not there") : "switch this camera on or off (o)");
+}
+
+function refreshCaption(name, { rates, form, reason }) {
+  const sample = store.sample?.cameras[name];
+  const now = decided(name);
+  const age = store.ages[name]?.age_ms ?? sample?.latency_ms;
+  const differs = now ? unapplied(now) : [];
+  const bitrate = differs.includes("bitrate") || differs.includes("sending");
+  const region = differs.includes("size") || differs.includes("ROI");
+  const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
+  const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
+  caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
+  caption(form, region, `${shape} · ${whole(age)} ms`, "received size · scaling factor · capture to drawing");
+  write(reason, now?.reason ?? "");
+}
+
+/** One line of a caption; marked where what is decided was not yet read back. */
+function caption(element, differs, text, title) {
+  write(element, differs ? `◌ ${text}` : text);
+  mark(element, "data-differs", differs ? "" : null);
+  mark(element, "title", differs ? `pending: decided, not yet read back; ${title}` : title);
+}
+
+/** What is decided and was not yet read back from the elements. */
+export function unapplied({ on, sending, roi, width, height, kbps, applied }) {
+  const found = [];
+  if (applied.sending !== undefined && applied.sending !== sending) found.push("sending");
+  if (!on || !sending) return found;
+  if (applied.bitrate !== undefined && applied.bitrate !== kbps) found.push("bitrate");
+  const { size: is, roi: seen } = applied;
+  if (is && (is.width !== width || is.height !== height)) found.push("size");
+  if (seen && ["x", "y", "width", "height"].some((key) => seen[key] !== roi[key])) found.push("ROI");
+  return found;
+}
+
+function announce({ camera: name, status }) {
+  const part = tiles.get(name);
+  if (!part) return;
+  refreshStatus(name, part);
+  if (ALARMS.includes(status)) write(document.getElementById("announcer"), `${spoken(name)} ${status}`);
+}
+
+export function startTiles() {
+  listen("hello", build);
+  listen("state sample requests control socket theme selected", refreshAll);
+  listen("status", announce);
+  listen("enlarged", (name) => {
+    lay();
+    if (name && !hinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });
+    hinted = true;
+  });
+  if (!canShowVideo) sayNoVideo();
+  new ResizeObserver(lay).observe(area.parentElement);
+}
+
+/** Move the focus to the tile of a camera. */
+export const focusTile = (name) => tiles.get(name)?.element.focus({ preventScroll: true });

@@ -1,0 +1,41 @@
+/** The total bitrate: where it comes from in each mode, and the operator's slider for mode C. */
+
+import { inControl, listen, mode, store } from "./store.js";
+import { request, whyNoControl } from "./requests.js";
+import { makeSlider } from "./slider.js";
+import { make, write, whole } from "./format.js";
+
+const WHY = {
+  single: "sum of the bitrates set in mode S; choose C to set it",
+  automatic: "set by the prediction in mode A; choose C to set it",
+};
+
+const figure = make("b", { class: "large" });
+const prediction = make("b", { class: "large" });
+const why = make("p", { class: "why" });
+const slider = makeSlider({
+  label: "total bitrate",
+  data: "total",
+  id: "total-kbps",
+  control: () => "total",
+  send: (kbps) => request("total", { event: "total_set", kbps }, `total ${kbps} kbit/s`),
+});
+
+function refresh() {
+  const now = mode();
+  const most = (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
+  const total = now ? store.state.total_kbps : undefined;
+  const reason = !now ? "the vehicle is not there" : WHY[now] ?? (inControl() ? null : whyNoControl());
+  write(figure, whole(total));
+  write(prediction, whole(store.sample?.predicted_kbps));
+  write(why, reason ?? "shared among the cameras by demand and weight");
+  slider.update({ value: total, max: most, why: reason });
+}
+
+export function startTotal() {
+  const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
+  const inForce = make("div", {}, make("span", {}, "Total "), figure, make("span", { class: "muted" }, " kbit/s"));
+  document.getElementById("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
+  listen("hello state sample control requests socket", refresh);
+  refresh();
+}

@@ -1,0 +1,172 @@
+/**
+ * The worker: it holds the WebSocket and all video, so that neither charts nor dialogs of the page delay a picture.
+ * Text messages of the station go on to the page as they are; pictures go to the canvases the page has handed over.
+ */
+
+import { Clock, now } from "./clock.js";
+import { hasGpu } from "./picture.js";
+import { Stream } from "./stream.js";
+// Named here, though used further down, so that all modules are fetched at once.
+import "./h264.js";
+import "./overlay.js";
+import "./status.js";
+import "./yuv.js";
+
+const WATCH_MS = 15;
+const RECONNECT_MS = 500;
+const TELL_MS = 250;
+const HEADER = 24;
+
+const station = {
+  clock: new Clock(),
+  limits: { late_ms: 200, frozen_ms: 120 },
+  connected: false,
+  online: true,
+  video: true,
+  resync: (name) => send({ resync: name }),
+  wake,
+};
+let settings = null; // of the page: {url, origin, video}
+let socket = null;
+let streams = []; // in the order of hello, which the binary messages count in
+let described = "";
+let asleep = true;
+let watched = now();
+const log = [];
+
+const tell = (message) => postMessage(message);
+const find = (name) => streams.find((stream) => stream.name === name);
+
+// --- the socket -------------------------------------------------------------------------------------------------------
+
+function connect() {
+  socket = new WebSocket(settings.url);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => (typeof data === "string" ? heard(JSON.parse(data)) : unit(data));
+  socket.onclose = () => {
+    connection(false);
+    setTimeout(connect, RECONNECT_MS);
+  };
+}
+
+function connection(open) {
+  if (station.connected === open) return;
+  station.connected = open;
+  tell({ kind: "socket", open });
+}
+
+function send(message) {
+  if (socket?.readyState !== WebSocket.OPEN) return false;
+  socket.send(JSON.stringify(message));
+  return true;
+}
+
+function heard(message) {
+  if (message.kind === "clock") return station.clock.heard(message.page_ms, message.server_ms);
+  if (message.kind === "hello") hello(message);
+  if (message.kind === "state") decided(message);
+  tell({ kind: "server", message });
+}
+
+function hello(message) {
+  station.limits = { late_ms: message.late_ms, frozen_ms: message.frozen_ms };
+  const text = JSON.stringify(message.cameras);
+  if (text !== described) {
+    streams.forEach((stream) => stream.end());
+    streams = message.cameras.map((camera) => new Stream(camera, station));
+    described = text;
+  }
+  streams.forEach((stream) => stream.started());
+  connection(true);
+  send({ clock: now() });
+}
+
+function decided(message) {
+  if (message.online && !station.online) streams.forEach((stream) => stream.started());
+  station.online = message.online;
+  for (const stream of streams) if (message.cameras?.[stream.name]) stream.decide(message.cameras[stream.name]);
+}
+
+function unit(buffer) {
+  const view = new DataView(buffer);
+  streams[view.getUint8(0)]?.receive({
+    flags: view.getUint8(1),
+    sequence: view.getUint32(4, true),
+    captured: view.getFloat64(8, true),
+    arrived: view.getFloat64(16, true),
+    data: new Uint8Array(buffer, HEADER),
+  });
+}
+
+// --- drawing and watching ---------------------------------------------------------------------------------------------
+
+function wake() {
+  if (!asleep) return;
+  asleep = false;
+  requestAnimationFrame(() => {
+    asleep = true;
+    for (const stream of streams) stream.draw();
+  });
+}
+
+function watch() {
+  const late = now() - watched > 3 * WATCH_MS;
+  watched = now();
+  // After a stall the units that came meanwhile are still in the queue: let them in before judging, at the next tick.
+  if (!late) judgeAll();
+}
+
+function judgeAll() {
+  for (const stream of streams) {
+    if (!stream.watch()) continue;
+    log.push([now(), stream.name, stream.status]);
+    if (log.length > 200) log.shift();
+    tell({ kind: "status", camera: stream.name, status: stream.status });
+  }
+}
+
+/** What the page shows of the drawing: the median age of the last pictures. */
+function tellAges() {
+  const ages = {};
+  for (const { name, stages, status } of streams) {
+    const last = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured).sort((a, b) => a - b);
+    ages[name] = { age_ms: last.length ? last[last.length >> 1] : null, status };
+  }
+  tell({ kind: "ages", ages });
+}
+
+// --- the page ---------------------------------------------------------------------------------------------------------
+
+const orders = {
+  start(message) {
+    settings = message;
+    station.keep = message.keep;
+    station.video = message.video && typeof VideoDecoder !== "undefined";
+    connect();
+    setInterval(watch, WATCH_MS);
+    setInterval(tellAges, TELL_MS);
+    setInterval(() => send({ clock: now() }), 1000);
+  },
+  canvas: ({ name, canvas }) => find(name)?.attach(canvas),
+  size({ name, ...display }) {
+    const stream = find(name);
+    if (stream) Object.assign(stream, { display, painted: null });
+  },
+  send: ({ message }) => tell({ kind: "sent", id: message.id, sent: send(message) }),
+  async ask({ id, what, name }) {
+    const questions = { measure, stages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    tell({ kind: "answer", id, value: await questions[what]() });
+  },
+};
+
+/** Of each drawn picture: captured, arrived at the station, received here, decoded, drawn; ms on the station's clock. */
+function stages() {
+  return Object.fromEntries(streams.map(({ name, stages }) => [name, stages]));
+}
+
+function measure() {
+  const cameras = Object.fromEntries(streams.map((stream) => [stream.name, stream.measure(settings.origin)]));
+  return { cameras, status_log: log, gpu: hasGpu, clock_offset_ms: station.clock.offset };
+}
+
+onmessage = ({ data }) => orders[data.order](data);

@@ -1,0 +1,85 @@
+/** Pixels of a frame (I420 or NV12, as decoders give them) to RGBA, without asking anything of the browser. */
+
+const SHIFT = 14;
+const BELOW = 512; // how far a sum may leave 0..255 on either side
+const OPAQUE = 0xff << 24;
+const CLAMP = Uint8Array.from({ length: 256 + 2 * BELOW }, (_, i) => Math.min(255, Math.max(0, i - BELOW)));
+const LUMA = { bt709: [0.2126, 0.0722], smpte170m: [0.299, 0.114], bt470bg: [0.299, 0.114] }; // weights of red and blue
+const tables = new Map();
+
+/** Look-up tables of a colour space: one addition for each part of a pixel. */
+function tablesOf({ matrix, fullRange }) {
+  const key = `${matrix} ${fullRange}`;
+  if (!tables.has(key)) tables.set(key, makeTables(LUMA[matrix] ?? LUMA.smpte170m, fullRange));
+  return tables.get(key);
+}
+
+function makeTables([red, blue], full) {
+  const [black, span, chroma] = full ? [0, 255, 255] : [16, 219, 224];
+  const green = 1 - red - blue;
+  const table = (of) => Int32Array.from({ length: 256 }, (_, i) => Math.round(of(i) * (1 << SHIFT)));
+  const colour = (weight) => table((i) => (((i - 128) * 255) / chroma) * weight);
+  return {
+    y: table((i) => ((i - black) * 255) / span + BELOW + 0.5),
+    rv: colour(2 * (1 - red)),
+    gv: colour((-2 * (1 - red) * red) / green),
+    gu: colour((-2 * (1 - blue) * blue) / green),
+    bu: colour(2 * (1 - blue)),
+  };
+}
+
+/**
+ * @param {Uint8Array} bytes of all planes  @param {{offset, stride}[]} planes as VideoFrame.copyTo tells
+ * @param {"I420"|"NV12"} format  @param {{matrix, fullRange}} space
+ * @param {ImageData} image written to, of the frame's size, or of half of it each way
+ * @param {number} width of the frame
+ */
+export function toRgba(bytes, planes, format, space, image, width) {
+  const apart = format === "NV12" ? 2 : 1; // NV12 has U and V side by side
+  const [y, u] = planes;
+  const v = format === "NV12" ? { offset: u.offset + 1, stride: u.stride } : planes[2];
+  const out = new Int32Array(image.data.buffer);
+  const convert = image.width === width ? wholeRow : halfRow;
+  const across = image.width === width ? 1 : 2;
+  const tables = tablesOf(space);
+  for (let row = 0; row < image.height; row++) {
+    const chroma = across === 2 ? row : row >> 1;
+    const from = { y: y.offset + row * across * y.stride, below: y.stride, u: u.offset + chroma * u.stride, v: v.offset + chroma * v.stride };
+    convert(bytes, from, apart, tables, out, row * image.width, image.width);
+  }
+}
+
+/** One row of pixels; two of them share their colour. */
+function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
+  let { y: ys, u: us, v: vs } = from;
+  const end = to + width;
+  while (to < end) {
+    const cb = bytes[us];
+    const cr = bytes[vs];
+    const red = rv[cr];
+    const green = gv[cr] + gu[cb];
+    const blue = bu[cb];
+    us += apart;
+    vs += apart;
+    for (const stop = to + 2 < end ? to + 2 : end; to < stop; to++) {
+      const light = y[bytes[ys++]];
+      out[to] = OPAQUE | (CLAMP[(light + blue) >> SHIFT] << 16) | (CLAMP[(light + green) >> SHIFT] << 8) | CLAMP[(light + red) >> SHIFT];
+    }
+  }
+}
+
+/** One row of pixels, each the mean of four, which have one colour anyway. */
+function halfRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
+  let { y: ys, u: us, v: vs } = from;
+  let low = ys + from.below;
+  for (const end = to + width; to < end; to++) {
+    const light = y[(bytes[ys] + bytes[ys + 1] + bytes[low] + bytes[low + 1] + 2) >> 2];
+    const cb = bytes[us];
+    const cr = bytes[vs];
+    ys += 2;
+    low += 2;
+    us += apart;
+    vs += apart;
+    out[to] = OPAQUE | (CLAMP[(light + bu[cb]) >> SHIFT] << 16) | (CLAMP[(light + gv[cr] + gu[cb]) >> SHIFT] << 8) | CLAMP[(light + rv[cr]) >> SHIFT];
+  }
+}

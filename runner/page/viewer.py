@@ -1,0 +1,89 @@
+"""One browser that looks on: what waits to be sent to it, bounded whatever it does. No network here."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from runner.units import AccessUnit
+
+HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
+KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but do not draw; reset the decoder first
+WAITING_UNITS = 30  # of one camera; a viewer that is further behind starts again from the last IDR
+WAITING_TEXTS = 500
+
+Burst = Callable[[int], list[AccessUnit]]  # by camera index: what a decoder that starts now must get
+
+
+class Viewer:
+    """Queues of one viewer. Used from one thread.
+
+    burst  asked for what brings a late decoder up to date, when the viewer is ready to take it and not before
+    """
+
+    def __init__(self, cameras: int, burst: Burst) -> None:
+        self._burst = burst
+        self._texts: deque[str] = deque(maxlen=WAITING_TEXTS)
+        self._cameras = [_Waiting() for _ in range(cameras)]
+        self._turn = 0  # index of the camera whose turn it is
+        self._sequence = 0
+
+    def tell(self, kind: str, message: Mapping[str, Any]) -> None:
+        self._texts.append(json.dumps({"kind": kind, **message}))
+
+    def show(self, camera: int, unit: AccessUnit) -> None:
+        """A unit that has just come."""
+        waiting = self._cameras[camera]
+        if waiting.behind:
+            return  # it will be part of the burst
+        waiting.live.append(unit)
+        if len(waiting.live) > WAITING_UNITS:
+            self.restart(camera)
+
+    def restart(self, camera: int) -> None:
+        """Forget what waits; the next that is sent of this camera is a burst."""
+        self._cameras[camera] = _Waiting()
+
+    def pop(self) -> str | bytes | None:
+        """The next message to send, texts first, then the cameras in turn; None if there is nothing."""
+        if self._texts:
+            return self._texts.popleft()
+        for _ in self._cameras:
+            camera, self._turn = self._turn, (self._turn + 1) % len(self._cameras)
+            waiting = self._cameras[camera]
+            if waiting.behind:
+                self._catch_up(camera, waiting)
+            if waiting.burst:
+                return self._packed(camera, *waiting.burst.popleft())
+            if waiting.live:
+                unit = waiting.live.popleft()
+                return self._packed(camera, 0, unit)
+        return None
+
+    def _catch_up(self, camera: int, waiting: _Waiting) -> None:
+        units = self._burst(camera)
+        waiting.behind = not units
+        last = len(units) - 1
+        for number, unit in enumerate(units):
+            flags = (RESTART if number == 0 else 0) | (CATCH_UP if number < last else 0)
+            waiting.burst.append((flags, unit))
+
+    def _packed(self, camera: int, flags: int, unit: AccessUnit) -> bytes:
+        self._sequence = (self._sequence + 1) % 2**32
+        flags |= (KEY if unit.key else 0) | (0 if unit.exact else CATCH_UP)
+        captured = math.nan if unit.captured is None else unit.captured * 1000
+        return HEADER.pack(camera, flags, 0, self._sequence, captured, unit.arrived * 1000) + unit.data
+
+
+@dataclass
+class _Waiting:
+    """Of one camera: whether it starts with a burst, what is left of that, and what came since."""
+
+    behind: bool = True
+    burst: deque[tuple[int, AccessUnit]] = field(default_factory=deque)
+    live: deque[AccessUnit] = field(default_factory=deque)
