@@ -19,6 +19,8 @@ test: $(READY)
 
 bench: $(READY)
 	$(BIN)/python bench/live.py
+	$(BIN)/python bench/link.py
+	$(BIN)/python bench/page.py
 	$(BIN)/python bench/replay.py
 	$(BIN)/python bench/pqos_map.py
 

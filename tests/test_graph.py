@@ -29,7 +29,8 @@ ENCODER = (
 )
 PAY = "identity name=sent ! rtph264pay name=pay0 pt=96 mtu=1200 config-interval=-1"
 DECODE = (
-    "rtph264depay name=depay ! identity name=received ! avdec_h264 name=decoder max-threads=1 ! "
+    "rtph264depay name=depay ! capsfilter name=units caps=video/x-h264,stream-format=byte-stream,alignment=au "
+    "! identity name=received ! avdec_h264 name=decoder max-threads=1 ! "
     "fakesink name=sink sync=false async=false enable-last-sample=false"
 )
 KNOBS: dict[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 1920, 1040), "size": (480, 260), "bitrate": 545}

@@ -17,6 +17,18 @@ SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "da
 CLIPS = sorted((SHARED / "video").glob("*")) if SHARED.is_dir() else []
 
 
+# No sandbox inside containers; no talk with hosts that a closed network refuses anyway.
+CHROMIUM_FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -24,12 +36,18 @@ def free_port() -> int:
         return port
 
 
-def until(done: Callable[[], Any], seconds: float = 15) -> Any:
+def answers(port: int) -> bool:
+    """Whether somebody listens there."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def until(done: Callable[[], Any], seconds: float = 15, every_s: float = 0.01) -> Any:
     """Wait for something to come to pass; the limit is far above what is normal."""
     end = time.monotonic() + seconds
     while not (seen := done()):
         assert time.monotonic() < end, "it did not come to pass"
-        time.sleep(0.01)
+        time.sleep(every_s)
     return seen
 
 
@@ -40,6 +58,20 @@ def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command, capture_output=True, text=True, timeout=120, check=False, env=environment, cwd=CHECKOUT, **options
     )
+
+
+@contextmanager
+def process(verb: str, *words: str, stdout: int = subprocess.PIPE) -> Iterator[subprocess.Popen[str]]:
+    """A verb in a process of its own, killed at the end."""
+    command = [sys.executable, "-m", "runner", verb, *words]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    with subprocess.Popen(
+        command, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
 
 
 @contextmanager

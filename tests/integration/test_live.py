@@ -3,36 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 import queue
 import signal
-import subprocess
-import sys
 import time
-from contextlib import contextmanager
 
 import pytest
 
-from rig import CHECKOUT, CLIPS, SHARED, free_port, run, until
+from rig import CLIPS, SHARED, free_port, process, run, until
 from runner.broker import private_broker
 from runner.control import Link
 from runner.errors import RunError
+from runner.frames import live_frames
 from runner.model import Endpoint
 
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
-
-
-@contextmanager
-def process(verb, *words):
-    command = [sys.executable, "-m", "runner", verb, *words]
-    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT
-    ) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000", "page.serve=false")
 
 
 NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'
@@ -84,10 +68,10 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
     assert state["mode"] == "automatic"
     assert set(state["cameras"]) == {"front", "rear", "mast"}
 
-    assert operator.ask("1", event="mode_selected", mode="collective")["accepted"]
-    assert operator.ask("2", event="total_set", kbps=2000)["accepted"]
+    assert operator.ask("1", event="mode_selected", mode="collective")["result"] == "applied"
+    assert operator.ask("2", event="total_set", kbps=2000)["result"] == "applied"
     assert operator.state(lambda state: state["total_kbps"] == 2000)["cameras"]["mast"]["kbps"] == 416
-    assert operator.ask("3", event="camera_switched", camera="rear", on=False)["accepted"]
+    assert operator.ask("3", event="camera_switched", camera="rear", on=False)["result"] == "applied"
     assert not operator.state(lambda state: not state["cameras"]["rear"]["on"])["cameras"]["rear"]["sending"]
 
     refused = {
@@ -102,11 +86,11 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
     }
     for identity, (event, reason) in refused.items():
         reply = operator.ask(identity, **event)
-        assert (reply["accepted"], reply["reason"]) == (False, reason)
+        assert (reply["result"], reply["reason"]) == ("refused", reason)
 
     for payload in (b"", b"{", b"[1]", b"x" * 100_000, b'{"event": "total_set", "kbps": 1}', b"\xff\xfe", NAN, HUGE):
         operator.link._client.publish("tod/delivery_robot/request", payload, qos=1)
-    assert operator.ask("9", event="total_set", kbps=1500)["accepted"]  # it lives
+    assert operator.ask("9", event="total_set", kbps=1500)["result"] == "applied"  # it lives
     assert vehicle.poll() is None
 
     vehicle.send_signal(signal.SIGTERM)
@@ -115,6 +99,46 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()]
     assert [line["kbps"] for line in lines if line.get("event") == "total_set"] == [2000, 1500]
     assert [line["t"] for line in lines] == sorted(line["t"] for line in lines)
+
+
+def test_the_state_says_what_is_applied_and_a_late_listener_hears_it(broker, vehicle):
+    operator = Operator(broker)
+    state = operator.state(lambda state: state["online"])
+    assert {name: camera["applied"] for name, camera in state["cameras"].items()} == {
+        "front": {},
+        "rear": {},
+        "mast": {},
+    }
+    said = operator.ask("1", event="mode_selected", mode="collective")
+    assert (said["result"], said["reason"]) == ("applied", "")
+    said = operator.ask("2", event="total_set", kbps=1200)
+    assert said["reason"] == "nobody watches front, rear, mast: kept until somebody does"
+
+    media = f"media.port={vehicle.args[-2].partition('=')[2]}"
+    with live_frames([*ROBOT, media], cameras=["rear"]) as frames:
+        frames.next(15)
+        rear = operator.state(lambda state: state["cameras"]["rear"]["applied"])["cameras"]["rear"]
+        assert rear["applied"]["bitrate"] == rear["kbps"]
+        assert rear["applied"]["size"] == {"width": rear["width"], "height": rear["height"]}
+        assert (
+            operator.ask("3", event="total_set", kbps=900)["reason"]
+            == "nobody watches front, mast: kept until somebody does"
+        )
+        rear = operator.state(lambda state: state["total_kbps"] == 900)["cameras"]["rear"]
+        late = Operator(broker).state(lambda state: state["online"])
+        assert late["cameras"]["rear"]["applied"]["bitrate"] == rear["kbps"]
+        assert until(lambda: operator.telemetry)[-1]["predicted_kbps"] == 3000
+
+
+def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
+    operator = Operator(broker)
+    operator.state(lambda state: state["online"])
+    assert operator.ask("1", event="operator_connected")["result"] == "applied"
+    # No goodbye and no last will: after 3 s of silence sending is stopped, 5 s later, by the rule of modes=safe.
+    state = operator.state(lambda state: not any(camera["sending"] for camera in state["cameras"].values()))
+    assert "operator" in state["cameras"]["front"]["reason"]
+    assert operator.ask("2", event="operator_connected")["result"] == "applied"
+    operator.state(lambda state: all(camera["sending"] for camera in state["cameras"].values()))
 
 
 def test_a_killed_vehicle_is_told_by_its_last_will(broker, vehicle):
@@ -166,7 +190,13 @@ def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp", "h264_srt"])
 def test_the_demo_runs_over_every_transport(graph, tmp_path):
-    words = (*ROBOT[:2], f"graph={graph}", f"media.port={free_port()}", f"control.port={free_port()}")
+    words = (
+        *ROBOT[:2],
+        "page.serve=false",
+        f"graph={graph}",
+        f"media.port={free_port()}",
+        f"control.port={free_port()}",
+    )
     done = run("demo", *words, "duration_s=8", f"log={tmp_path}")
     assert done.returncode == 0, done.stderr
     for line in done.stdout[done.stdout.rindex("received") :].splitlines():
@@ -179,6 +209,7 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
 @pytest.mark.skipif(not CLIPS, reason="needs the recorded clips")
 def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     words = (
+        "page.serve=false",
         "source=file",
         f"source.clip={SHARED / 'video' / 'forward_highway_day_540p25_A.mp4'}",
         f"pqos.file={SHARED / 'traces' / 'raw' / 'tum_bandwidth_map.yaml'}",

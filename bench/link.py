@@ -1,0 +1,48 @@
+"""What the control link adds on loopback: half the time from a request to its answer, through a real broker.
+
+python bench/link.py
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import socket
+import time
+
+from runner.broker import private_broker
+from runner.control import OFFLINE, OPERATOR_GONE, Link
+from runner.model import Endpoint
+from runner.telemetry import middle, percentile
+
+ROUNDS = 1000
+
+
+def main() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        broker = Endpoint("127.0.0.1", probe.getsockname()[1])
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    with private_broker(broker):
+
+        def answer(asked: bytes) -> None:
+            vehicle.publish("reply", {"id": json.loads(asked)["id"], "result": "applied", "reason": ""})
+
+        vehicle = Link("bench", broker, ("state", OFFLINE), {"request": answer}, lambda here: None)
+        operator = Link("bench", broker, ("request", OPERATOR_GONE), {"reply": answers.put}, lambda here: None)
+        vehicle.connect()
+        operator.connect()
+        waits = []
+        for number in range(ROUNDS):
+            began = time.perf_counter()
+            operator.publish("request", {"id": str(number), "event": "total_set", "kbps": 4000})
+            answers.get(timeout=5)
+            waits.append(1000 * (time.perf_counter() - began) / 2)
+            time.sleep(0.002)
+        operator.close("request", OPERATOR_GONE)
+        vehicle.close("state", OFFLINE)
+    print(f"control link, one way: median {middle(waits):.2f} ms, p95 {percentile(waits, 0.95):.2f} ms ({ROUNDS})")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""From source to screen: what a frame costs on its way into the browser, by stage, and whether eight tiles keep up.
+
+  python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, five pages each
+  python bench/page.py --seconds 60 --show  with a window instead of headless
+
+The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
+display's own delay is not in it. Needs chromium. Run it on an otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from playwright.sync_api import Browser, sync_playwright
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+from rig import CHROMIUM_FLAGS, answers, free_port, process, until
+from runner.broker import private_broker
+from runner.config import load
+from runner.model import Endpoint
+from runner.sources import render_missing
+from runner.telemetry import middle, percentile
+
+STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
+SETTLE_S = 5
+ROUNDS = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--show", action="store_true", help="a window instead of headless")
+    words = parser.parse_args()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), headless=not words.show, args=CHROMIUM_FLAGS
+        )
+        measure(browser, "one camera 960x540 at 30 Hz, 2500 kbit/s", 1, (960, 540, 30), 2500, words.seconds)
+        measure(browser, "eight cameras 640x360 at 15 Hz, 6000 kbit/s", 8, (640, 360, 15), 6000, words.seconds)
+        browser.close()
+
+
+def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float) -> None:
+    """Drive a vehicle of some equal cameras and look at its page."""
+    with tempfile.TemporaryDirectory() as directory:
+        words = _configuration(Path(directory), count, *form, kbps)
+        render_missing(load(words, Path(directory)), lambda *_: None)
+        with _station([*words, f"conf={directory}"]) as (url, operator):
+            rounds = [_round(browser, url, operator, seconds / ROUNDS) for _ in range(ROUNDS)]
+    print(f"\n{what}, {ROUNDS} times {seconds / ROUNDS:g} s")
+    cameras = [frames for one in rounds for frames in one.frames]
+    for number, stage in enumerate(STAGES):
+        _print(stage, [frame[number + 1] - frame[number] for frames in cameras for frame in frames])
+    _print("source to screen", [frame[-1] - frame[0] for frames in cameras for frame in frames])
+    _print("between two pictures", [later[-1] - sooner[-1] for frames in cameras for sooner, later in pairwise(frames)])
+    _print("page opened: all pictures drawn", [one.opened_ms for one in rounds])
+    rates = [rate for one in rounds for rate in one.rates]
+    print(f"  drawn at {min(rates):.1f} to {max(rates):.1f} of {form[2]} Hz", end="; ")
+    print(f"{sum(one.errors for one in rounds)} decoder errors", end="; ")
+    print(f"operator process {sum(one.cores for one in rounds) / ROUNDS:.2f} of a core")
+
+
+class Round(NamedTuple):
+    """One page, opened and looked at: frames by camera as times of each stage, ms."""
+
+    frames: list[list[list[float]]]
+    rates: list[float]
+    errors: int
+    opened_ms: float
+    cores: float
+
+
+def _round(browser: Browser, url: str, operator: int, seconds: float) -> Round:
+    """Open a page in a context of its own and look at it.
+
+    Cameras and screen keep their phase to each other as long as a page is open, so one page alone says little.
+    """
+    with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
+        page = context.new_page()
+        page.goto(url)
+        time.sleep(SETTLE_S)
+        before, began, used = page.evaluate("tod.measure()")["cameras"], time.time(), _cpu_s(operator)
+        time.sleep(seconds)
+        after, took = page.evaluate("tod.measure()")["cameras"], time.time() - began
+        cores = (_cpu_s(operator) - used) / took
+        stages = page.evaluate("tod.stages()").values()
+    # The first frames of a stream carry no capture time.
+    frames = [[f for f in camera if f[-1] > began * 1000 and math.isfinite(f[0])] for camera in stages]
+    rates = [(after[name]["drawn"] - before[name]["drawn"]) / took for name in after]
+    opened = max(float(camera["first_drawn_ms"] or "inf") for camera in after.values())
+    return Round(frames, rates, sum(camera["errors"] for camera in after.values()), opened, cores)
+
+
+def _print(what: str, values: list[float]) -> None:
+    shares = (middle(values), percentile(values, 0.95), percentile(values, 0.99), max(values))
+    figures = "  ".join(
+        f"{name} {value:6.1f}" for name, value in zip(("median", "p95", "p99", "max"), shares, strict=True)
+    )
+    print(f"  {what:37} {figures} ms  ({len(values)})")
+
+
+def _configuration(directory: Path, count: int, width: int, height: int, fps: int, kbps: int) -> list[str]:
+    """A vehicle of equal cameras in a conf directory of its own; the overrides that choose it."""
+    (directory / "cameras").mkdir()
+    (directory / "vehicle").mkdir()
+    model = f"{{scaling: [1.0], b_min_kbps: [0], b_full_kbps: {kbps}}}"
+    camera = f"width_px: {width}\nheight_px: {height}\nfps: {fps}\nrate_quality: {model}\n"
+    (directory / "cameras" / "equal.yaml").write_text(camera)
+    names = [f"camera_{number}" for number in range(count)]
+    mounts = "".join(f"  - /cameras@cameras.{name}: equal\n" for name in names)
+    mounted = []
+    for n, name in enumerate(names):
+        place = f"{{row: {n // 3}, column: {n % 3}}}"
+        pose = f"{{x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: {n * 360 // count}}}"
+        mounted.append(f"  {name}: {{place: {place}, pose: {pose}}}\n")
+    vehicle = f"# @package _global_\ndefaults:\n{mounts}  - _self_\nname: bench\ncameras:\n{''.join(mounted)}"
+    (directory / "vehicle" / "bench.yaml").write_text(vehicle)
+    return ["vehicle=bench", "source=synthetic", "pqos=constant", f"pqos.kbps={kbps}"]
+
+
+@contextmanager
+def _station(words: Sequence[str]) -> Iterator[tuple[str, int]]:
+    """Both sides as processes, as the demo runs them. Yields the page's address and the operator's process."""
+    media, control, page = (free_port() for _ in range(3))
+    own = [*words, f"media.port={media}", f"control.port={control}", f"page.port={page}"]
+    with (
+        private_broker(Endpoint("127.0.0.1", control)),
+        process("vehicle", *own, stdout=subprocess.DEVNULL),
+        process("operator", *own, stdout=subprocess.DEVNULL) as operator,
+    ):
+        until(lambda: answers(page), seconds=20)
+        yield f"http://127.0.0.1:{page}/", operator.pid
+
+
+def _cpu_s(process: int) -> float:
+    """Processor time that a process has used so far, s (proc(5))."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Decoded pictures for programs, from a real vehicle."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from rig import streaming, until
+from runner.commands import Command
+from runner.errors import UserError
+from runner.frames import live_frames
+
+pytestmark = pytest.mark.gst
+
+
+@pytest.fixture
+def robot():
+    with streaming("vehicle=delivery_robot", "fps_max=15", cameras=()) as (side, vehicle, _, _):
+        side.turn(
+            [Command(name, *knob) for name in vehicle.cameras for knob in (("size", (450, 260)), ("bitrate", 900))]
+        )
+        yield (
+            side,
+            [
+                "vehicle=delivery_robot",
+                "fps_max=15",
+                f"media.port={vehicle.media.port}",
+            ],
+        )
+
+
+def test_pictures_come_with_name_capture_time_and_true_colours(robot):
+    _, overrides = robot
+    seen = {}
+    with live_frames(overrides) as frames:
+        until(lambda: (frame := frames.next()) and seen.update({frame.camera: frame}) is None and len(seen) == 3)
+        later = next(frame for frame in frames if frame.camera == "front")
+    for frame in seen.values():
+        assert frame.image.shape == (260, 450, 3)  # a width whose rows are padded
+        assert frame.image.dtype == np.uint8
+        assert 0 < time.time() - frame.captured < 15
+    # videotestsrc begins with bars in white and yellow, and ends with blue.
+    red, green, blue = later.image[60, 20].tolist()
+    assert min(red, green, blue) > 150
+    red, green, blue = later.image[60, 430].tolist()
+    assert blue > 150 > max(red, green)
+    assert later.captured > seen["front"].captured
+
+
+def test_a_slow_program_gets_the_newest_and_ends_when_it_is_closed(robot):
+    _, overrides = robot
+    with live_frames(overrides, cameras=["rear"]) as frames:
+        first = until(frames.next)
+        time.sleep(1)
+        assert frames.next().captured - first.captured > 0.7
+        assert first.camera == "rear"
+    assert list(frames) == []
+
+
+def test_an_unknown_camera_is_told(robot):
+    _, overrides = robot
+    with (
+        pytest.raises(UserError, match=r"raer: unknown camera, did you mean rear\?"),
+        live_frames(overrides, cameras=["raer"]),
+    ):
+        pass

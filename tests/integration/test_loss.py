@@ -1,0 +1,52 @@
+"""Lost packets: no half picture reaches a viewer, whatever is lost."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import time
+
+import pytest
+
+from rig import streaming, until
+from runner.commands import Command
+from runner.gst import receiver
+
+pytestmark = pytest.mark.gst
+
+
+@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
+def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
+    from runner.apply import OperatorSide
+    from runner.gst import Gst
+
+    chance = random.Random(1)
+
+    class Lossy(receiver.Receiver):
+        def _on_element(self, pipeline, parent, element):
+            super()._on_element(pipeline, parent, element)
+            if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
+                element.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._lose)
+
+        def _lose(self, _pad, _info):
+            return Gst.PadProbeReturn.DROP if chance.random() < 0.01 else Gst.PadProbeReturn.OK
+
+    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+    units = []
+    overrides = (f"graph={graph}", "graph.retransmission_ms=0", "fps_max=15")  # what is lost stays lost
+    with streaming(*overrides) as (side, _, plans, _):
+        knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
+        side.turn([Command("front_left", *knob) for knob in knobs.items()])
+        operator = OperatorSide(plans, lambda *_: None, lambda camera, unit: units.append(unit))
+        try:
+            until(lambda: operator.sample({"front_left": True})["front_left"].lost > 20, seconds=40)
+            time.sleep(1)
+            received = operator.sample({"front_left": True})["front_left"]
+        finally:
+            operator.stop()
+    assert 0 < received.frames - len(units) < received.frames / 2
+    command = ["ffmpeg", "-v", "warning", "-threads", "1", "-err_detect", "explode", "-f", "h264", "-i", "-"]
+    data = b"".join(unit.data for unit in units)
+    said = subprocess.run([*command, "-f", "null", "-"], input=data, capture_output=True, check=False).stderr.decode()
+    assert "error while decoding" not in said
+    assert "concealing" not in said

@@ -1,0 +1,139 @@
+"""Access units: where a decoder can start, and what one that comes late is given."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runner.units import AccessUnit, Recent, read_unit
+
+AUD, SPS, PPS, SEI, IDR, SLICE = (bytes([0, 0, 0, 1, kind]) for kind in (0x09, 0x67, 0x68, 0x06, 0x65, 0x41))
+
+
+@pytest.mark.parametrize(
+    ("data", "anew"),
+    [
+        (AUD + SPS + PPS + IDR + b"\x88", True),
+        (AUD + SPS + PPS + SEI + SLICE + b"\x9a", False),  # a refresh wave begins: parameter sets, but no IDR
+        (SLICE + b"\x9a", False),
+        (b"\0\0\1\x65\x88", True),  # short start code
+        (b"\0\0\0\1\x25\x88", True),  # nal_ref_idc 1
+    ],
+)
+def test_only_an_idr_starts_anew(data, anew):
+    assert read_unit(data, None, 0).key is anew
+
+
+@pytest.mark.parametrize("data", [AUD + SPS, AUD, b"", b"\0\0\1"])
+def test_what_holds_no_picture_is_of_no_use(data):
+    assert read_unit(data, None, 0) is None
+
+
+def test_half_a_picture_is_left_out_and_half_an_idr_picture_becomes_a_grey_one():
+    sps = b"\0\0\0\1" + bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+    assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
+    assert read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None  # without parameter set nothing can be made
+    grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
+    assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
+    assert read_unit(grey.data, None, 0).key
+    recent = Recent(refresh_s=1.0)
+    shown = [recent.add(grey), *(recent.add(unit(2.5 + tenth / 10)) for tenth in range(1, 30))]
+    assert [u.arrived for u in shown if u.exact] == [2.5 + tenth / 10 for tenth in range(20, 30)]
+
+
+@pytest.mark.parametrize(
+    ("message", "frames"),
+    [
+        ("0601c0", 0),  # recovery point, ue(0)
+        ("06029a60", 0),
+        ("0602098080", 18),
+        ("05100102030405060708", None),  # user data
+    ],
+)
+def test_a_recovery_point_states_its_frames(message, frames):
+    unit = read_unit(AUD + SPS + PPS + b"\0\0\0\1\x06" + bytes.fromhex(message) + SLICE + b"\x9a", None, 0)
+    assert (unit.key, unit.recovery) == (False, frames)
+
+
+def unit(arrived, key=False, recovery=None):
+    return AccessUnit(b"", None, arrived, key, recovery)
+
+
+def test_a_late_decoder_gets_the_idr_and_two_refresh_periods():
+    recent = Recent(refresh_s=1.0)
+    recent.add(unit(-1))  # nothing can be done with what came before the first IDR
+    assert recent.burst() == []
+    recent.add(unit(0, key=True))
+    for tenth in range(1, 101):
+        recent.add(unit(tenth / 10))
+    first, *rest = recent.burst()
+    assert first.key
+    assert [u.arrived for u in rest] == [tenth / 10 for tenth in range(80, 101)]
+
+
+def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods():
+    sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")  # x264, 480x260
+    recent = Recent(refresh_s=1.0)
+    shown = [recent.add(unit(0))]  # no parameter sets yet
+    shown.append(recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, 0.1, 0.1, key=False)))
+    shown += [recent.add(unit(tenth / 10)) for tenth in range(2, 30)]
+    assert [u.arrived for u in shown if u.exact] == [tenth / 10 for tenth in range(21, 30)]
+    first, second, *_ = recent.burst()
+    assert (first.key, first.exact, read_unit(first.data, None, 0).key) == (True, False, True)
+    assert second.arrived == 0.9  # of the burst only what is needed for the newest
+    assert recent.add(unit(3, key=True)).exact
+    assert recent.add(unit(3.1)).exact
+
+
+def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
+    recent = Recent(refresh_s=1.0)
+    recent.add(unit(0, key=True))
+    for tenth in range(1, 58):
+        recent.add(unit(tenth / 10, recovery=9 if tenth % 10 == 0 else None))
+    _, *rest = recent.burst()
+    assert [u.arrived for u in rest] == [tenth / 10 for tenth in range(40, 58)]  # that of 5.0 still runs
+    recent.add(unit(5.8))
+    recent.add(unit(5.9))
+    assert recent.burst()[1].arrived == 5.0
+
+
+def test_a_grey_start_is_exact_when_the_first_whole_wave_has_run():
+    recent = Recent(refresh_s=1.0)
+    sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+    shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False))]
+    shown += [recent.add(unit(tenth / 10, recovery=4 if tenth == 3 else None)) for tenth in range(1, 12)]
+    assert [u.arrived for u in shown if u.exact] == [0.7, 0.8, 0.9, 1.0, 1.1]
+
+
+def test_a_grey_start_may_itself_be_the_beginning_of_the_wave():
+    recent = Recent(refresh_s=1.0)
+    sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+    shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False, recovery=4))]
+    shown += [recent.add(unit(tenth / 10)) for tenth in range(1, 8)]
+    assert [u.arrived for u in shown if u.exact] == [0.4, 0.5, 0.6, 0.7]
+
+
+def test_a_new_idr_makes_everything_before_it_needless():
+    recent = Recent(refresh_s=1.0)
+    for arrived, key in ((0, True), (0.1, False), (0.2, True), (0.3, False)):
+        recent.add(unit(arrived, key))
+    assert [u.arrived for u in recent.burst()] == [0.2, 0.3]
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 0.5), st.booleans()), max_size=200), st.floats(0.1, 2))
+def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, refresh_s):
+    recent, now, everything = Recent(refresh_s), 0.0, []
+    for step, key in steps:
+        now += step
+        everything.append(recent.add(unit(now, key)))
+    burst = recent.burst()
+    assert bool(burst) == any(u.key for u in everything)
+    if burst:
+        assert burst[0].key
+        assert burst[-1] is everything[-1]
+        assert not any(u.key for u in burst[1:])
+        assert all(u.arrived >= now - 2 * refresh_s for u in burst[1:])
+        # Nothing is missing but what lies between the IDR and the last two periods.
+        since = everything[everything.index(burst[0]) + 1 :]
+        assert burst[1:] == [u for u in since if u.arrived >= now - 2 * refresh_s]
