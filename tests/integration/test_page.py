@@ -112,7 +112,7 @@ def measure(page):
 
 def all_live(page, seconds=30):
     """Every camera has been live; on a busy machine hardly ever all at the very same moment."""
-    waiting = set(measure(page))
+    waiting = set(until(lambda: measure(page)))  # empty until the station has introduced the vehicle
 
     def seen():
         waiting.difference_update(name for name, camera in measure(page).items() if camera["status"] == "live")
@@ -227,7 +227,7 @@ def test_collective_the_slider_changes_all(page):
     slider.focus()
     for _ in range(3):
         slider.press("PageDown")
-    state_when(page, lambda now: now["total_kbps"] < before["total_kbps"] - 500)
+    state_when(page, lambda now: now["total_kbps"] < before["total_kbps"] / 2)
     after = state_when(
         page, lambda now: now["total_kbps"] == page.evaluate("+document.querySelector('#total-kbps').value")
     )

@@ -7,6 +7,7 @@ import { pending } from "./requests.js";
 import { make, mark, whole, write } from "./format.js";
 
 const STEPS = 1000;
+const SPAN = 200; // the right end over the left end; rates below are set by number
 const SEND_EVERY_MS = 200;
 const HAND_MS = 400;
 
@@ -25,9 +26,9 @@ export function makeSlider({ label, data, id, send, control }) {
   let touched = -Infinity;
   let held = false;
 
-  // Quadratic, so that the low rates, where a little matters much, have room.
-  const toKbps = (step) => Math.max(1, Math.round(max * (step / STEPS) ** 2));
-  const toStep = (kbps) => Math.round(STEPS * Math.sqrt(Math.min(1, kbps / max)));
+  // Even steps are even ratios: a little matters much at low rates, and no key press goes from plenty to nothing.
+  const toKbps = (step) => Math.max(1, Math.round(max * SPAN ** (step / STEPS - 1)));
+  const toStep = (kbps) => Math.round(STEPS * Math.min(1, Math.max(0, 1 + Math.log(kbps / max) / Math.log(SPAN))));
 
   const wish = throttle(send, SEND_EVERY_MS);
   range.addEventListener("pointerdown", () => (held = true));
@@ -59,11 +60,11 @@ export function makeSlider({ label, data, id, send, control }) {
       const asked = pending(control());
       mark(element, "data-pending", asked ? "" : null);
       tick.hidden = !Number.isFinite(value);
-      tick.style.setProperty("--at", toStep(value ?? 0) / STEPS);
+      tick.style.setProperty("--at", toStep(value || 1) / STEPS);
       write(inForce, asked ? `◌ now ${whole(value)}` : `now ${whole(value)}`);
       mark(range, "aria-valuetext", `${toKbps(+range.value)} kbit/s, in force ${whole(value)}`);
       if (held || asked || performance.now() - touched < HAND_MS) return;
-      range.value = toStep(value ?? 0);
+      range.value = toStep(value || 1);
       if (!edited) number.value = Number.isFinite(value) ? Math.round(value) : "";
     },
   };
