@@ -32,7 +32,7 @@ def sent(viewer):
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
-    viewer = Viewer(1, lambda camera: [unit(0, key=True), unit(7), unit(8)])
+    viewer = Viewer("me", 1, lambda camera: [unit(0, key=True), unit(7), unit(8)])
     viewer.show(0, unit(8))  # part of the burst already
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, CATCH_UP, 7), (0, 0, 8)]
     viewer.show(0, unit(9))
@@ -42,21 +42,21 @@ def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
 
 def test_a_burst_of_one_is_drawn_and_none_is_waited_for():
     come = []
-    viewer = Viewer(1, lambda camera: come)
+    viewer = Viewer("me", 1, lambda camera: come)
     assert sent(viewer) == []
     come.append(unit(0, key=True))
     assert sent(viewer) == [(0, KEY | RESTART, 0)]
 
 
 def test_texts_go_first_and_cameras_take_turns():
-    viewer = Viewer(2, lambda camera: [unit(0, key=True), unit(1)])
+    viewer = Viewer("me", 2, lambda camera: [unit(0, key=True), unit(1)])
     viewer.tell("state", {})
     assert [m if isinstance(m, str) else m[0] for m in sent(viewer)] == ["state", 0, 1, 0, 1]
 
 
 def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
     newest = []
-    viewer = Viewer(1, lambda camera: [unit(0, key=True), *newest])
+    viewer = Viewer("me", 1, lambda camera: [unit(0, key=True), *newest])
     sent(viewer)
     for number in range(1, 201):
         newest[:] = [unit(number)]
@@ -66,16 +66,16 @@ def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
 
 
 def test_texts_are_bounded_too():
-    viewer = Viewer(0, lambda camera: [])
+    viewer = Viewer("me", 0, lambda camera: [])
     for _ in range(10_000):
         viewer.tell("sample", {})
     assert len(sent(viewer)) == 500
 
 
 def test_the_header_states_times_in_ms_and_an_unknown_capture_as_nan():
-    viewer = Viewer(1, lambda camera: [unit(5, key=True, captured=0.25)])
+    viewer = Viewer("me", 1, lambda camera: [unit(5, key=True, captured=0.25)])
     assert HEADER.unpack_from(viewer.pop()) == (0, KEY | RESTART, 0, 1, 250.0, 500.0)
-    viewer = Viewer(1, lambda camera: [unit(5, key=True)])
+    viewer = Viewer("me", 1, lambda camera: [unit(5, key=True)])
     assert math.isnan(HEADER.unpack_from(viewer.pop())[4])
 
 

@@ -56,9 +56,8 @@ class Page:
         self._recent = [Recent(None if period is None else float(period)) for period in periods]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
-        self._viewers: dict[Viewer, asyncio.Event] = {}
+        self._viewers: set[Viewer] = set()
         self._control = Control()
-        self._tokens: dict[Viewer, str] = {}
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
 
@@ -102,15 +101,13 @@ class Page:
             self._history.add(message)
         elif kind == "note":
             self._notes.append(message)
-        for viewer, ready in self._viewers.items():
+        for viewer in self._viewers:
             viewer.tell(kind, message)
-            ready.set()
 
     def _show(self, camera: int, unit: AccessUnit) -> None:
         unit = self._recent[camera].add(unit)
-        for viewer, ready in self._viewers.items():
+        for viewer in self._viewers:
             viewer.show(camera, unit)
-            ready.set()
 
     async def _on_viewer(self, request: web.Request) -> web.WebSocketResponse:
         token = request.query.get("viewer", "")
@@ -121,21 +118,20 @@ class Page:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, heartbeat=HEARTBEAT_S)
         await ws.prepare(request)
-        viewer, ready = Viewer(len(self._recent), lambda camera: self._recent[camera].burst()), asyncio.Event()
+        viewer = Viewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
         self._greet(viewer)
-        self._viewers[viewer], self._tokens[viewer] = ready, token
+        self._viewers.add(viewer)
         self._control.opened(token, time.monotonic())
         self._tell_control()
-        sender = asyncio.create_task(_send(ws, viewer, ready))
+        sender = asyncio.create_task(_send(ws, viewer))
         try:
             async for message in ws:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                    self._on_message(viewer, token, message.data)
-                    ready.set()
+                    self._on_message(viewer, message.data)
         finally:
             sender.cancel()
-            del self._viewers[viewer], self._tokens[viewer]
-            if token not in self._tokens.values():
+            self._viewers.remove(viewer)
+            if token not in {other.token for other in self._viewers}:
                 self._control.closed(token, time.monotonic())
             self._tell_control()
         return ws
@@ -148,11 +144,10 @@ class Page:
             viewer.tell("note", note)
 
     def _tell_control(self) -> None:
-        for viewer, ready in self._viewers.items():
-            viewer.tell("control", {"holder": self._control.seen_by(self._tokens[viewer])})
-            ready.set()
+        for viewer in self._viewers:
+            viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
 
-    def _on_message(self, viewer: Viewer, token: str, text: str | bytes) -> None:
+    def _on_message(self, viewer: Viewer, text: str | bytes) -> None:
         """One message of a page; whatever it holds, it is answered and nothing else suffers."""
         try:
             document = read_message(text.encode() if isinstance(text, str) else text)
@@ -165,23 +160,21 @@ class Page:
             case {"resync": str(name)} if name in self._index:
                 viewer.restart(self._index[name])
             case {"take_control": True}:
-                self._control.take(token)
+                self._control.take(viewer.token)
                 self._tell_control()
             case {"release_control": True}:
-                self._control.release(token)
+                self._control.release(viewer.token)
                 self._tell_control()
             case _:
-                self._on_request(viewer, token, document)
+                self._on_request(viewer, document)
 
-    def _on_request(self, viewer: Viewer, token: str, document: dict[str, Any]) -> None:
+    def _on_request(self, viewer: Viewer, document: dict[str, Any]) -> None:
         identity = document.pop("id", None)
 
         def answer(kind: str, said: Mapping[str, Any]) -> None:
             viewer.tell(kind, {"id": identity, **said})
-            if viewer in self._viewers:
-                self._viewers[viewer].set()
 
-        problem = self._problem(token, identity, document.get("event"))
+        problem = self._problem(viewer.token, identity, document.get("event"))
         if problem:
             answer("reply", {"result": "refused", "reason": problem})
         else:
@@ -198,15 +191,12 @@ class Page:
         return ""
 
 
-async def _send(ws: web.WebSocketResponse, viewer: Viewer, ready: asyncio.Event) -> None:
+async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
     """Send what waits, as fast as the viewer takes it."""
     try:
         while True:
-            message = viewer.pop()
-            if message is None:
-                ready.clear()
-                await ready.wait()
-            elif isinstance(message, str):
+            message = await viewer.next()
+            if isinstance(message, str):
                 await ws.send_str(message)
             else:
                 await ws.send_bytes(message)

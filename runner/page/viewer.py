@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import struct
@@ -23,11 +24,14 @@ Burst = Callable[[int], list[AccessUnit]]  # by camera index: what a decoder tha
 class Viewer:
     """Queues of one viewer. Used from one thread.
 
+    token  who it is: a random name that the browser keeps when the page is loaded again
     burst  asked for what brings a late decoder up to date, when the viewer is ready to take it and not before
     """
 
-    def __init__(self, cameras: int, burst: Burst) -> None:
+    def __init__(self, token: str, cameras: int, burst: Burst) -> None:
+        self.token = token
         self._burst = burst
+        self._filled = asyncio.Event()
         self._texts: deque[str] = deque(maxlen=WAITING_TEXTS)
         self._cameras = [_Waiting() for _ in range(cameras)]
         self._turn = 0  # index of the camera whose turn it is
@@ -35,9 +39,11 @@ class Viewer:
 
     def tell(self, kind: str, message: Mapping[str, Any]) -> None:
         self._texts.append(json.dumps({"kind": kind, **message}))
+        self._filled.set()
 
     def show(self, camera: int, unit: AccessUnit) -> None:
         """A unit that has just come."""
+        self._filled.set()
         waiting = self._cameras[camera]
         if waiting.behind:
             return  # it will be part of the burst
@@ -48,6 +54,14 @@ class Viewer:
     def restart(self, camera: int) -> None:
         """Forget what waits; the next that is sent of this camera is a burst."""
         self._cameras[camera] = _Waiting()
+        self._filled.set()
+
+    async def next(self) -> str | bytes:
+        """The next message to send, as soon as there is one."""
+        while (message := self.pop()) is None:
+            self._filled.clear()
+            await self._filled.wait()
+        return message
 
     def pop(self) -> str | bytes | None:
         """The next message to send, texts first, then the cameras in turn; None if there is nothing."""

@@ -107,12 +107,12 @@ def take_control(page):
 
 
 def measure(page):
-    return page.evaluate("tod.measure()")["cameras"]
+    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before the introduction
 
 
 def all_live(page, seconds=30):
     """Every camera has been live; on a busy machine hardly ever all at the very same moment."""
-    waiting = set(until(lambda: measure(page)))  # empty until the station has introduced the vehicle
+    waiting = set(measure(page))
 
     def seen():
         waiting.difference_update(name for name, camera in measure(page).items() if camera["status"] == "live")
@@ -462,6 +462,16 @@ def test_another_page_watches_and_may_take_control(chromium, demo, page):
         until(lambda: page.evaluate("tod.control === 'another'"))
     until(lambda: page.evaluate("tod.control === 'nobody'"))
     take_control(page)
+
+
+def test_a_copy_of_a_page_only_watches(page):
+    with page.expect_popup() as opening:
+        page.evaluate("void open(location.href)")  # takes the storage of its tab with it, as a duplicated tab does
+    copy = opening.value
+    until(lambda: copy.evaluate("window.tod?.state"))
+    until(lambda: copy.evaluate("tod.control") == "another")
+    copy.close()
+    assert page.evaluate("tod.control") == "you"
 
 
 def test_without_webcodecs_one_sentence_says_what_it_needs(chromium, demo):

@@ -25,11 +25,16 @@ function liveUrl() {
   return url.href;
 }
 
-/** A random name of this viewer, the same after a reload. */
+/**
+ * A random name of this viewer, the same after a reload. It lies in the tab's storage only from one document to the next,
+ * since a tab that is duplicated takes the storage with it and must not take control as well.
+ */
 function token() {
   const key = "tod-viewer";
-  const kept = sessionStorage.getItem(key);
-  const made = kept ?? [...crypto.getRandomValues(new Uint8Array(16))].map((b) => b.toString(16).padStart(2, "0")).join("");
-  sessionStorage.setItem(key, made);
+  const random = () => [...crypto.getRandomValues(new Uint8Array(16))].map((b) => b.toString(16).padStart(2, "0")).join("");
+  const made = sessionStorage.getItem(key) ?? random();
+  sessionStorage.removeItem(key);
+  addEventListener("pagehide", () => sessionStorage.setItem(key, made));
+  addEventListener("pageshow", () => sessionStorage.removeItem(key));
   return made;
 }

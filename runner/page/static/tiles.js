@@ -151,7 +151,9 @@ function refreshCaption(name, { rates, form, reason }) {
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
   caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
-  caption(form, region, `${shape} · ${whole(age)} ms`, "received size · scaling factor · capture to drawing");
+  const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
+  const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
+  caption(form, region, `${shape} · ${whole(age)} ms${lost}`, `received size · scaling factor · capture to drawing; ${wire}`);
   write(reason, now?.reason ?? "");
 }
 
