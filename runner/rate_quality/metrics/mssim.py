@@ -4,7 +4,11 @@ similarity", IEEE Trans. Image Processing 13(4), 2004).
     SSIM(x, y) = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sx^2 + sy^2 + C2)),    C1 = (.01 L)^2, C2 = (.03 L)^2
 
 with mean m, variance s^2 and covariance sxy under an 11x11 Gaussian window of sigma 1.5, L = 255, averaged over all
-windows that lie wholly inside the picture. Full resolution: no decimation before.
+windows that lie wholly inside the picture. Full resolution: no decimation before. Computed with d = x - y as
+
+    SSIM(x, y) = (1 - md^2 / (mx^2 + my^2 + C1)) (1 - sd^2 / (sx^2 + sy^2 + C2)),
+
+which is the same, and exact enough in float32: of two flat pictures sxy is a small difference of large numbers.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric
 SIDE, SIGMA = 11, 1.5  # of the window, px
 MARGIN = SIDE // 2
 C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
+ONE = np.float32(1)
 GREY = np.float32(128)  # taken off first: squares stay small, and float32 exact enough
 
 Line = NDArray[np.float32]
@@ -99,11 +104,12 @@ def total(x: Luma, y: Luma, weights: Line, counts: NDArray[np.uint8]) -> float:
 
 @compiled
 def multiply(x: Luma, y: Luma, lines: Lines) -> None:
-    """The four products of one row whose means are needed: x, y, x^2 + y^2 and xy, of values less grey."""
+    """What means are taken of, for one row: x, d, x^2 + y^2 and d^2, with x and y less grey, d = x - y."""
     for j in range(len(x)):
         a, b = np.float32(x[j]) - GREY, np.float32(y[j]) - GREY
-        lines[0, j], lines[1, j] = a, b
-        lines[2, j], lines[3, j] = a * a + b * b, a * b
+        d = a - b
+        lines[0, j], lines[1, j] = a, d
+        lines[2, j], lines[3, j] = a * a + b * b, d * d
 
 
 # Written out below: as loops over the taps they are not turned into vector instructions.
@@ -145,14 +151,14 @@ def smooth_column(ring: Lines, w: Line, smooth: Line) -> None:
 
 @compiled
 def compare(means: Lines, counts: NDArray[np.uint8]) -> float:
-    """Sum of SSIM over one row of windows, from the means of x, y, x^2 + y^2 and xy of values less grey."""
+    """Sum of SSIM over one row of windows, from the means of x, d, x^2 + y^2 and d^2, with x and y less grey."""
     result = np.float32(0)
     for j in range(len(counts)):
-        mx, my = means[0, j], means[1, j]
-        covariance = means[3, j] - mx * my
-        variances = means[2, j] - (mx * mx + my * my)
+        mx, md = means[0, j], means[1, j]
+        my = mx - md
+        variances, difference = means[2, j] - (mx * mx + my * my), means[3, j] - md * md
         mx, my = mx + GREY, my + GREY
-        luminance = (np.float32(2) * mx * my + C1) / (mx * mx + my * my + C1)
-        structure = (np.float32(2) * covariance + C2) / (variances + C2)
+        luminance = ONE - md * md / (mx * mx + my * my + C1)
+        structure = ONE - difference / (variances + C2)
         result += luminance * structure * np.float32(counts[j])
     return float(result)
