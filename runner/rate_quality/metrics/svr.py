@@ -179,7 +179,8 @@ def _opencv_kernels(path: Path, text: str, features: int) -> Kernels:
 
 def _opencv_ranges(path: Path, text: str, features: int) -> Ranges:
     """The matrix `range`: a row of the least, a row of the most of each feature."""
-    found = _storage(path, text).getNode("range").mat()
+    file = _storage(path, text)  # its nodes live no longer
+    found = file.getNode("range").mat()
     shape = None if found is None else found.shape
     _expect(path, "range", shape, f"must be a matrix of 2 x {features}", shape == (2, features))
     assert found is not None

@@ -77,7 +77,8 @@ def find_tool() -> Tool:
     raises  RunError where none has libvmaf; one that TOD_FFMPEG names is not silently replaced by another
     """
     named = os.environ.get("TOD_FFMPEG")
-    for exe in [named] if named else _known():
+    for name in [named] if named else _known():
+        exe = os.path.abspath(shutil.which(name) or name)  # it will run in another directory
         if version := _version(exe):
             return Tool(exe, version)
     what = f"TOD_FFMPEG={named} is no ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
@@ -90,8 +91,7 @@ def _known() -> Iterator[str]:
         import imageio_ffmpeg
 
         yield imageio_ffmpeg.get_ffmpeg_exe()
-    if on_path := shutil.which("ffmpeg"):
-        yield on_path
+    yield "ffmpeg"
 
 
 @cache
