@@ -328,6 +328,16 @@ def test_vmaf_tells_why_ffmpeg_ended(fake: Callable[[str], str]) -> None:
         find_metric("vmaf")
 
 
+def test_vmaf_without_scores(fake: Callable[[str], str]) -> None:
+    """As libvmaf does with some models when pictures are too small for them: status 0, and no log."""
+    read_all = 'for w in "$@"; do case $w in pipe:*) cat /dev/fd/${w#pipe:} >/dev/null & ;; esac; done; wait'
+    exe = fake(f"{read_all}; echo 'libvmaf ERROR no feature' >&2")
+    meter = vmaf_module.VmafMeter(vmaf_module.Tool(exe, ""), VMAF_MODEL, (64, 48), FPS, 1)
+    meter.add(0, noise(0), noise(0))
+    with pytest.raises(RunError, match=r"^ffmpeg failed to score VMAF: libvmaf ERROR no feature$"):
+        meter.close()
+
+
 def test_vmaf_gives_up_on_a_process_that_stands(fake: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vmaf_module, "PATIENCE_S", 0.2)
     exe = fake("exec sleep 60")

@@ -25,7 +25,7 @@ from runner.rate_quality.metrics.interface import Luma, Mask, Metric, Size, chec
 
 PATIENCE_S = 120.0  # a busy machine scores a picture in less
 PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
-SMALLEST_PX = 16  # its features halve the picture four times
+SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, which they say
 GREY = 128  # chroma, which VMAF does not look at
 LOG, COMPLAINTS = "scores.json", "stderr"
 
@@ -121,8 +121,8 @@ def libvmaf_version(tool: Tool, model: str) -> str:
 
     raises  UserError for an unknown model, RunError where scoring fails for another reason
     """
-    grey = np.full((64, 64), GREY, np.uint8)
-    probe = VmafMeter(tool, model, (64, 64), Fraction(1), 1)
+    grey = np.full((360, 640), GREY, np.uint8)  # large enough for every model
+    probe = VmafMeter(tool, model, (640, 360), Fraction(1), 1)
     try:
         probe.add(0, grey, grey)
         probe.close()
@@ -150,10 +150,15 @@ def picture_format(size: Size, pixel_format: str, fps: Fraction) -> list[str]:
     return ["-pix_fmt", pixel_format, "-s", f"{size[0]}x{size[1]}", "-r", f"{fps.numerator}/{fps.denominator}"]
 
 
-def read_log(directory: Path) -> Scores:
-    """What libvmaf wrote. Raises OSError, ValueError or KeyError where it did not."""
-    log = json.loads((directory / LOG).read_text())
-    return Scores(log["version"], {entry["frameNum"]: entry["metrics"]["vmaf"] for entry in log["frames"]})
+def read_log(directory: Path, status: int) -> Scores:
+    """What libvmaf wrote. Raises RunError where it did not: ffmpeg may end with status 0 all the same."""
+    if status:
+        raise complaint(directory, status)
+    try:
+        log = json.loads((directory / LOG).read_text())
+        return Scores(log["version"], {entry["frameNum"]: entry["metrics"]["vmaf"] for entry in log["frames"]})
+    except (OSError, ValueError, KeyError):
+        raise complaint(directory, status) from None
 
 
 def complaint(directory: Path, status: int) -> RunError:
@@ -175,9 +180,7 @@ def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, m
     with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / COMPLAINTS).open("w") as complaints:
         words = command(tool.exe, inputs, model, 1)
         status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=complaints).returncode
-        if status:
-            raise complaint(Path(name), status)
-        return list(read_log(Path(name)).by_picture.values())
+        return list(read_log(Path(name), status).by_picture.values())
 
 
 # --- a lane ---------------------------------------------------------------------------------------------------------
@@ -279,9 +282,7 @@ class VmafMeter:
     def _finish(self) -> dict[int, float]:
         """Let the process score what it has, and read what it found."""
         self._close_pipes()
-        if status := self._wait():
-            raise complaint(self._path, status)
-        scores = read_log(self._path)
+        scores = read_log(self._path, self._wait())
         self.version = scores.version
         return {self._frames[number]: score for number, score in scores.by_picture.items()}
 
