@@ -1,0 +1,1 @@
+"""Rate-quality models of live encoders, measured offline: the running system never scores video."""

@@ -1,0 +1,52 @@
+"""Picture quality: the metric of a name. The four are described in the modules of their names.
+
+Their modules are imported only when asked for: each needs libraries or tools of its own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from runner.errors import UserError
+from runner.model import suggest
+from runner.rate_quality.metrics.interface import Luma, Mask, Meter, Metric, Size
+
+__all__ = ["NAMES", "VMAF_MODEL", "Luma", "Mask", "Meter", "Metric", "Size", "find_metric"]
+
+NAMES = ("psnr", "mssim", "vmaf", "brisque")
+VMAF_MODEL = "vmaf_v0.6.1"
+
+
+def find_metric(
+    name: str,
+    *,
+    brisque_model: Path | None = None,
+    brisque_range: Path | None = None,
+    vmaf_model: str = VMAF_MODEL,
+) -> Metric:
+    """The metric of a name.
+
+    brisque_model, brisque_range  files of the regression and of the feature ranges, see `svr.py`; brisque needs both
+    vmaf_model                    one that libvmaf has built in
+    raises  UserError for an unknown name or model, a file that is missing or cannot be read;
+            RunError where no ffmpeg has libvmaf
+    """
+    match name:
+        case "psnr":
+            from runner.rate_quality.metrics import psnr
+
+            return psnr.metric()
+        case "mssim":
+            from runner.rate_quality.metrics import mssim
+
+            return mssim.metric()
+        case "vmaf":
+            from runner.rate_quality.metrics import vmaf
+
+            return vmaf.metric(vmaf_model)
+        case "brisque":
+            from runner.rate_quality.metrics import brisque
+
+            return brisque.metric(brisque_model, brisque_range)
+        case _:
+            raise UserError("", "metric", repr(name), f"unknown metric, {suggest(name, NAMES)}")

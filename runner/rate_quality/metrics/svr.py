@@ -1,0 +1,211 @@
+"""Support vector regression with a radial kernel, read from the files of two libraries, and evaluated.
+
+    f(x) = sum_i alpha_i exp(-gamma |v_i - x|^2) - rho               (C.-C. Chang, C.-J. Lin, "LIBSVM", 2011, Eq. 10)
+
+The files: libsvm's text (svm-train -s 3 -t 2) with ranges in the text of svm-scale, or both in OpenCV's YAML
+(cv::ml::SVM::save; a matrix `range` whose rows are the least and the most of each feature, scaled to [-1, 1]).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import UserError
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """What a training found.
+
+    vectors  [i, feature], of scaled features
+    alpha    [i]
+    """
+
+    vectors: NDArray[np.float64]
+    alpha: Vector
+    rho: float
+    gamma: float
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What features were scaled to before training: from [least, most] of each to [lower, upper]."""
+
+    least: Vector
+    most: Vector
+    lower: float = -1.0
+    upper: float = 1.0
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A trained regression.
+
+    identity  changes with the files
+    """
+
+    kernels: Kernels
+    ranges: Ranges
+    identity: str
+
+    def __call__(self, features: Vector) -> float:
+        """The prediction for one vector of features, unscaled."""
+        offset = self.kernels.vectors - scale(features, self.ranges)
+        return float(self.kernels.alpha @ np.exp(-self.kernels.gamma * (offset**2).sum(axis=1)) - self.kernels.rho)
+
+
+def scale(features: Vector, ranges: Ranges) -> Vector:
+    """Features as the training saw them; one that never changed there is 0, as svm-scale leaves it out."""
+    span = ranges.most - ranges.least
+    share = (features - ranges.least) / np.where(span > 0, span, 1)
+    return np.where(span > 0, ranges.lower + (ranges.upper - ranges.lower) * share, 0.0)
+
+
+def load(model: Path, ranges: Path, features: int) -> Regression:
+    """Read a regression of so many features, each file in either form.
+
+    raises  UserError that names file, place and rule
+    """
+    found, spans = _read(model), _read(ranges)
+    kernels = (_opencv_kernels if _is_opencv(found) else _libsvm_kernels)(model, found, features)
+    scaling = (_opencv_ranges if _is_opencv(spans) else _libsvm_ranges)(ranges, spans, features)
+    digest = hashlib.sha256("\0".join((found, spans)).encode()).hexdigest()
+    return Regression(kernels, scaling, digest[:16])
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError as error:
+        raise UserError(str(path), "", None, (error.strerror or "cannot be read").lower()) from None
+    except ValueError:
+        raise UserError(str(path), "", None, "is not text") from None
+
+
+def _is_opencv(text: str) -> bool:
+    return text.startswith(("%YAML", "<?xml"))
+
+
+def _expect(path: Path, place: str, found: object, rule: str, good: bool) -> None:
+    if not good:
+        raise UserError(str(path), place, repr(found), rule)
+
+
+# --- libsvm ---------------------------------------------------------------------------------------------------------
+
+
+def _libsvm_kernels(path: Path, text: str, features: int) -> Kernels:
+    """Lines of settings, then SV, then per vector its alpha and its features as index:value, those of 0 left out."""
+    head, _, body = text.partition("\nSV\n")
+    settings = {name: value for name, _, value in (line.partition(" ") for line in head.splitlines())}
+    for name, value in (("svm_type", "epsilon_svr"), ("kernel_type", "rbf")):
+        _expect(path, name, settings.get(name), f"must be {value}", settings.get(name) == value)
+    rho, gamma = (_number(path, name, settings.get(name, "")) for name in ("rho", "gamma"))
+    rows = [line.split() for line in body.splitlines() if line.strip()]
+    total = int(_number(path, "total_sv", settings.get("total_sv", "")))
+    _expect(path, "SV", len(rows), f"must have {total} lines, as total_sv says", len(rows) == total > 0)
+    vectors = np.zeros((total, features))
+    alpha = np.zeros(total)
+    for i, (weight, *cells) in enumerate(rows):
+        place = f"SV {i + 1}"
+        alpha[i] = _number(path, place, weight)
+        for cell in cells:
+            index, _, value = cell.partition(":")
+            vectors[i, _feature(path, place, index, features)] = _number(path, place, value)
+    return Kernels(vectors, alpha, rho, gamma)
+
+
+def _libsvm_ranges(path: Path, text: str, features: int) -> Ranges:
+    """A line x, a line with lower and upper, then for each feature its index, its least and its most."""
+    rows = [line.split() for line in text[text.find("x") :].splitlines() if line.strip()]
+    _expect(path, "", rows[:1], "must have a line x before the ranges of features", rows[:1] == [["x"]])
+    for number, row in enumerate(rows[1:]):
+        _expect(path, f"line {number + 2}", " ".join(row), "must have 2 numbers, then 3", len(row) == 2 + (number > 0))
+    least, most = np.zeros(features), np.zeros(features)
+    numbers = [[_number(path, "x", cell) for cell in row] for row in rows[1:]]
+    _expect(path, "x", len(numbers), "must have a line of lower and upper", bool(numbers))
+    for cells, (_, low, high) in zip(rows[2:], numbers[1:], strict=True):
+        at = _feature(path, "x", cells[0], features)
+        least[at], most[at] = low, high
+    return Ranges(least, most, *numbers[0])
+
+
+def _feature(path: Path, place: str, text: str, features: int) -> int:
+    """Where a feature is that libsvm counts from 1."""
+    good = text.isdecimal() and 1 <= int(text) <= features
+    _expect(path, place, text, f"must be the number of a feature, 1 to {features}", good)
+    return int(text) - 1
+
+
+def _number(path: Path, place: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    _expect(path, place, text, "must be a finite number", math.isfinite(value))
+    return value
+
+
+# --- OpenCV ---------------------------------------------------------------------------------------------------------
+
+
+def _opencv_kernels(path: Path, text: str, features: int) -> Kernels:
+    """The first node of a file that cv::ml::SVM::save wrote."""
+    file = _storage(path, text)
+    node = file.root().getNode(file.root().keys()[0])
+    kind, kernel = node.getNode("svmType").string(), node.getNode("kernel")
+    _expect(path, "svmType", kind, "must be EPS_SVR", kind == "EPS_SVR")
+    shape = kernel.getNode("type").string()
+    _expect(path, "kernel.type", shape, "must be RBF", shape == "RBF")
+    decision = node.getNode("decision_functions").at(0)
+    alpha = _row(path, "alpha", decision.getNode("alpha"))
+    vectors = [_row(path, "support_vectors", row) for row in _items(node.getNode("support_vectors"))]
+    sizes = {len(row) for row in vectors}
+    _expect(path, "support_vectors", sorted(sizes), f"each must have {features} features", sizes == {features})
+    _expect(path, "alpha", len(alpha), f"must have {len(vectors)} numbers", len(alpha) == len(vectors))
+    rho, gamma = (_real(path, name, at.getNode(name)) for name, at in (("rho", decision), ("gamma", kernel)))
+    return Kernels(np.array(vectors), np.array(alpha), rho, gamma)
+
+
+def _opencv_ranges(path: Path, text: str, features: int) -> Ranges:
+    """The matrix `range`: a row of the least, a row of the most of each feature."""
+    file = _storage(path, text)  # its nodes live no longer
+    found = file.getNode("range").mat()
+    shape = None if found is None else found.shape
+    _expect(path, "range", shape, f"must be a matrix of 2 x {features}", shape == (2, features))
+    assert found is not None
+    least, most = found.astype(np.float64)
+    return Ranges(least, most)
+
+
+def _storage(path: Path, text: str) -> cv2.FileStorage:
+    try:
+        file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (cv2.error, SystemError):
+        raise UserError(str(path), "", None, "is not what OpenCV writes") from None
+    _expect(path, "", text[:20], "holds nothing", file.isOpened() and bool(file.root().keys()))
+    return file
+
+
+def _items(node: cv2.FileNode) -> Iterable[cv2.FileNode]:
+    return (node.at(i) for i in range(node.size()))
+
+
+def _row(path: Path, place: str, node: cv2.FileNode) -> list[float]:
+    return [_real(path, place, item) for item in _items(node)]
+
+
+def _real(path: Path, place: str, node: cv2.FileNode) -> float:
+    value = node.real() if node.isReal() or node.isInt() else math.nan
+    _expect(path, place, node.string() if node.isString() else None, "must be a finite number", math.isfinite(value))
+    return value

@@ -1,0 +1,302 @@
+"""VMAF (Netflix) of luma, by an ffmpeg with libvmaf in a process of its own that the pictures are piped to."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import re
+import select
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from fractions import Fraction
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from runner.errors import RunError, UserError
+from runner.rate_quality.metrics.interface import Luma, Mask, Metric, Size, check
+
+PATIENCE_S = 120.0  # a busy machine scores a picture in less
+PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
+SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, which they say
+GREY = 128  # chroma, which VMAF does not look at
+LOG, COMPLAINTS = "scores.json", "stderr"
+
+
+class Tool(NamedTuple):
+    """An ffmpeg that has libvmaf."""
+
+    exe: str
+    version: str
+
+
+class Scores(NamedTuple):
+    """What libvmaf wrote: its version, and the score by number of the picture, from 0."""
+
+    version: str
+    by_picture: dict[int, float]
+
+
+def metric(model: str) -> Metric:
+    """VMAF with a model that libvmaf has built in. Raises UserError for an unknown model, RunError without a tool."""
+    if not re.fullmatch(r"[\w.]+", model):
+        raise UserError("", "vmaf_model", repr(model), "must be the name of a model, such as vmaf_v0.6.1")
+    tool = find_tool()
+    return Metric(
+        name="vmaf",
+        label="VMAF",
+        identity=f"vmaf of luma, {model}, 8 bit, libvmaf {libvmaf_version(tool, model)}, ffmpeg {tool.version}",
+        bounds=(0.0, 100.0),
+        tolerance=0.3,
+        good=85.0,
+        build=partial(meter, tool, model),
+        smallest_px=SMALLEST_PX,
+        every_frame=True,
+        takes_mask=False,
+    )
+
+
+def meter(tool: Tool, model: str, size: Size, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
+    """Meter of one lane. There is never a mask: the metric says so."""
+    return VmafMeter(tool, model, size, fps, stride)
+
+
+# --- the tool -------------------------------------------------------------------------------------------------------
+
+
+def find_tool() -> Tool:
+    """The ffmpeg of TOD_FFMPEG, else the first with libvmaf of: that of imageio-ffmpeg, that on the PATH.
+
+    raises  RunError where none has libvmaf; one that TOD_FFMPEG names is not silently replaced by another
+    """
+    named = os.environ.get("TOD_FFMPEG")
+    for name in [named] if named else _known():
+        exe = os.path.abspath(shutil.which(name) or name)  # it will run in another directory
+        if version := _version(exe):
+            return Tool(exe, version)
+    what = f"TOD_FFMPEG={named} is no ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
+    raise RunError(f"{what}: pip install 'tod-runner[vmaf]'")
+
+
+def _known() -> Iterator[str]:
+    # The module raises RuntimeError where its wheel came without a binary.
+    with suppress(ModuleNotFoundError, RuntimeError):
+        import imageio_ffmpeg
+
+        yield imageio_ffmpeg.get_ffmpeg_exe()
+    yield "ffmpeg"
+
+
+@cache
+def _version(exe: str) -> str:
+    """Version of an ffmpeg with libvmaf; empty for anything else."""
+    try:
+        texts = [
+            subprocess.run(
+                [exe, "-hide_banner", question],
+                check=False,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=PATIENCE_S,
+            ).stdout
+            for question in ("-filters", "-version")
+        ]
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    found = re.match(r"ffmpeg version (\S+)", texts[1])
+    return found[1] if found and re.search(r"^.{4,6}libvmaf +VV->V", texts[0], re.MULTILINE) else ""
+
+
+@cache
+def libvmaf_version(tool: Tool, model: str) -> str:
+    """Version of libvmaf, found by scoring one picture, which also proves that the model exists.
+
+    raises  UserError for an unknown model, RunError where scoring fails for another reason
+    """
+    grey = np.full((360, 640), GREY, np.uint8)  # large enough for every model
+    probe = VmafMeter(tool, model, (640, 360), Fraction(1), 1)
+    try:
+        probe.add(0, grey, grey)
+        probe.close()
+    except RunError as error:
+        if "could not load libvmaf model" in str(error):
+            raise UserError("", "vmaf_model", repr(model), "libvmaf has no such model built in") from None
+        raise
+    finally:
+        probe.close()
+    return probe.version
+
+
+def command(exe: str, inputs: Sequence[Sequence[str]], model: str, stride: int) -> list[str]:
+    """Score the first input against the second, into a log in the working directory.
+
+    inputs  for each raw video its options, ending in -i and where it is
+    """
+    options = f"model=version={model}:n_threads=1:n_subsample={stride}:log_fmt=json:log_path={LOG}"
+    raw = [word for words in inputs for word in ("-f", "rawvideo", "-threads", "1", *words)]
+    return [exe, "-nostdin", "-v", "error", *raw, "-lavfi", f"[0:v][1:v]libvmaf={options}", "-f", "null", "-"]
+
+
+def picture_format(size: Size, pixel_format: str, fps: Fraction) -> list[str]:
+    """Options of a raw video."""
+    return ["-pix_fmt", pixel_format, "-s", f"{size[0]}x{size[1]}", "-r", f"{fps.numerator}/{fps.denominator}"]
+
+
+def read_log(directory: Path, status: int) -> Scores:
+    """What libvmaf wrote. Raises RunError where it did not: ffmpeg may end with status 0 all the same."""
+    if status:
+        raise complaint(directory, status)
+    try:
+        log = json.loads((directory / LOG).read_text())
+        return Scores(log["version"], {entry["frameNum"]: entry["metrics"]["vmaf"] for entry in log["frames"]})
+    except (OSError, ValueError, KeyError):
+        raise complaint(directory, status) from None
+
+
+def complaint(directory: Path, status: int) -> RunError:
+    """An end of ffmpeg that should not be, with its first words: the last ones name no cause."""
+    said = (directory / COMPLAINTS).read_text(errors="replace").strip().splitlines()
+    why = re.sub(r"^\[[^]]*\] ", "", said[0]) if said else f"status {status}"
+    return RunError(f"ffmpeg failed to score VMAF: {why}")
+
+
+def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, model: str) -> list[float]:
+    """Score of each picture of a raw video.
+
+    pixel_format  of both files, as ffmpeg names it
+    raises        RunError
+    """
+    tool = find_tool()
+    layout = picture_format(size, pixel_format, Fraction(25))
+    inputs = [[*layout, "-i", str(path.resolve())] for path in (picture, reference)]
+    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / COMPLAINTS).open("w") as complaints:
+        words = command(tool.exe, inputs, model, 1)
+        status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=complaints).returncode
+        return list(read_log(Path(name), status).by_picture.values())
+
+
+# --- a lane ---------------------------------------------------------------------------------------------------------
+
+
+class VmafMeter:
+    """Pictures to a process, scores from its log.
+
+    No call waits for ever: whichever pipe has room is written to, the end of the process is seen at once, and one
+    that stands still is given up after `PATIENCE_S`.
+    """
+
+    version = ""  # of libvmaf, known at the end
+
+    def __init__(self, tool: Tool, model: str, size: Size, fps: Fraction, stride: int) -> None:
+        self._size = size
+        self._frames: list[int] = []
+        self._sound = True  # no picture went in by half
+        self._scores: dict[int, float] | None = None
+        luma, chroma = math.prod(size), 2 * math.prod((side + 1) // 2 for side in size)
+        self._pictures = [np.full(luma + chroma, GREY, np.uint8) for _ in range(2)]
+        self._pipes: list[int] = []
+        self._directory = TemporaryDirectory(prefix="tod-vmaf-", ignore_cleanup_errors=True)
+        self._path = Path(self._directory.name)
+        try:
+            self._process = self._start(tool.exe, model, picture_format(size, "yuv420p", fps), stride)
+        except OSError as error:
+            self._free()
+            raise RunError(f"{tool.exe}: cannot be started: {error.strerror}") from None
+
+    def _start(self, exe: str, model: str, layout: list[str], stride: int) -> subprocess.Popen[bytes]:
+        """The process, and the pipes into it: first for the scored picture, then for its reference."""
+        theirs: list[int] = []
+        try:
+            for _ in range(2):
+                read, write = os.pipe()
+                theirs.append(read)
+                self._pipes.append(write)
+                os.set_blocking(write, False)
+                # Not on every system, and not when this user's pipes hold too much already.
+                with suppress(OSError, AttributeError):
+                    fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+            words = command(exe, [[*layout, "-i", f"pipe:{pipe}"] for pipe in theirs], model, stride)
+            with (self._path / COMPLAINTS).open("wb") as complaints:
+                return subprocess.Popen(
+                    words,
+                    cwd=self._path,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=complaints,
+                    pass_fds=theirs,
+                )
+        finally:
+            for pipe in theirs:
+                os.close(pipe)
+
+    def add(self, frame: int, reference: Luma, picture: Luma) -> None:
+        check(self._size, reference, picture)
+        if self._scores is not None or not self._sound:
+            raise ValueError("this meter has ended")
+        for whole, luma in zip(self._pictures, (picture, reference), strict=True):
+            whole[: luma.size] = luma.ravel()
+        self._frames.append(frame)
+        self._sound = False
+        try:
+            self._write()
+        except BrokenPipeError:
+            raise complaint(self._path, self._wait()) from None
+        self._sound = True
+
+    def _write(self) -> None:
+        """One picture into each pipe. Raises BrokenPipeError when the process has ended, RunError when it stands."""
+        left = {pipe: picture.data for pipe, picture in zip(self._pipes, self._pictures, strict=True)}
+        room = select.poll()
+        for pipe in left:
+            room.register(pipe, select.POLLOUT)
+        while left:
+            ready = room.poll(PATIENCE_S * 1000)
+            if not ready:
+                raise RunError(f"ffmpeg has taken no picture for {PATIENCE_S:g} s")
+            for pipe, _ in ready:
+                left[pipe] = left[pipe][os.write(pipe, left[pipe]) :]
+                if not left[pipe]:
+                    room.unregister(pipe)
+                    del left[pipe]
+
+    def close(self) -> dict[int, float]:
+        if self._scores is None:
+            self._scores = {}  # a failure is told once
+            try:
+                if self._frames and self._sound:
+                    self._scores = self._finish()
+            finally:
+                self._process.kill()
+                self._process.wait()
+                self._free()
+        return self._scores
+
+    def _finish(self) -> dict[int, float]:
+        """Let the process score what it has, and read what it found."""
+        self._close_pipes()
+        scores = read_log(self._path, self._wait())
+        self.version = scores.version
+        return {self._frames[number]: score for number, score in scores.by_picture.items()}
+
+    def _wait(self) -> int:
+        """Exit status of the process, which has been told to end or is about to."""
+        try:
+            return self._process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            raise RunError(f"ffmpeg has not ended for {PATIENCE_S:g} s") from None
+
+    def _close_pipes(self) -> None:
+        while self._pipes:
+            os.close(self._pipes.pop())
+
+    def _free(self) -> None:
+        self._close_pipes()
+        self._directory.cleanup()
