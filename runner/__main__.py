@@ -69,6 +69,8 @@ def _run(words: list[str]) -> int:
     if any(word in ("-h", "--help") for word in rest):
         print((module.__doc__ or "").strip())
         return 0
+    if name == "model" and rest[:1] == ["compare"]:
+        return int(module.compare(rest[1:]))
     arguments = Arguments.parse(name, rest)
     if arguments.conf is not None and not arguments.conf.is_dir():
         raise UserError("command line", "conf", str(arguments.conf), "no such directory")

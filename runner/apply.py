@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from runner.commands import Command, KnobValue
 from runner.errors import RunError
@@ -15,10 +15,17 @@ from runner.graph import Plan, launch
 from runner.gst import GLib, Gst
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
-from runner.gst.registry import check_plan, missing_plugins
+from runner.gst.registry import check_plan, missing_plugins, versions
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.model import Endpoint
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from runner.gst.lanes import Encoded, OnDecoded, OnFrame
+    from runner.gst.sequence import Form
+    from runner.rate_quality.lanes import LaneSet
 
 __all__ = [
     "OperatorSide",
@@ -26,7 +33,10 @@ __all__ = [
     "VehicleSide",
     "check_machine",
     "check_plan",
+    "discover",
     "missing_plugins",
+    "run_lanes",
+    "versions",
 ]
 
 Report = Callable[[str, str], None]  # camera, what happened to it
@@ -225,3 +235,22 @@ class OperatorSide:
 
         self._glib.call(stop)
         self._glib.quit()
+
+
+# --- offline: what driving does not load ------------------------------------------------------------------------------
+
+
+def discover(path: Path, where: str) -> Form:
+    """Form of a clip, see `runner.gst.sequence.discover`."""
+    from runner.gst import sequence
+
+    return sequence.discover(path, where)
+
+
+def run_lanes(
+    lanes: LaneSet, on_frame: OnFrame, on_picture: OnDecoded, on_progress: Callable[[int], None]
+) -> list[Encoded]:
+    """A sequence through many encoders, see `runner.gst.lanes.run_lanes`."""
+    from runner.gst import lanes as gst_lanes
+
+    return gst_lanes.run_lanes(lanes, on_frame, on_picture, on_progress)

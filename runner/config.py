@@ -36,6 +36,7 @@ from runner.model import (
 if TYPE_CHECKING:
     from runner.pqos import Pqos
     from runner.pqos.track import Track
+    from runner.rate_quality.study import Study
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
@@ -86,6 +87,19 @@ def load_run(
     # A map that cannot be read is told once, though the drive goes through its points.
     track = builder.attempt(("pqos",), lambda: build_track(settings, bases)) if pqos else None
     return builder.finished(vehicle), builder.finished(pqos), track
+
+
+def load_study(overrides: Sequence[str], user: Path | None, *, check: Check | None = None) -> tuple[Vehicle, Study]:
+    """The vehicle, and how rate-quality models of its cameras are measured.
+
+    raises  ConfigError with all problems
+    """
+    from runner.rate_quality.study import read_study
+
+    builder = _Builder(compose(overrides, user), runnable=False, check=check)
+    vehicle = builder.vehicle()
+    study = builder.part(("study",), read_study)
+    return builder.finished(vehicle), builder.finished(study)
 
 
 @dataclass
@@ -189,9 +203,9 @@ class _Builder:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
         # Parts that the schema accepts are looked at further, whatever is wrong beside them.
-        graph = self._part(self._of(name, "graph"), _graph)
-        source = self._part(self._of(name, "source"), _source)
-        model = self._part((*path, "rate_quality"), _rate_quality)
+        graph = self.part(self._of(name, "graph"), _graph)
+        source = self.part(self._of(name, "source"), _source)
+        model = self.part((*path, "rate_quality"), _rate_quality)
         if graph is None or source is None or model is None or not (self.fine(*path) and self.fine("fps_max")):
             return None
         fps, limit = exact(data["fps"]), document.get("fps_max")
@@ -218,7 +232,7 @@ class _Builder:
             ),
         )
 
-    def _part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
+    def part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
         """What a part of the document describes, if the schema accepts it."""
         if not self.fine(*path):
             return None

@@ -70,8 +70,7 @@ class Plan:
 
     def vehicle_line(self, knobs: Mapping[str, KnobValue]) -> str:
         """Arguments for gst-launch-1.0 with the knobs turned, quoted for a shell, ending in a network sink."""
-        turned = [a for knob, value in knobs.items() for a in assignments(self.camera, knob, value)]
-        return shell(_set((*self.printed, *self.vehicle, *self.wire_vehicle), turned))
+        return shell(turn_elements(self.camera, (*self.printed, *self.vehicle, *self.wire_vehicle), knobs))
 
     def operator_line(self) -> str:
         """Arguments for gst-launch-1.0, quoted for a shell, beginning with the source that `vehicle_line` sends to."""
@@ -127,6 +126,15 @@ def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]
             raise ModelError(f"graph.knobs.{knob}", repr(turn.value), f"{knob} offers {', '.join(quantities)}")
         turned.append((turn.element, turn.property, filled))
     return turned
+
+
+def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:
+    """Elements of a camera as they are built with these knobs turned; what a knob sets elsewhere is left out."""
+    by_element: dict[str, dict[str, Value]] = {}
+    for knob, value in knobs.items():
+        for name, key, filled in assignments(camera, knob, value):
+            by_element.setdefault(name, {})[key] = filled
+    return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
 
 
 def launch(elements: Iterable[Element]) -> str:
@@ -212,13 +220,6 @@ def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
     if whole:
         return values[whole[1]]  # keeps its type
     return PLACEHOLDER.sub(lambda match: text(values[match[1]]), value)
-
-
-def _set(elements: Iterable[Element], turned: Iterable[Assignment]) -> tuple[Element, ...]:
-    by_element: dict[str, dict[str, Value]] = {}
-    for name, key, value in turned:
-        by_element.setdefault(name, {})[key] = value
-    return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
 
 
 def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:

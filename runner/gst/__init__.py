@@ -2,7 +2,7 @@
 
 import gi
 
-for _name in ("Gst", "GstRtp", "GstRtsp", "GstRtspServer"):
+for _name in ("Gst", "GstPbutils", "GstRtp", "GstRtsp", "GstRtspServer", "GstVideo"):
     gi.require_version(_name, "1.0")
 
 from gi.repository import GLib, Gst  # noqa: E402

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 
 from gi.repository import GLib, GObject, Gst
@@ -33,6 +33,17 @@ def missing_plugins(plan: Plan) -> list[str]:
         for name in names
         if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None
     ]
+
+
+def versions(elements: Iterable[Element]) -> dict[str, str]:
+    """GStreamer's version, and by element that of the plugin it comes from."""
+    found = {"GStreamer": ".".join(map(str, Gst.version()[:3]))}
+    for element in elements:
+        factory = Gst.ElementFactory.find(element.factory)
+        if factory:
+            plugin = factory.get_plugin()
+            found[element.factory] = f"{plugin.get_package()}, {plugin.get_version()}"
+    return found
 
 
 def check_plan(plan: Plan) -> list[ModelError]:

@@ -26,12 +26,24 @@ VERBS = {
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "duration_s")),
+    "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", ()),
 }
 
 
 # By Python module, the extra of this package that brings it.
-EXTRAS = {"paho": "live", "rich": "live", "aiohttp": "page", "plotly": "page", "numba": "synthetic"}
+EXTRAS = {
+    "paho": "live",
+    "rich": "live",
+    "aiohttp": "page",
+    "plotly": "page",
+    "numba": "synthetic",
+    "cv2": "model",
+    "scipy": "model",
+    "matplotlib": "model",
+    "imageio_ffmpeg": "vmaf",
+    "distributed": "cluster",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ def metric() -> Metric:
         identity=f"psnr of luma, 10 log10(255^2 / MSE), at most {HIGHEST_DB:g} dB",
         bounds=(0.0, HIGHEST_DB),
         tolerance=0.05,
-        good=36.0,
+        good=38.0,
         build=meter,
     )
 

@@ -1,0 +1,187 @@
+"""Many encoders on one sequence: decoded once, scaled once for each factor, encoded and decoded again in lanes.
+
+Offline work: frames are looked at in Python here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from gi.repository import Gst, GstVideo
+from numpy.typing import NDArray
+
+from runner.errors import RunError
+from runner.gst.pipeline import counted
+from runner.rate_quality.lanes import FRAMES, LaneSet
+
+Luma = NDArray[np.uint8]  # height x width
+POLL_NS = 200 * 1_000_000
+STALLED_S = 60  # no frame for so long: something waits for something else
+
+OnFrame = Callable[[int, Luma], None]  # number of the frame from 0, its luma
+OnDecoded = Callable[[int, int, Luma], None]  # lane, number of the frame, its luma as decoded
+
+
+@dataclass(slots=True)
+class Encoded:
+    """What one lane came to.
+
+    frames    pictures that came out of the decoder
+    bytes     of coded video
+    encode_s  processor time of the encoder in its own thread, s
+    """
+
+    frames: int = 0
+    bytes: int = 0
+    encode_s: float = 0.0
+
+
+@dataclass(slots=True)
+class _Run:
+    """State of one run, shared by its streaming threads."""
+
+    fps: Fraction
+    form: str = ""
+    frames: int = 0
+    moved: float = field(default_factory=time.monotonic)
+    failed: BaseException | None = None
+
+
+def run_lanes(
+    lanes: LaneSet, on_frame: OnFrame, on_picture: OnDecoded, on_progress: Callable[[int], None]
+) -> list[Encoded]:
+    """Run a sequence through all lanes, as fast as it goes.
+
+    on_frame     told each frame of the sequence before any lane has it, from one thread
+    on_picture   told each decoded picture, lane by lane from a thread of its own; it may take its time
+    on_progress  told the number of frames so far, a few times a second
+    returns      by lane
+    raises       RunError with what GStreamer says; what the callbacks raise
+    """
+    pipeline = _parsed(lanes.line)
+    run = _Run(lanes.fps)
+    pipeline.get_by_name(FRAMES).get_static_pad("sink").add_probe(
+        Gst.PadProbeType.BUFFER | Gst.PadProbeType.EVENT_DOWNSTREAM,
+        lambda pad, info: _on_source(run, pad, info, on_frame),
+    )
+    results = [Encoded() for _ in lanes.lanes]
+    for number, lane in enumerate(lanes.lanes):
+        _watch_encoder(pipeline.get_by_name(lane.encoder), results[number])
+        sink = pipeline.get_by_name(lane.sink)
+        sink.connect("new-sample", lambda s, n=number: _on_sample(run, s, n, results[n], on_picture))
+    try:
+        if pipeline.set_state(Gst.State.PLAYING) == Gst.StateChangeReturn.FAILURE:
+            raise RunError(_message(pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)))
+        _wait(pipeline, run, on_progress)
+        for result, lane in zip(results, lanes.lanes, strict=True):
+            result.bytes = counted(pipeline.get_by_name(lane.counter))[1]
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+    return results
+
+
+def _parsed(line: str) -> Gst.Pipeline:
+    try:
+        return Gst.parse_launch(line)
+    except Exception as error:  # GLib.Error
+        raise RunError(f"GStreamer: {error}") from None
+
+
+def _wait(pipeline: Gst.Pipeline, run: _Run, on_progress: Callable[[int], None]) -> None:
+    """Until the end of the sequence."""
+    bus = pipeline.get_bus()
+    while True:
+        message = bus.timed_pop_filtered(POLL_NS, Gst.MessageType.ERROR | Gst.MessageType.EOS)
+        if run.failed:
+            raise run.failed
+        if message and message.type == Gst.MessageType.ERROR:
+            raise RunError(_message(message))
+        if message:
+            return
+        on_progress(run.frames)
+        if time.monotonic() - run.moved > STALLED_S:
+            raise RunError(f"no frame has moved for {STALLED_S} s")
+
+
+def _message(message: Gst.Message | None) -> str:
+    if message is None:
+        return "the pipeline does not start"
+    error, detail = message.parse_error()
+    where = message.src.get_name() if message.src else "pipeline"
+    reason = str(detail or "").strip().splitlines()
+    return f"{where}: {error.message}" + (f" ({reason[-1]})" if reason else "")
+
+
+def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFrame) -> Gst.PadProbeReturn:
+    event = info.get_event() if info.type & Gst.PadProbeType.EVENT_DOWNSTREAM else None
+    if event is not None:
+        if event.type == Gst.EventType.CAPS:
+            _check_form(run, event.parse_caps())
+        return Gst.PadProbeReturn.OK
+    number, run.frames, run.moved = run.frames, run.frames + 1, time.monotonic()
+    _guarded(run, lambda: on_frame(number, _luma(info.get_buffer(), pad.get_current_caps())))
+    return Gst.PadProbeReturn.OK
+
+
+def _check_form(run: _Run, caps: Gst.Caps) -> None:
+    picture = caps.get_structure(0)
+    form = f"{picture.get_int('width')[1]}x{picture.get_int('height')[1]}"
+    if run.form and form != run.form:
+        run.failed = run.failed or RunError(f"the size changes from {run.form} to {form} within the sequence")
+    run.form = form
+
+
+def _watch_encoder(encoder: Gst.Element, result: Encoded) -> None:
+    """Count the processor time between a frame that goes in and its packet that comes out, in the encoder's thread."""
+    began: dict[int, float] = {}
+
+    def goes_in(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        began[threading.get_ident()] = time.thread_time()
+        return Gst.PadProbeReturn.OK
+
+    def comes_out(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        start = began.pop(threading.get_ident(), None)
+        result.encode_s += 0.0 if start is None else time.thread_time() - start
+        return Gst.PadProbeReturn.OK
+
+    encoder.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, goes_in)
+    encoder.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, comes_out)
+
+
+def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_picture: OnDecoded) -> Gst.FlowReturn:
+    sample = sink.emit("pull-sample")
+    buffer = sample.get_buffer()
+    running_ns = sample.get_segment().to_running_time(Gst.Format.TIME, buffer.pts)
+    # An encoder may leave out frames; which one this is, its time says.
+    number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
+    result.frames += 1
+    run.moved = time.monotonic()
+    _guarded(run, lambda: on_picture(lane, number, _luma(buffer, sample.get_caps())))
+    return Gst.FlowReturn.ERROR if run.failed else Gst.FlowReturn.OK
+
+
+def _guarded(run: _Run, work: Callable[[], None]) -> None:
+    """What goes wrong in a streaming thread is raised in the one that waits."""
+    if run.failed:
+        return
+    try:
+        work()
+    except BaseException as error:
+        run.failed = error
+
+
+def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> Luma:
+    """A copy of the first plane of a picture with one byte per sample."""
+    picture = caps.get_structure(0)
+    width, height = picture.get_int("width")[1], picture.get_int("height")[1]
+    meta: Any = GstVideo.buffer_get_video_meta(buffer)
+    stride, offset = (meta.stride[0], meta.offset[0]) if meta else (-(-width // 4) * 4, 0)
+    plane = buffer.extract_dup(offset, stride * (height - 1) + width)
+    rows = np.frombuffer(plane.ljust(stride * height, b"\0"), np.uint8).reshape(height, stride)
+    return rows[:, :width]

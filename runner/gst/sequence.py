@@ -1,0 +1,63 @@
+"""What a clip is before anything is measured on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+from gi.repository import Gst, GstPbutils
+
+from runner.errors import UserError
+
+TIMEOUT_S = 20
+# Caps of codecs that keep every sample, as far as they are told from their caps alone.
+LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", "video/x-utvideo", "image/png")
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """Form of a clip.
+
+    width, height  px
+    fps            frames a second, as its container states
+    codec          as GStreamer describes it
+    lossless       whether the codec keeps every sample
+    """
+
+    width: int
+    height: int
+    fps: Fraction
+    codec: str
+    lossless: bool
+
+
+def discover(path: Path, where: str) -> Form:
+    """Look at the head of a clip.
+
+    where   the argument that names it, for messages
+    raises  UserError where it is no readable video
+    """
+    if not path.is_file():
+        raise UserError("command line", where, repr(str(path)), "no such file")
+    if path.stat().st_size == 0:
+        raise UserError("command line", where, repr(str(path)), "the file is empty")
+    discoverer = GstPbutils.Discoverer.new(TIMEOUT_S * Gst.SECOND)
+    try:
+        info = discoverer.discover_uri(path.resolve().as_uri())
+    except Exception as error:  # GLib.Error
+        raise UserError("command line", where, repr(str(path)), f"cannot be read as video: {error}") from None
+    streams = info.get_video_streams()
+    if not streams:
+        raise UserError("command line", where, repr(str(path)), "has no video")
+    stream = streams[0]
+    if stream.get_framerate_num() <= 0:
+        raise UserError("command line", where, repr(str(path)), "has no frame rate")
+    caps = stream.get_caps()
+    return Form(
+        width=stream.get_width(),
+        height=stream.get_height(),
+        fps=Fraction(stream.get_framerate_num(), stream.get_framerate_denom()),
+        codec=str(GstPbutils.pb_utils_get_codec_description(caps)),
+        lossless=caps.get_structure(0).get_name() in LOSSLESS,
+    )

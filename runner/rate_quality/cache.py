@@ -1,0 +1,90 @@
+"""Measured points, kept by content: the same sequence, settings and metric are never encoded twice."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from runner.errors import RunError
+from runner.rate_quality.curves import Point
+
+
+def digest(*parts: object) -> str:
+    """Digest of anything whose text says it all."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Cache:
+    """JSON documents by digest, one small file each, written at once or not at all.
+
+    warn  told, in a line, of a file that cannot be used; it is made again
+    """
+
+    def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
+        self._directory, self._warn = directory, warn
+
+    def load(self, key: str) -> dict[str, Any] | None:
+        path = self._path(key)
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (ValueError, OSError) as error:
+            self._warn(f"{path}: cannot be read ({error}), measured again")
+            return None
+        if not isinstance(document, dict):
+            self._warn(f"{path}: is no cache file, measured again")
+            return None
+        return document
+
+    def store(self, key: str, document: Mapping[str, Any]) -> None:
+        """raises RunError where the disk does not take it"""
+        write_whole(self._path(key), json.dumps(document).encode())
+
+    def _path(self, key: str) -> Path:
+        return self._directory / f"{key}.json"
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """A file that is there wholly or not at all.
+
+    raises  RunError
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+
+
+def point_to_json(point: Point, identities: Mapping[str, str]) -> dict[str, Any]:
+    """identities: by metric, what makes its scores what they are"""
+    return {
+        "actual_kbps": point.actual_kbps,
+        "encode_ms": point.encode_ms,
+        "scores": {identities[name]: scores for name, scores in point.scores.items()},
+    }
+
+
+def point_from_json(
+    scaling: Fraction, kbps: int, data: Mapping[str, Any], identities: Mapping[str, str]
+) -> Point | None:
+    """The point, if it was scored with all of these metrics."""
+    try:
+        scores = {name: tuple(map(float, data["scores"][identity])) for name, identity in identities.items()}
+        return Point(scaling, kbps, float(data["actual_kbps"]), float(data["encode_ms"]), scores)
+    except (KeyError, TypeError, ValueError):
+        return None

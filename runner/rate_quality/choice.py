@@ -1,0 +1,185 @@
+"""From the points of a camera to its rate-quality model: which factors, from which bitrates, up to which. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from math import ceil
+from statistics import fmean
+
+from runner.model import plain
+from runner.rate_quality.curves import (
+    Crossing,
+    Curves,
+    Ladder,
+    Point,
+    best_ladder,
+    climb,
+    crossings,
+    draw_curves,
+    falls,
+    mean_score,
+    reaches,
+)
+
+FEW_FRAMES = 40  # scored ones, below which a mean says little
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What decides between points; see conf/study/paper.yaml.
+
+    metric  the one that chooses, sign -1 where lower is better
+    good    quality at which b_full is set
+    cores   most of a core that an encoder may need; None: no limit
+    fps     of the sequence
+    """
+
+    metric: str
+    sign: int
+    tolerance: float
+    narrowest: float
+    good: float
+    cores: float | None
+    fps: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A rate-quality model and what speaks for it.
+
+    b_min      whole kbit/s, rising from 0
+    dropped    by factor, why it is not in
+    table      for each number of factors the best choice there is, and what it loses
+    cores      by factor, share of a core that its encoder needs, the most of all bitrates
+    warnings   what a person should know before using it
+    """
+
+    scaling: tuple[Fraction, ...]
+    b_min: tuple[int, ...]
+    b_full: int
+    ladder: Ladder
+    crossings: tuple[Crossing, ...]
+    dropped: Mapping[Fraction, str]
+    table: tuple[Ladder, ...]
+    cores: Mapping[Fraction, float]
+    warnings: tuple[str, ...]
+
+
+def choose(points: Sequence[Point], wishes: Wishes) -> Choice:
+    """Choose factors, bounds and b_full from points.
+
+    raises  ValueError where no factor is left
+    """
+    score = mean_score(wishes.metric, wishes.sign)
+    cores = cores_needed(points, wishes.fps)
+    dropped: dict[Fraction, str] = {}
+    if wishes.cores is not None:
+        dropped = {
+            f: f"needs {c:.2f} of a core, allowed {wishes.cores:g}" for f, c in cores.items() if c > wishes.cores
+        }
+    left = [point for point in points if point.scaling not in dropped]
+    if not left:
+        raise ValueError(f"no factor's encoder needs at most {wishes.cores:g} of a core")
+    curves = draw_curves(left, score)
+    ladder, table = best_ladder(curves, wishes.tolerance, wishes.narrowest)
+    warnings = list(_warnings(left, curves, ladder, wishes))
+    b_full, unreached = _b_full(curves, ladder, wishes)
+    warnings += unreached
+    ladder = _below(curves, ladder, b_full)
+    dropped |= {
+        factor: _why_dropped(factor, curves, b_full) for factor in curves.quality if factor not in ladder.scaling
+    }
+    kept = [point for point in left if point.scaling in ladder.scaling]
+    return Choice(
+        scaling=ladder.scaling,
+        b_min=(0, *(round(bound) for bound in ladder.bounds)),
+        b_full=b_full,
+        ladder=ladder,
+        crossings=tuple(crossings(kept, ladder, wishes.metric, wishes.sign)),
+        dropped=dict(sorted(dropped.items())),
+        table=tuple(table),
+        cores=cores,
+        warnings=tuple(warnings),
+    )
+
+
+def pooled(groups: Sequence[Sequence[Point]]) -> list[Point]:
+    """Points of several cameras as those of one: the mean over all their frames."""
+    by_lane: dict[tuple[Fraction, int], list[Point]] = {}
+    for point in (point for group in groups for point in group):
+        by_lane.setdefault((point.scaling, point.target_kbps), []).append(point)
+    return [_mean_point(points) for points in by_lane.values() if len(points) == len(groups)]
+
+
+def _mean_point(points: Sequence[Point]) -> Point:
+    return replace(
+        points[0],
+        actual_kbps=fmean(point.actual_kbps for point in points),
+        encode_ms=fmean(point.encode_ms for point in points),
+        scores={name: tuple(s for point in points for s in point.scores[name]) for name in points[0].scores},
+    )
+
+
+def cores_needed(points: Iterable[Point], fps: Fraction) -> dict[Fraction, float]:
+    """By factor, the largest share of a core that its encoder needed."""
+    found: dict[Fraction, float] = {}
+    for point in points:
+        found[point.scaling] = max(found.get(point.scaling, 0.0), point.encode_ms * float(fps) / 1000)
+    return dict(sorted(found.items()))
+
+
+def _b_full(curves: Curves, ladder: Ladder, wishes: Wishes) -> tuple[int, list[str]]:
+    """The bitrate at which the quality is good enough; the largest measured one where it never is."""
+    reached = reaches(curves, ladder, wishes.sign * wishes.good)
+    if reached is not None:
+        return ceil(reached), []
+    largest = round(float(curves.kbps[-1]))
+    best = wishes.sign * float(curves.best[-1])
+    said = f"b_full: {wishes.metric} {wishes.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is taken"
+    return largest, [said]
+
+
+def _below(curves: Curves, ladder: Ladder, b_full: int) -> Ladder:
+    """Without the factors that no bitrate below b_full would choose."""
+    used = [bound for bound in ladder.bounds if round(bound) < b_full]
+    return climb(curves, ladder.scaling[: len(used) + 1]) or ladder
+
+
+def _why_dropped(factor: Fraction, curves: Curves, b_full: int) -> str:
+    wins = curves.kbps[curves.quality[factor] >= curves.best]
+    if not wins.size:
+        return "never the best"
+    if wins[0] >= b_full:
+        return f"the best from {wins[0]:.0f} kbit/s only, above b_full"
+    return f"the best from {wins[0]:.0f} to {wins[-1]:.0f} kbit/s, where it gains too little over the others"
+
+
+def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, wishes: Wishes) -> Iterable[str]:
+    score = mean_score(wishes.metric, wishes.sign)
+    scored = len(points[0].scores[wishes.metric])
+    if scored < FEW_FRAMES:
+        yield f"only {scored} frames were scored; a longer sequence would say more"
+    if len(ladder.scaling) == 1:
+        low, high = curves.kbps[0], curves.kbps[-1]
+        yield f"the curves never cross between {low:.0f} and {high:.0f} kbit/s: {_shown(ladder.scaling[0])} is the best"
+    if ladder.regret_max > wishes.tolerance:
+        said = f"{ladder.regret_max:.2g} of {wishes.metric}, more than the {wishes.tolerance:g} allowed"
+        yield f"no choice of factors whose ranges are wide enough loses less than {said}"
+    fallen = falls(points, score, wishes.tolerance)
+    if fallen:
+        worst = max(fallen, key=lambda pair: score(pair[0]) - score(pair[1]))
+        pair = " to ".join(str(point.target_kbps) for point in worst)
+        where = f"worst for {_shown(worst[0].scaling)} from {pair} kbit/s, by {score(worst[0]) - score(worst[1]):.2g}"
+        yield f"{len(fallen)} times more bitrate looks worse; {where}"
+    for factor in curves.quality:
+        over = [point for point in points if point.scaling == factor and not point.holds]
+        if over:
+            top = max(over, key=lambda point: point.target_kbps)
+            comes = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
+            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it comes to {comes}; left out there"
+
+
+def _shown(factor: Fraction) -> str:
+    return f"factor {plain(factor)}"

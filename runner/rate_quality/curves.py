@@ -1,0 +1,254 @@
+"""From measured points to a ladder of scaling factors: curves over bitrate, crossings, what is worth keeping. Pure.
+
+Quality is turned so that higher is better. Bitrates are the targets that an encoder was given, since a target is what
+the allocation commands; an encoding that does not hold its target takes no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+
+GRID = 400  # bitrates that curves are compared at, log-spaced
+HOLDS = 1.1  # actual over target bitrate, up to which an encoding holds its target
+SATURATED = 0.8  # below it the encoder has no use for more
+RESAMPLED = 200  # bootstrap samples for the confidence of a crossing
+BLOCKS = 8  # time blocks that are resampled
+CONFIDENCE = (5, 95)  # percentiles
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One encoding of a sequence.
+
+    actual_kbps  what came out of the encoder
+    encode_ms    processor time of the encoder for each frame
+    scores       by metric, the quality of each sampled frame
+    """
+
+    scaling: Fraction
+    target_kbps: int
+    actual_kbps: float
+    encode_ms: float
+    scores: Mapping[str, tuple[float, ...]]
+
+    @property
+    def holds(self) -> bool:
+        return self.actual_kbps <= HOLDS * self.target_kbps
+
+    @property
+    def saturated(self) -> bool:
+        return self.actual_kbps < SATURATED * self.target_kbps
+
+
+Score = Callable[[Point], float]  # quality of a point, higher is better
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Quality of each factor over bitrate.
+
+    kbps     grid, log-spaced
+    quality  by factor, on the grid; -inf where the factor does not hold its target or was not measured
+    """
+
+    kbps: Values
+    quality: Mapping[Fraction, Values]
+
+    @property
+    def best(self) -> Values:
+        """Envelope over all factors (paper, section III)."""
+        return np.asarray(np.max(list(self.quality.values()), axis=0))
+
+
+@dataclass(frozen=True, slots=True)
+class Ladder:
+    """A choice of factors and the bitrates from which each is taken.
+
+    scaling      rising
+    bounds       kbit/s, one less: from bounds[i] on, scaling[i + 1] is taken
+    regret_max   most quality that is lost against the best of all factors
+    regret_mean  the same on average over log bitrate
+    width_min    narrowest range: its end over its beginning
+    """
+
+    scaling: tuple[Fraction, ...]
+    bounds: tuple[float, ...]
+    regret_max: float
+    regret_mean: float
+    width_min: float
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """Where the larger of two factors begins to look better.
+
+    low, high  its 5th and 95th percentile over resampled time blocks of the sequence
+    """
+
+    lower: Fraction
+    upper: Fraction
+    kbps: float
+    low: float
+    high: float
+
+
+def mean_score(metric: str, sign: int = 1) -> Score:
+    """Mean over the sampled frames; sign -1 where lower is better."""
+    return lambda point: sign * float(np.mean(point.scores[metric]))
+
+
+def draw_curves(points: Iterable[Point], score: Score) -> Curves:
+    """Curves through the points: piecewise cubic in log bitrate, monotone where the points are (PCHIP).
+
+    raises  ValueError where no point holds its target
+    """
+    held: dict[Fraction, list[Point]] = {}
+    for point in sorted(points, key=lambda p: (p.scaling, p.target_kbps)):
+        if point.holds:
+            held.setdefault(point.scaling, []).append(point)
+    targets = [point.target_kbps for group in held.values() for point in group]
+    if not targets:
+        raise ValueError("no encoding holds its target bitrate")
+    kbps = np.geomspace(min(targets), max(targets), GRID)
+    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in held.items()})
+
+
+def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
+    from scipy.interpolate import PchipInterpolator
+
+    at = np.log([point.target_kbps for point in points])
+    quality = np.array([score(point) for point in points])
+    inside = (x >= at[0] - 1e-9) & (x <= at[-1] + 1e-9)
+    y = np.full(x.shape, -np.inf)
+    if len(points) > 1:
+        y[inside] = PchipInterpolator(at, quality)(np.clip(x[inside], at[0], at[-1]))
+    if points[-1].saturated:
+        y[x > at[-1]] = quality[-1]
+    return y
+
+
+def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
+    """The bitrate from which the larger factor looks better; None where one of the two wins throughout.
+
+    Noisy curves may cross more than once: the bound is the one that loses least quality, summed over log bitrate.
+    """
+    gain = _gain(curves.quality[upper], curves.quality[lower])
+    lost_below = np.concatenate([[0.0], np.cumsum(np.maximum(gain, 0))])  # by taking the lower one up to here
+    lost_above = np.concatenate([np.cumsum(np.maximum(-gain, 0)[::-1])[::-1], [0.0]])
+    at = int(np.argmin(lost_below + lost_above))
+    if at in (0, len(gain)):
+        return None
+    before, after = gain[at - 1], gain[at]
+    share = -before / (after - before) if before < 0 < after else 0.5
+    x = np.log(curves.kbps)
+    return float(np.exp(x[at - 1] + share * (x[at] - x[at - 1])))
+
+
+def _gain(upper: Values, lower: Values) -> Values:
+    """What the larger factor gains, finite: all or nothing where only one of them works."""
+    return np.nan_to_num(upper - lower, nan=0.0, posinf=1e3, neginf=-1e3)
+
+
+def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Ladder, list[Ladder]]:
+    """The smallest choice of factors that loses nobody more than `tolerance`.
+
+    tolerance  quality, see `Metric.tolerance`
+    narrowest  a range must end at this many times its beginning, or its factor is not worth a switch
+    returns    the ladder, and for each number of factors the best there is, to show what fewer would lose
+
+    Where no choice meets both, the one that loses least.
+    """
+    ladders = [ladder for chosen in _choices(curves) if (ladder := climb(curves, chosen)) is not None]
+    wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
+    by_size: dict[int, Ladder] = {}
+    for ladder in sorted(wide, key=lambda one: (one.regret_max, one.regret_mean)):
+        by_size.setdefault(len(ladder.scaling), ladder)
+    best = [by_size[size] for size in sorted(by_size)]
+    fits = (ladder for ladder in best if ladder.regret_max <= tolerance)
+    return next(fits, min(best, key=lambda ladder: ladder.regret_max)), best
+
+
+def _choices(curves: Curves) -> Iterator[tuple[Fraction, ...]]:
+    """All choices among the factors that are the best anywhere."""
+    winners = sorted({factor for factor, y in curves.quality.items() if np.any((y >= curves.best) & np.isfinite(y))})
+    for size in range(1, len(winners) + 1):
+        yield from combinations(winners, size)
+
+
+def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
+    """These factors, each taken in its range; None where one of them would have none."""
+    bounds = [cross(curves, lower, upper) for lower, upper in pairwise(scaling)]
+    found = [bound for bound in bounds if bound is not None]
+    if len(found) < len(bounds) or any(a >= b for a, b in pairwise(found)):
+        return None
+    quality = along(curves, scaling, found)
+    best = curves.best
+    regret = (best - quality)[np.isfinite(best)]
+    # The first range reaches down to 0 and the last has no end: only those between are narrow.
+    width = min((b / a for a, b in pairwise(found)), default=np.inf)
+    return Ladder(tuple(scaling), tuple(found), float(regret.max()), float(regret.mean()), width)
+
+
+def along(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
+    """Quality on the grid when each factor is taken in its range."""
+    taken = np.searchsorted(bounds, curves.kbps, side="right")
+    return np.asarray(np.choose(taken, [curves.quality[factor] for factor in scaling]))
+
+
+def crossings(points: Sequence[Point], ladder: Ladder, metric: str, sign: int) -> list[Crossing]:
+    """Bounds of a ladder with their confidence: the sequence is resampled in time blocks (block bootstrap).
+
+    All points were scored at the same frames, so that differences between factors are paired.
+    """
+    frames = len(next(iter(points)).scores[metric])
+    draws: dict[int, list[float]] = {number: [] for number in range(len(ladder.bounds))}
+    for weights in _resampled(frames):
+        curves = draw_curves(points, lambda p, w=weights: sign * float(np.dot(p.scores[metric], w)))  # type: ignore[misc]
+        for number, (lower, upper) in enumerate(pairwise(ladder.scaling)):
+            bound = cross(curves, lower, upper)
+            if bound is not None:
+                draws[number].append(bound)
+    found = []
+    for number, (lower, upper) in enumerate(pairwise(ladder.scaling)):
+        kbps = ladder.bounds[number]
+        low, high = np.percentile([*draws[number], kbps], CONFIDENCE)
+        found.append(Crossing(lower, upper, kbps, min(float(low), kbps), max(float(high), kbps)))
+    return found
+
+
+def _resampled(frames: int) -> Iterator[Values]:
+    """Weights of the frames, summing to 1, for each bootstrap sample; always the same ones."""
+    random = np.random.default_rng(0)
+    block = np.arange(frames) * min(BLOCKS, frames) // frames
+    sizes = np.bincount(block)
+    for _ in range(RESAMPLED):
+        counts = np.bincount(random.integers(0, len(sizes), len(sizes)), minlength=len(sizes))
+        weights = counts[block].astype(float)
+        yield weights / weights.sum()
+
+
+def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
+    """The smallest bitrate at which a ladder reaches a quality and keeps it; None where it does not."""
+    below = np.flatnonzero(along(curves, ladder.scaling, ladder.bounds) < quality)
+    if not below.size:
+        return float(curves.kbps[0])
+    first = int(below[-1]) + 1
+    return float(curves.kbps[first]) if first < len(curves.kbps) else None
+
+
+def falls(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
+    """Pairs of neighbouring points of a factor in which more bitrate looks worse."""
+    found = []
+    ordered = sorted(points, key=lambda p: (p.scaling, p.target_kbps))
+    for before, after in pairwise(ordered):
+        if before.scaling == after.scaling and score(after) < score(before) - tolerance:
+            found.append((before, after))
+    return found

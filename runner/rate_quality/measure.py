@@ -1,0 +1,211 @@
+"""Measure the rate-quality models of some cameras, one after the other, and write them down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from runner.errors import RunError, UserError
+from runner.graph import compile_graph
+from runner.model import Camera, Progress, Vehicle
+from runner.rate_quality import plans
+from runner.rate_quality.artefact import Measured, dumps, to_json, to_yaml
+from runner.rate_quality.cache import Cache, file_digest, write_whole
+from runner.rate_quality.choice import Wishes, choose, pooled
+from runner.rate_quality.curves import Point, mean_score
+from runner.rate_quality.lanes import Lane, cut, fragment
+from runner.rate_quality.metrics import Metric, find_metric
+from runner.rate_quality.sequence import Sequence as Clip
+from runner.rate_quality.sequence import as_filmed, survey
+from runner.rate_quality.study import Study, stride
+from runner.rate_quality.sweep import Sweep, open_executor, parallel_tasks
+from runner.sources import cache_directory
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from runner.rate_quality.metrics import Mask
+
+LATER_ROUNDS = 0.3  # of the first round's work: what the adaptive plan is expected to add
+
+
+def measure(
+    vehicle: Vehicle,
+    study: Study,
+    sequences: Mapping[str, Path],
+    output: Path,
+    progress: Progress,
+    say: Callable[[str], None],
+) -> Iterator[str]:
+    """Measure and write models; yields a line for each.
+
+    sequences  by camera, its clip
+    raises     UserError for what cannot be measured, RunError where a run fails; finished models stay
+    """
+    metrics = tuple(_metric(study, name) for name in study.metrics)
+    cache = Cache(cache_directory() / "points", say)
+    clips = {name: survey(path, cache, lambda frames: None) for name, path in sequences.items()}
+    parallel = parallel_tasks(study.parallel)
+    alone = {name: (name,) for name in sequences if not any(name in members for members in study.pool.values())}
+    with open_executor(study.workers, study.scheduler, parallel) as executor:
+        for model, members in {**alone, **study.pool}.items():
+            sweeps = [_sweep(vehicle, study, name, clips[name], metrics, cache, executor, parallel) for name in members]
+            measured = _measure(model, vehicle, study, sweeps, metrics, progress)
+            yield _write(measured, output, sweeps)
+
+
+def _metric(study: Study, name: str) -> Metric:
+    return find_metric(
+        name,
+        brisque_model=study.brisque_model,
+        brisque_range=study.brisque_range,
+        vmaf_model=study.vmaf_model,
+    )
+
+
+def _sweep(
+    vehicle: Vehicle,
+    study: Study,
+    name: str,
+    clip: Clip,
+    metrics: tuple[Metric, ...],
+    cache: Cache,
+    executor: Executor,
+    parallel: int,
+) -> Sweep:
+    from runner.apply import versions
+
+    camera, _ = as_filmed(vehicle.cameras[name], clip)
+    plan = compile_graph(camera, vehicle.media)
+    roi = camera.crop or camera.full_roi
+    before, behind = cut(plan)
+    mask = study.masks.get(name)
+    key_interval = round(float(camera.graph.settings.get("key_interval_s", 0)) * float(camera.fps))
+    return Sweep(
+        name=name,
+        clip=clip,
+        plan=plan,
+        roi=roi,
+        metrics=metrics,
+        stride=stride(study, clip.frames, key_interval),
+        mask=_read_mask(mask, name, camera) if mask else None,
+        mask_digest=file_digest(mask) if mask else "",
+        encoder=versions((*before, *behind)),
+        cache=cache,
+        executor=executor,
+        parallel=parallel,
+    )
+
+
+def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
+    """A picture of the camera's size; what is black in it does not count.
+
+    raises  UserError
+    """
+    import cv2
+
+    where = f"masks.{name}"
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if picture is None:
+        rule = "cannot be read as a picture" if path.is_file() else "no such file"
+        raise UserError("command line", where, repr(str(path)), rule)
+    if picture.shape != (camera.height, camera.width):
+        found = f"{picture.shape[1]}x{picture.shape[0]}"
+        raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the sequence is")
+    mask: Mask = picture > 127
+    if not mask.any():
+        raise UserError("command line", where, repr(str(path)), "is all black: nothing would count")
+    return mask
+
+
+def _measure(
+    name: str, vehicle: Vehicle, study: Study, sweeps: Sequence[Sweep], metrics: tuple[Metric, ...], progress: Progress
+) -> Measured:
+    chooses = metrics[0]
+    sign = 1 if chooses.higher_is_better else -1
+    wishes = Wishes(
+        metric=chooses.name,
+        sign=sign,
+        tolerance=chooses.tolerance if study.tolerance is None else study.tolerance,
+        narrowest=study.narrowest,
+        good=chooses.good if study.b_full_quality is None else study.b_full_quality,
+        cores=study.cpu_cores,
+        fps=sweeps[0].plan.camera.fps,
+    )
+    points = _points(study, wishes, sweeps, lambda share: progress(name, share))
+    try:
+        choice = choose(points, wishes)
+    except ValueError as error:
+        raise RunError(f"{name}: {error}") from None
+    first = sweeps[0]
+    lane = Lane(study.scalings[0], study.rates[0])
+    text = fragment(first.plan, first.plan.camera.full_roi, lane)
+    return Measured(
+        name=name,
+        camera=vehicle.cameras[first.name],
+        clips={sweep.name: sweep.clip for sweep in sweeps},
+        masks={sweep.name: sweep.mask_digest for sweep in sweeps if sweep.mask_digest},
+        encoder={"graph": text, "versions": first.encoder},
+        metrics={metric.name: metric.identity for metric in metrics},
+        labels={metric.name: metric.label for metric in metrics},
+        metric=chooses.name,
+        sign=sign,
+        good=wishes.good,
+        plan=study.plan,
+        stride=first.stride,
+        points=points,
+        choice=choice,
+        notes=[note for sweep in sweeps for note in _notes(vehicle.cameras[sweep.name], sweep.clip)],
+    )
+
+
+def _points(study: Study, wishes: Wishes, sweeps: Sequence[Sweep], told: Callable[[float], None]) -> list[Point]:
+    """Points of one model, round by round, until its plan wants no more."""
+    groups: list[list[Point]] = [[] for _ in sweeps]
+    done = expected = 0.0
+    while lanes := _next(study, wishes, pooled(groups)):
+        cost = float(sum(lane.scaling**2 for lane in lanes)) * len(sweeps)
+        later = LATER_ROUNDS * cost if study.plan == "adaptive" and not done else 0.0
+        expected = max(expected, done + cost + later)
+        for index, sweep in enumerate(sweeps):
+            part = cost / len(sweeps)
+            groups[index] += sweep.measure(lanes, _rising(told, done / expected, part / expected))
+            done += part
+    told(1.0)
+    return pooled(groups)
+
+
+def _rising(told: Callable[[float], None], begun: float, part: float) -> Callable[[float], None]:
+    """Tells how much of the whole is done, from how much of a part is; the end is told by who knows that it is."""
+    return lambda share: told(min(0.99, begun + part * share))
+
+
+def _next(study: Study, wishes: Wishes, points: Sequence[Point]) -> list[Lane]:
+    if study.plan == "full":
+        return plans.full(study.scalings, study.rates, points)
+    score = mean_score(wishes.metric, wishes.sign)
+    return plans.adaptive(study.scalings, study.rates, points, score, wishes.tolerance, wishes.narrowest)
+
+
+def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
+    if not clip.lossless:
+        yield f"{Path(clip.path).name} was compressed before ({clip.codec}): high qualities are flattered"
+    _, form = as_filmed(camera, clip)
+    if form:
+        yield form
+
+
+def _write(measured: Measured, output: Path, sweeps: Sequence[Sweep]) -> str:
+    """Write all files of a model; the line that says so."""
+    from runner.rate_quality.plots import plot
+
+    write_whole(output / f"{measured.name}.model.json", dumps(to_json(measured)))
+    write_whole(output / f"{measured.name}.yaml", to_yaml(measured).encode())
+    plot(measured, output / measured.name)
+    choice = measured.choice
+    pairs = zip(choice.scaling, choice.b_min, strict=True)
+    ladder = ", ".join(f"{float(factor):g} from {bound}" for factor, bound in pairs)
+    encoded, found = (sum(getattr(sweep, key) for sweep in sweeps) for key in ("encoded", "found"))
+    head = f"{output / measured.name}.yaml: {ladder}, b_full {choice.b_full} kbit/s"
+    return "\n".join([f"{head} ({encoded} encoded, {found} known)", *(f"  {warning}" for warning in measured.warnings)])

@@ -1,0 +1,84 @@
+"""Which encodings to make next, from those that are there. Pure: a plan is asked again until it wants no more."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+
+from runner.rate_quality.curves import Curves, Ladder, Point, Score, along, best_ladder, draw_curves
+from runner.rate_quality.lanes import Lane
+
+FIRST_RATES = 4  # of the adaptive plan, for each factor
+CLOSE = 1.05  # a crossing is known when both factors were encoded so near to it
+SHARE = 3  # the adaptive plan makes at most one in so many encodings of the full one
+
+
+def full(scalings: Sequence[Fraction], rates: Sequence[int], points: Iterable[Point]) -> list[Lane]:
+    """Every factor at every bitrate (paper, section V-A)."""
+    return _missing([Lane(factor, kbps) for factor in scalings for kbps in rates], points)
+
+
+def adaptive(
+    scalings: Sequence[Fraction],
+    rates: Sequence[int],
+    points: Sequence[Point],
+    score: Score,
+    tolerance: float,
+    narrowest: float,
+) -> list[Lane]:
+    """A few bitrates for each factor, then both neighbours of each crossing until it stays where it was predicted.
+
+    rates      of the full plan, rising; their ends are kept, and no more than a third of its encodings are made
+    score, tolerance, narrowest  as `curves.best_ladder` takes them
+    """
+    first = _missing([Lane(factor, kbps) for factor in scalings for kbps in spread(rates, FIRST_RATES)], points)
+    if first or len(rates) <= FIRST_RATES:
+        return first
+    curves = draw_curves(points, score)
+    ladder, _ = best_ladder(curves, tolerance, narrowest)
+    left = max(0, len(scalings) * len(rates) // SHARE - len(points))
+    return (_unknown(_crossings(ladder), points) or _unknown(_rivals(curves, ladder, tolerance), points))[:left]
+
+
+def _crossings(ladder: Ladder) -> list[Lane]:
+    """Both neighbours of each predicted crossing."""
+    pairs = zip(pairwise(ladder.scaling), ladder.bounds, strict=True)
+    return [Lane(factor, round(kbps)) for neighbours, kbps in pairs for factor in neighbours]
+
+
+def _rivals(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
+    """Factors that are left out and nearly as good, where they are most so, beside the one that is kept there."""
+    kept = along(curves, ladder.scaling, ladder.bounds)
+    wanted: list[tuple[float, list[Lane]]] = []
+    for factor, quality in curves.quality.items():
+        gain = np.where(np.isfinite(kept) & np.isfinite(quality), quality - kept, -np.inf)
+        at = int(np.argmax(gain))
+        if factor not in ladder.scaling and gain[at] > -tolerance:
+            kbps = float(curves.kbps[at])
+            taken = ladder.scaling[bisect_right(ladder.bounds, kbps)]
+            wanted.append((float(gain[at]), [Lane(factor, round(kbps)), Lane(taken, round(kbps))]))
+    return [lane for _, lanes in sorted(wanted, key=lambda one: -one[0]) for lane in lanes]
+
+
+def _unknown(lanes: Iterable[Lane], points: Sequence[Point]) -> list[Lane]:
+    """Those that nothing was encoded near enough to."""
+    return [
+        lane
+        for lane in dict.fromkeys(lanes)
+        if not any(p.scaling == lane.scaling and 1 / CLOSE <= p.target_kbps / lane.kbps <= CLOSE for p in points)
+    ]
+
+
+def spread(rates: Sequence[int], count: int) -> list[int]:
+    """Some of the bitrates, both ends among them, as even in log bitrate as they come."""
+    wanted = np.geomspace(rates[0], rates[-1], min(count, len(rates)))
+    return sorted({min(rates, key=lambda rate: float(abs(np.log(rate / want)))) for want in wanted})
+
+
+def _missing(lanes: Sequence[Lane], points: Iterable[Point]) -> list[Lane]:
+    have = {(point.scaling, point.target_kbps) for point in points}
+    return [lane for lane in lanes if (lane.scaling, lane.kbps) not in have]

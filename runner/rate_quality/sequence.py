@@ -1,0 +1,119 @@
+"""A recorded sequence of a camera, looked through once: how long it is, how hard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+from runner.errors import RunError, UserError
+from runner.model import Camera
+from runner.rate_quality.cache import Cache, digest, file_digest
+from runner.rate_quality.lanes import FRAMES, LaneSet
+
+if TYPE_CHECKING:
+    from runner.rate_quality.metrics import Luma
+
+SURVEY_VERSION = 1
+FEWEST_FRAMES = 25
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """A clip and what is known of it.
+
+    sha256         of the file
+    width, height  px
+    fps            frames a second
+    lossless       whether its codec keeps every sample
+    si, ti         spatial and temporal information, the largest of all frames (ITU-T P.910); si_mean, ti_mean
+    """
+
+    path: str
+    sha256: str
+    width: int
+    height: int
+    fps: Fraction
+    codec: str
+    lossless: bool
+    frames: int
+    si: float
+    ti: float
+    si_mean: float
+    ti_mean: float
+
+    @property
+    def decode(self) -> str:
+        """The line that makes its frames."""
+        return decoding(self.path, self.fps)
+
+
+def decoding(path: str, fps: Fraction) -> str:
+    """I420 frames of a clip at a constant rate, as GStreamer parses it."""
+    quoted = path.replace("\\", "\\\\").replace('"', '\\"')
+    rate = f"video/x-raw,framerate={fps.numerator}/{fps.denominator}"
+    raw = "videoconvert ! video/x-raw,format=I420"
+    return f'filesrc location="{quoted}" ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}'
+
+
+def survey(path: Path, cache: Cache, progress: Callable[[int], None]) -> Sequence:
+    """Look a clip through.
+
+    progress  told how many frames were seen
+    raises    UserError where it cannot be used
+    """
+    from runner.apply import discover
+
+    where = "sequence"
+    form = discover(path, where)
+    sha256 = file_digest(path)
+    key = digest("survey", SURVEY_VERSION, sha256)
+    known = cache.load(key)
+    if known is None:
+        known = _look_through(path, form.fps, progress)
+        cache.store(key, known)
+    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **asdict(form), **known)
+    if sequence.frames < FEWEST_FRAMES:
+        found = f"{path}: {sequence.frames} frames"
+        raise UserError("command line", where, found, f"is too short, at least {FEWEST_FRAMES} are needed")
+    return sequence
+
+
+def _look_through(path: Path, fps: Fraction, progress: Callable[[int], None]) -> dict[str, Any]:
+    from runner.apply import run_lanes
+    from runner.rate_quality.siti import spatial, temporal
+
+    si: list[float] = []
+    ti: list[float] = []
+    before: Luma | None = None
+
+    def look(_number: int, luma: Luma) -> None:
+        nonlocal before
+        si.append(spatial(luma))
+        if before is not None:
+            ti.append(temporal(before, luma))
+        before = luma
+
+    line = f"{decoding(str(path.resolve()), fps)} ! identity name={FRAMES} ! fakesink sync=false"
+    try:
+        run_lanes(LaneSet(line, fps, ()), look, lambda *_: None, progress)
+    except RunError as error:
+        raise UserError("command line", "sequence", repr(str(path)), f"cannot be decoded to its end: {error}") from None
+    means = {"si_mean": fmean(si or [0.0]), "ti_mean": fmean(ti or [0.0])}
+    return {"frames": len(si), "si": max(si, default=0.0), "ti": max(ti, default=0.0), **means}
+
+
+def as_filmed(camera: Camera, sequence: Sequence) -> tuple[Camera, str]:
+    """A camera at the size and rate of a sequence, and what that means for its bitrates, or ""."""
+    size = (sequence.width, sequence.height)
+    if size == camera.source_size:
+        filmed = replace(camera, fps=sequence.fps)
+    else:
+        filmed = replace(camera, width=size[0], height=size[1], native=None, crop=None, fps=sequence.fps)
+    form, own = (f"{c.width}x{c.height} at {float(c.fps):g} Hz" for c in (filmed, camera))
+    if form == own:
+        return filmed, ""
+    return filmed, f"the sequence is {form}, the camera {own}: the bitrates are those of the sequence"

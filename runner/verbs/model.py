@@ -1,0 +1,153 @@
+"""usage: tod-runner model [OVERRIDE ...] camera=NAME sequence=CLIP output=DIR
+       tod-runner model [OVERRIDE ...] vehicle=NAME sequence=DIR output=DIR
+       tod-runner model compare A.model.json B.model.json
+
+Measures rate-quality models: each recorded sequence is scaled, encoded by the live graph's own encoder at constant
+bitrates, decoded, scaled up again and compared with the original. Writes for each camera DIR/CAMERA.yaml, ready for
+conf/cameras/, DIR/CAMERA.model.json with every point, and the curves as .png and .pdf.
+
+camera= is a camera of the vehicle, else a kind in conf/cameras/; without it all cameras of the vehicle are measured,
+and sequence= is a directory with one clip for each, named after it. Without sequence= the source's own clips are taken.
+How it is measured stands in conf/study/paper.yaml; its keys may be given alone: metric= plan= scalings= bitrates_kbps=
+b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
+
+What was measured is kept by content in the user's cache: a run that is interrupted goes on where it stopped.
+
+  tod-runner model camera=front_center sequence=drive.mp4 output=models
+  tod-runner model camera=front_center sequence=drive.mp4 output=models metric=[mssim,psnr] plan=full
+  tod-runner model vehicle=tum_q7 sequence=recording/ output=models 'pool={front_side:[front_left,front_right]}'
+  tod-runner model vehicle=tum_q7 source=synthetic output=models graph=openh264_rtsp
+  tod-runner model camera=top_left sequence=top.mkv output=models masks.top_left=mask.png cpu_cores=0.3
+  tod-runner model compare models/front_center.model.json models_new/front_center.model.json
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from runner.compose import conf_directories, options
+from runner.config import load_study
+from runner.errors import ConfigError, Problem, RunError, UserError
+from runner.model import ModelError, Vehicle, suggest
+from runner.schema import schema_document
+from runner.verbs import Arguments
+from runner.verbs.screen import progress_bar, say, streaming
+
+if TYPE_CHECKING:
+    from runner.rate_quality.study import Study
+
+NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # what else may be named after a camera
+
+
+def run(arguments: Arguments) -> int:
+    streaming()
+    _need_libraries()
+    output = arguments.path("output")
+    if output is None:
+        raise UserError("command line", "output", None, "must be given: the directory that models are written to")
+    vehicle, study, names = _wanted(arguments)
+    paths = _sequences(arguments, vehicle, names)
+    from runner.rate_quality.measure import measure
+
+    with progress_bar() as progress:
+        for written in measure(vehicle, study, {name: paths[name] for name in names}, output, progress, say):
+            print(written)
+    return 0
+
+
+def compare(words: Sequence[str]) -> int:
+    """The verb's second form: how two model files differ."""
+    from runner.rate_quality.artefact import read_model
+    from runner.rate_quality.compare import compare as differences
+
+    if len(words) != 2:
+        raise UserError(
+            "command line", "model compare", f"{len(words)} files", "must be two: A.model.json B.model.json"
+        )
+    before, after = (read_model(Path(word)) for word in words)
+    print("\n".join(differences(before, after)))
+    return 0
+
+
+def _need_libraries() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("numba", "cv2", "scipy", "matplotlib") if find_spec(name) is None]
+    if missing:
+        raise RunError(f"the Python modules {', '.join(missing)} are not installed: pip install 'tod-runner[model]'")
+
+
+def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
+    """The vehicle, how to measure, and which of its cameras; a camera of another kind is mounted for it."""
+    from runner.apply import check_plan
+    from runner.rate_quality.study import check_cameras, check_size
+
+    words = [_study_word(word) for word in arguments.overrides]
+    wanted = arguments.values.get("camera")
+    vehicle, study = load_study(words, arguments.conf, check=check_plan)
+    if wanted and wanted not in vehicle.cameras:
+        kinds = options("cameras", conf_directories(arguments.conf))
+        if wanted not in kinds:
+            hint = suggest(wanted, [*vehicle.cameras, *kinds])
+            raise UserError("command line", "camera", repr(wanted), f"is neither mounted nor a kind of camera, {hint}")
+        vehicle, study = load_study([*words, f"+cameras@cameras.{wanted}={wanted}"], arguments.conf, check=check_plan)
+    names = [wanted] if wanted else list(vehicle.cameras)
+    try:
+        check_cameras(study, names)
+        for name in names:
+            check_size(study, vehicle.cameras[name])
+    except ModelError as error:
+        raise UserError("command line", error.key, str(error.found), error.rule) from None
+    return vehicle, study, names
+
+
+def _study_word(word: str) -> str:
+    """A key of conf/study/ that stands alone."""
+    key = re.split(r"[=.]", word.lstrip("+~"), maxsplit=1)[0]
+    return f"study.{word}" if key in schema_document("study")["properties"] and word[0] not in "+~" else word
+
+
+def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Path]:
+    """By camera, its clip."""
+    given = arguments.path("sequence")
+    if given is None:
+        return _clips_of_sources(vehicle, names)
+    if "camera" in arguments.values and not given.is_dir():
+        return {names[0]: given}
+    if not given.is_dir():
+        rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
+        raise UserError("command line", "sequence", repr(str(given)), rule)
+    found: dict[str, Path] = {}
+    problems = []
+    for name in names:
+        clips = sorted(path for path in given.glob(f"{name}.*") if path.suffix not in NO_CLIPS)
+        if len(clips) == 1:
+            found[name] = clips[0]
+        else:
+            rule = f"{len(clips)} files are named {name}.*, must be one"
+            problems.append(Problem("command line", "sequence", repr(str(given)), rule))
+    if problems:
+        raise ConfigError(problems)
+    return found
+
+
+def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Path]:
+    """The clip that each camera's source plays; a drive that is not rendered yet is rendered first."""
+    from dataclasses import replace
+
+    from runner.sources import compile_plans, render_missing
+
+    wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
+    with progress_bar() as progress:
+        render_missing(wanted, progress)
+    found = {}
+    for plan in compile_plans(wanted):
+        clip = next((e.properties["location"] for e in plan.source if "location" in e.properties), None)
+        if clip is None or not plan.loops:
+            rule = f"must be given, since the source of {plan.camera.name} plays no clip"
+            raise UserError("command line", "sequence", None, rule)
+        found[plan.camera.name] = Path(str(clip))
+    return found
