@@ -218,7 +218,7 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "const":
             return f"must be {shown(limit)}"
         case "minItems" | "minLength" | "minProperties":
-            return "must not be empty" if limit == 1 else "must say more"
+            return "must not be empty" if limit == 1 else f"must have at least {limit} entries"
         case "maxProperties":
             return "must have one entry"
         case "pattern":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from runner.errors import RunError, UserError
 from runner.graph import compile_graph
-from runner.model import Camera, Progress, Vehicle
+from runner.model import Camera, ModelError, Progress, Vehicle
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest, write_whole
@@ -18,7 +18,7 @@ from runner.rate_quality.lanes import Lane, cut, fragment
 from runner.rate_quality.metrics import Metric, find_metric
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.sequence import as_filmed, survey
-from runner.rate_quality.study import Study, stride
+from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep, open_executor, parallel_tasks
 from runner.sources import cache_directory
 
@@ -77,6 +77,10 @@ def _sweep(
     from runner.apply import versions
 
     camera, _ = as_filmed(vehicle.cameras[name], clip)
+    try:
+        check_size(study, camera)
+    except ModelError as error:
+        raise UserError("command line", error.key, str(error.found), error.rule) from None
     plan = compile_graph(camera, vehicle.media)
     roi = camera.crop or camera.full_roi
     before, behind = cut(plan)

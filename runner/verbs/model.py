@@ -83,7 +83,7 @@ def _need_libraries() -> None:
 def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     """The vehicle, how to measure, and which of its cameras; a camera of another kind is mounted for it."""
     from runner.apply import check_plan
-    from runner.rate_quality.study import check_cameras, check_size
+    from runner.rate_quality.study import check_cameras
 
     words = [_study_word(word) for word in arguments.overrides]
     wanted = arguments.values.get("camera")
@@ -97,8 +97,6 @@ def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     names = [wanted] if wanted else list(vehicle.cameras)
     try:
         check_cameras(study, names)
-        for name in names:
-            check_size(study, vehicle.cameras[name])
     except ModelError as error:
         raise UserError("command line", error.key, str(error.found), error.rule) from None
     return vehicle, study, names
