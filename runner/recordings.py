@@ -56,7 +56,8 @@ def make_directory(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
+        rule = "must be a directory" if path.exists() else (error.strerror or "").lower()
+        raise UserError("command line", "output", repr(str(path)), rule) from None
 
 
 def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:

@@ -14,7 +14,7 @@ from runner.gst.source import loop_clip
 
 CHECK_MS = 100
 SILENT_S = 10.0  # a source that delivers nothing for so long has failed
-FINISH_S = 60.0  # what waits before the encoder is written, and the file finished, within this time
+WRITE_S = 60.0  # an encoder or a disk that does nothing for so long has failed
 LAST_S = 1.0  # each of the last frames is looked at, so that the file ends with the right one
 
 
@@ -33,7 +33,7 @@ class Recorded:
     frames     frames kept
     seconds    from the first to the end of the last one, by their own time
     missing    frames that this time has room for and that are not there
-    overruns   of these, frames that found the queue before the encoder full
+    overruns   frames that found the queue before the encoder full, also beyond the end
     repeated   frames that the source sent twice to keep its rate, those of a clip not counted
     left_out   frames that the source left out to keep its rate, likewise
     width, height  px, 0 before the first frame
@@ -155,16 +155,22 @@ class Recorder:
         self._recorded = replace(self._recorded, began=now.began)
         if now.frames != self._moved[0] and not self._finishing:
             self._moved = (now.frames, time.monotonic())
-        ending = self._finishing or self._end is not None
-        limit = FINISH_S if ending else SILENT_S
-        if time.monotonic() - self._moved[1] > limit:
-            what = "the file was not finished" if ending else "no frame came"
-            self._close(Stage.FAILED, f"{what} for {limit:g} s")
+        if why := self._stuck():
+            self._close(Stage.FAILED, why)
             return False
         started = self._first != Gst.CLOCK_TIME_NONE
         if started and self._duration_s is not None and now.seconds > self._duration_s - LAST_S:
             self._count_down()
         return True
+
+    def _stuck(self) -> str:
+        """What has not moved on for too long, or ""."""
+        still_s = time.monotonic() - self._moved[1]
+        if self._finishing or self._end is not None:
+            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else ""
+        if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
+            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else ""
+        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else ""
 
     def _count_down(self) -> None:
         """Look at every frame from now on, to cut at the right one."""

@@ -76,7 +76,8 @@ class _Session:
     def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None) -> None:
         self._vehicle, self._directory, self._duration_s = vehicle, directory, duration_s
         self._ended: dict[str, Recorded] = {}
-        self._kept: list[str] = []  # cameras whose files are complete and have their names
+        self._finishing = False  # before the time that was asked for
+        self._kept: set[str] = set()  # cameras whose files are complete and have their names
         self._problems: list[str] = []
         self._losing: set[str] = set()
         self._margin = recordings.margin(vehicle.cameras.values())
@@ -84,15 +85,14 @@ class _Session:
 
     def watch(self, side: RecordingSide, show: Show) -> None:
         """Until every camera has ended."""
-        finishing = False
         while len(self._ended) < len(self._vehicle.cameras):
             time.sleep(SAMPLE_S)
             samples = side.sample()
             show(samples)
             for name, recorded in samples.items():
                 self._take(name, recorded)
-            if not finishing and (self.signal or self._is_full()):
-                finishing = True
+            if not self._finishing and (self.signal or self._is_full()):
+                self._finishing = True
                 side.finish()
 
     def _take(self, name: str, recorded: Recorded) -> None:
@@ -112,13 +112,13 @@ class _Session:
         except RunError as error:  # the other cameras go on
             self._fail(f"{name}: {error}")
             return
-        self._kept.append(name)
+        self._kept.add(name)
         self._check_length(name, recorded)
 
     def _check_length(self, name: str, recorded: Recorded) -> None:
         """Whether a camera was recorded for as long as was asked for."""
         asked = self._duration_s
-        if asked is not None and not self.signal and not self._problems and recorded.seconds < asked - SAMPLE_S:
+        if asked is not None and not self._finishing and recorded.seconds < asked - SAMPLE_S:
             self._fail(f"{name}: its source ended after {recorded.seconds:.1f} of {asked:g} s")
 
     def _is_full(self) -> bool:
@@ -145,9 +145,10 @@ class _Session:
                 "configuration": configuration,
             }
             recordings.write_index(self._directory, document)
-        for name in self._kept:
+        kept = [name for name in cameras if name in self._kept]
+        for name in kept:
             print(self._line(name, cameras[name]))
-        for name in self._kept:
+        for name in kept:
             for warning in _warnings(self._ended[name]):
                 print(f"{name}: {warning}", file=sys.stderr)
 
@@ -187,7 +188,7 @@ def _warnings(recorded: Recorded) -> Iterator[str]:
     """What a person should know who takes the file for all that the camera saw."""
     if recorded.missing:
         of = recorded.frames + recorded.missing
-        why = f"; {recorded.overruns} came faster than they could be encoded and written" if recorded.overruns else ""
+        why = ", the encoder or the disk was too slow" if recorded.overruns else ""
         yield f"WARNING: {recorded.missing} of {of} frames are missing{why}"
     if recorded.repeated or recorded.left_out:
         rate = "to keep the camera's fps"
