@@ -15,7 +15,8 @@ from runner.graph import Plan, launch
 from runner.gst import GLib, Gst
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
-from runner.gst.registry import check_plan, missing_plugins, versions
+from runner.gst.recorder import Recorded, Recorder, Stage
+from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.model import Endpoint
@@ -30,11 +31,16 @@ if TYPE_CHECKING:
 __all__ = [
     "OperatorSide",
     "Received",
+    "Recorded",
+    "RecordingSide",
+    "Stage",
     "VehicleSide",
     "check_machine",
     "check_plan",
+    "check_recorders",
     "discover",
     "missing_plugins",
+    "missing_recorders",
     "run_lanes",
     "versions",
 ]
@@ -53,6 +59,16 @@ def check_machine(plans: Sequence[Plan]) -> None:
     refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _opening_fails(plan))]
     if refused:
         raise RunError("\n".join(refused))
+
+
+def check_recorders(plans: Sequence[Plan]) -> None:
+    """Whether every plugin that recording needs is installed.
+
+    raises  RunError that says what to install, for all cameras at once
+    """
+    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_recorders(plan))
+    if missing:
+        raise RunError("\n".join(missing))
 
 
 def _opening_fails(plan: Plan) -> str:
@@ -235,6 +251,45 @@ class OperatorSide:
 
         self._glib.call(stop)
         self._glib.quit()
+
+
+class RecordingSide:
+    """Cameras of the vehicle, each recorded from its source into a file.
+
+    files       by camera, the file that is written
+    duration_s  length of the recordings, s; None: until `finish`
+    """
+
+    def __init__(self, plans: Sequence[Plan], files: Mapping[str, Path], duration_s: float | None) -> None:
+        self._glib = _Glib()
+        self._recorders = {p.camera.name: Recorder(p, str(files[p.camera.name]), duration_s) for p in plans}
+        self._for_each(Recorder.start)
+
+    def sample(self) -> dict[str, Recorded]:
+        """What was recorded of each camera so far."""
+        samples: dict[str, Recorded] = {}
+
+        def sample() -> None:
+            samples.update({name: recorder.sample() for name, recorder in self._recorders.items()})
+
+        self._glib.call(sample)
+        return samples
+
+    def finish(self) -> None:
+        """Let every file end with what its source has delivered by now; returns at once."""
+        self._for_each(Recorder.finish)
+
+    def stop(self) -> None:
+        """End at once; what is not finished stays incomplete."""
+        self._for_each(Recorder.stop)
+        self._glib.quit()
+
+    def _for_each(self, do: Callable[[Recorder], None]) -> None:
+        def each() -> None:
+            for recorder in self._recorders.values():
+                do(recorder)
+
+        self._glib.call(each)
 
 
 # --- offline: what driving does not load ------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from runner.resources import directory
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "study")
+GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study")
 COMMAND_LINE = "command line"
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
 

@@ -24,6 +24,7 @@ from runner.model import (
     Place,
     Pose,
     RateQualityModel,
+    Recording,
     Roi,
     Source,
     Turn,
@@ -127,16 +128,17 @@ class _Builder:
             return None
         media, control = (Endpoint(**document[key]) for key in ("media", "control"))
         built = {name: camera for name, camera in cameras.items() if camera}
+        recording = self.part(("recording",), _recording)
         page = Page(**document["page"])
         listening = {"page.port": page.port} if page.serve else {}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
-            self._check_compiles(camera, media, index)
+            self._check_compiles(camera, media, index, recording)
             if camera.source.render:
                 self.attempt(("cameras", camera.name), lambda c=camera: sources.view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
-        if self.problems:
+        if self.problems or recording is None:
             return None
         return Vehicle(
             name=document["name"],
@@ -147,6 +149,7 @@ class _Builder:
             control=control,
             page=page,
             pqos=document["pqos"],
+            recording=recording,
         )
 
     def finished(self, built: T | None) -> T:
@@ -252,11 +255,11 @@ class _Builder:
             elif key == "clip" and not Path(str(given)).is_file():
                 self._report(where, ModelError(key, repr(given), "no such file"))
 
-    def _check_compiles(self, camera: Camera, media: Endpoint, index: int) -> None:
-        """Whether everything that source and graph refer to is there."""
+    def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
+        """Whether everything that source, graph and recording refer to is there."""
         anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
         try:
-            plan = compile_graph(replace(camera, mount=anything), media, index)
+            plan = compile_graph(replace(camera, mount=anything), media, index, recording=recording)
             for knob, value in SAMPLE_KNOBS.items():
                 assignments(camera, knob, value)
             errors = list(self.check(plan)) if self.check else []
@@ -328,6 +331,10 @@ def _source(data: Mapping[str, Any]) -> Source:
         render_s=render["seconds"] if render else 0,
         stand_in=_elements(data.get("stand_in")),
     )
+
+
+def _recording(data: Mapping[str, Any]) -> Recording:
+    return Recording(data["codec"], data["of_raw"], _elements(data["elements"]))
 
 
 def _split(key: str) -> schema.Path:

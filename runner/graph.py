@@ -9,7 +9,19 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from runner.commands import KnobValue
-from runner.model import PLACEHOLDER, Camera, Element, Endpoint, Graph, ModelError, Roi, Source, Value, suggest
+from runner.model import (
+    PLACEHOLDER,
+    Camera,
+    Element,
+    Endpoint,
+    Graph,
+    ModelError,
+    Recording,
+    Roi,
+    Source,
+    Value,
+    suggest,
+)
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 # Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and with what.
@@ -18,6 +30,19 @@ _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
     "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
 }
 Assignment = tuple[str, str, Value]  # element, property, value
+# Before the encoder of a recording. What the queue cannot take is lost and counted, so that a slow encoder or disk
+# never holds up the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts what is kept.
+_QUEUE: dict[str, Value] = {
+    "leaky": "upstream",
+    "max-size-bytes": 128_000_000,
+    "max-size-buffers": 0,
+    "max-size-time": 0,
+}
+_RECORDED = (
+    Element("waiting", "queue", _QUEUE),
+    Element("recorded", "identity", {"single-segment": True}),
+)
+_WRITER = Element("writer", "filesink", {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +56,7 @@ class Plan:
     vehicle    elements after the source
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
+    recorder   elements that follow the source where it is recorded, but for the file; nothing where nobody records
     """
 
     camera: Camera
@@ -42,6 +68,7 @@ class Plan:
     operator: tuple[Element, ...]
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
+    recorder: tuple[Element, ...] = ()
 
     @property
     def serves(self) -> bool:
@@ -68,6 +95,11 @@ class Plan:
         """The same without its sink."""
         return launch(self.operator[:-1])
 
+    def recording(self, path: str) -> str:
+        """The pipeline that records the source into a file, as GStreamer parses it."""
+        writer = replace(_WRITER, properties={"location": path})
+        return launch((*self.source, *_RECORDED, *self.recorder, writer))
+
     def vehicle_line(self, knobs: Mapping[str, KnobValue]) -> str:
         """Arguments for gst-launch-1.0 with the knobs turned, quoted for a shell, ending in a network sink."""
         return shell(turn_elements(self.camera, (*self.printed, *self.vehicle, *self.wire_vehicle), knobs))
@@ -78,16 +110,24 @@ class Plan:
         return shell((*self.wire_operator, *self.operator[1:]) if self.wire_operator else self.operator)
 
 
-def compile_graph(camera: Camera, media: Endpoint, index: int = 0, clip: str | None = None) -> Plan:
+def compile_graph(
+    camera: Camera,
+    media: Endpoint,
+    index: int = 0,
+    clip: str | None = None,
+    recording: Recording | None = None,
+) -> Plan:
     """Fill a camera's source and graph with what belongs to the camera.
 
-    media   the vehicle's RTSP server
-    index   number of the camera in its vehicle, for ports
-    clip    path of the rendered clip, where the source renders one and it is there
-    raises  ModelError for a placeholder that nothing fills, or a name that source and graph share
+    media      the vehicle's RTSP server
+    index      number of the camera in its vehicle, for ports
+    clip       path of the rendered clip, where the source renders one and it is there
+    recording  how `record` keeps what the source delivers
+    raises     ModelError for a placeholder that nothing fills, or a name that the source shares with what follows it
     """
     graph, source = camera.graph, camera.source
-    _check_names(graph, source)
+    recorder = recording.elements if recording else ()
+    _check_names(graph, source, recorder)
     values = _values(camera, media, index, clip)
 
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
@@ -107,6 +147,7 @@ def compile_graph(camera: Camera, media: Endpoint, index: int = 0, clip: str | N
         operator=fill(graph.operator, "graph.operator"),
         wire_vehicle=fill(graph.wire_vehicle, "graph.wire.vehicle"),
         wire_operator=fill(graph.wire_operator, "graph.wire.operator"),
+        recorder=fill(recorder, "recording.elements"),
     )
 
 
@@ -168,8 +209,8 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
     return {"width": width, "height": height}
 
 
-def _check_names(graph: Graph, source: Source) -> None:
-    """Source and graph become one pipeline, whose elements are found by name."""
+def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
+    """Source and graph become one pipeline, source and recording another; elements are found by name."""
     for key, elements in (("elements", source.elements), ("stand_in", source.stand_in)):
         taken = {element.name for element in (*graph.vehicle, *graph.wire_vehicle)}
         for index, element in enumerate(elements):
@@ -177,6 +218,11 @@ def _check_names(graph: Graph, source: Source) -> None:
                 rule = "is already the name of another element"
                 raise ModelError(f"source.{key}[{index}].name", repr(element.name), rule)
             taken.add(element.name)
+    taken = {element.name for element in (*source.elements, *source.stand_in, *_RECORDED, _WRITER)}
+    for index, element in enumerate(recorder):
+        if element.name in taken:
+            rule = "is already the name of another element"
+            raise ModelError(f"recording.elements[{index}].name", repr(element.name), rule)
 
 
 def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> dict[str, Value]:

@@ -203,6 +203,23 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
+class Recording:
+    """How frames are kept without loss, as the YAML states it.
+
+    codec     its name, for people and for recording.json
+    of_raw    largest share of the raw frames' size that a file is planned to take
+    elements  from raw frames to a Matroska stream, may hold {placeholders}
+    """
+
+    codec: str
+    of_raw: float
+    elements: tuple[Element, ...]
+
+    def __post_init__(self) -> None:
+        _check_unique("elements", [element.name for element in self.elements])
+
+
+@dataclass(frozen=True, slots=True)
 class Pose:
     """Where a camera sits on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
 
@@ -294,8 +311,9 @@ class Page:
 class Vehicle:
     """Everything the runner needs to know, valid once built.
 
-    modes  the rule list of each mode
-    pqos   the prediction source as the YAML states it, read by `pqos.py`
+    modes      the rule list of each mode
+    pqos       the prediction source as the YAML states it, read by `pqos.py`
+    recording  how `record` keeps the frames of every camera
     """
 
     name: str
@@ -306,6 +324,7 @@ class Vehicle:
     control: Endpoint
     page: Page
     pqos: Mapping[str, Any]
+    recording: Recording
 
 
 Progress = Callable[[str, float], None]  # what is being done, share done in [0, 1]

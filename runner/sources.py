@@ -25,7 +25,7 @@ def cache_directory() -> Path:
 def compile_plans(vehicle: Vehicle) -> list[Plan]:
     """A plan for each camera, with its rendered clip where there is one."""
     return [
-        compile_graph(camera, vehicle.media, index, clip=_rendered(camera))
+        compile_graph(camera, vehicle.media, index, clip=_rendered(camera), recording=vehicle.recording)
         for index, camera in enumerate(vehicle.cameras.values())
     ]
 

@@ -71,6 +71,16 @@ def test_the_printed_lines_of_front_left() -> None:
     )
 
 
+def test_the_recording_of_front_left() -> None:
+    recording = vehicle("modes=paper").recording
+    assert compile_graph(LEFT, MEDIA, recording=recording).recording("/tmp/my rec/.front_left.mkv.part") == (
+        f"{SOURCE} ! queue name=waiting leaky=upstream max-size-bytes=128000000 max-size-buffers=0 max-size-time=0 ! "
+        "identity name=recorded single-segment=true ! "
+        "x264enc name=encoder pass=quant quantizer=0 speed-preset=ultrafast key-int-max=30 ! "
+        'matroskamux name=mux timecodescale=1000 ! filesink name=writer location="/tmp/my rec/.front_left.mkv.part"'
+    )
+
+
 @pytest.mark.parametrize("name", GRAPHS)
 def test_every_graph_ends_in_a_sink_and_begins_with_the_source_for_it(name: str) -> None:
     camera = vehicle(f"graph={name}").cameras["front_right"]

@@ -16,7 +16,7 @@ def count(group: str) -> int:
 
 def test_everything_that_is_packaged_is_valid() -> None:
     result = process("validate")
-    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos")))
+    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos", "recording")))
     combinations = count("vehicle") * count("modes") * count("graph") * count("source")
     assert (result.status, result.err) == (0, "")
     first, *notes = result.out.splitlines()
@@ -31,11 +31,12 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
 def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
     conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
+    groups = "the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/, recording/"
     assert problems(tod, conf) == [
         "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
-        "~/foo.yaml: belongs to no group, the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/",
+        f"~/foo.yaml: belongs to no group, {groups}",
         "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",
-        "~/vehicel/x.yaml: belongs to no group, the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/",
+        f"~/vehicel/x.yaml: belongs to no group, {groups}",
     ]
 
 
@@ -94,3 +95,22 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
     conf.change("graph/h264_rtsp.yaml", {old: new})
     found = problems(tod, conf, *ONE)
     assert any(problem.startswith(f"~/graph/h264_rtsp.yaml: {told}") for problem in found), found
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
+@pytest.mark.parametrize(
+    "old, new, told",
+    [
+        ("element: avenc_ffv1", "element: avenc_ffv2", "elements[0].element: 'avenc_ffv2': unknown element, "),
+        ("slices: 4", "slices: -4", "elements[0].properties.slices: -4: must be from 0 to 2147483647"),
+        ("name: encoder", "name: waiting", "elements[0].name: 'waiting': is already the name of another element"),
+        ("element: matroskamux, properties: {timecodescale: 1000}", "element: h264parse", "elements: could not link"),
+    ],
+)
+def test_ways_to_record_are_checked_though_none_is_chosen(
+    tod: Command, conf: UserConf, old: str, new: str, told: str
+) -> None:
+    conf.change("recording/ffv1.yaml", {old: new})
+    (found,) = problems(tod, conf, *ONE)
+    assert found.startswith(f"~/recording/ffv1.yaml: {told}")

@@ -14,10 +14,10 @@ from runner.model import Element, ModelError, Value, suggest
 PACKAGES = {  # Debian package that brings an element; `doctor` and missing plugins name it
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
-    " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux",
+    " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux matroskamux",
     "gstreamer1.0-plugins-bad": "h264parse openh264enc x265enc srtsrc srtsink vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
-    "gstreamer1.0-libav": "avdec_h264",
+    "gstreamer1.0-libav": "avdec_h264 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
     "gstreamer1.0-x": "textoverlay",
     "nvidia-l4t-gstreamer": "nvvidconv nvv4l2h264enc",
@@ -26,8 +26,17 @@ PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for ele
 
 
 def missing_plugins(plan: Plan) -> list[str]:
-    """A sentence for each element that this project knows and this machine lacks."""
-    names = dict.fromkeys(e.factory for e in (*plan.source, *plan.vehicle, *plan.operator))
+    """A sentence for each element that streaming needs, this project knows and this machine lacks."""
+    return _missing((*plan.source, *plan.vehicle, *plan.operator))
+
+
+def missing_recorders(plan: Plan) -> list[str]:
+    """The same for what recording needs."""
+    return _missing((*plan.source, *plan.recorder))
+
+
+def _missing(elements: Iterable[Element]) -> list[str]:
+    names = dict.fromkeys(element.factory for element in elements)
     return [
         f"the GStreamer element {name} is not installed; on Debian: apt-get install {PACKAGE_OF[name]}"
         for name in names
@@ -49,7 +58,7 @@ def versions(elements: Iterable[Element]) -> dict[str, str]:
 def check_plan(plan: Plan) -> list[ModelError]:
     """All that the registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
 
-    Elements that are known and not installed are the business of `missing_plugins`.
+    Elements that are known and not installed are the business of `missing_plugins` and `missing_recorders`.
     """
     parts = {
         "source.elements": plan.source,
@@ -57,6 +66,7 @@ def check_plan(plan: Plan) -> list[ModelError]:
         "graph.operator": plan.operator,
         "graph.wire.vehicle": plan.wire_vehicle,
         "graph.wire.operator": plan.wire_operator,
+        "recording.elements": plan.recorder,
     }
     found = [error for where, elements in parts.items() for error in _check_elements(elements, where)]
     found += _check_knobs(plan)
@@ -105,10 +115,12 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
 def _check_links(plan: Plan) -> list[ModelError]:
     """Whether neighbours can be linked at all."""
     errors = []
-    for where, line in (("graph.vehicle", plan.pipeline), ("graph.operator", plan.receiver)):
+    lines = [] if missing_plugins(plan) else [("graph.vehicle", plan.pipeline), ("graph.operator", plan.receiver)]
+    if plan.recorder and not missing_recorders(plan):
+        lines.append(("recording.elements", plan.recording("/dev/null")))
+    for where, line in lines:
         try:
-            if not missing_plugins(plan):
-                Gst.parse_launch(line)
+            Gst.parse_launch(line)
         except GLib.Error as error:
             errors.append(ModelError(where, None, error.message))
     return errors

@@ -83,11 +83,12 @@ def _bindings() -> Iterator[Finding]:
 
 
 def _elements(vehicle: Vehicle) -> Iterator[Finding]:
-    from runner.apply import missing_plugins
+    from runner.apply import missing_plugins, missing_recorders
 
     plans = compile_plans(vehicle)
-    names = dict.fromkeys(e.factory for plan in plans for e in (*plan.source, *plan.vehicle, *plan.operator))
-    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
+    lines = [line for plan in plans for line in (plan.source, plan.vehicle, plan.operator, plan.recorder)]
+    names = {element.factory for line in lines for element in line}
+    missing = dict.fromkeys(s for plan in plans for s in (*missing_plugins(plan), *missing_recorders(plan)))
     yield from (Finding(False, sentence) for sentence in missing)
     if not missing:
         yield Finding(True, f"{len(names)} GStreamer elements")

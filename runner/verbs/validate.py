@@ -44,6 +44,7 @@ def run(arguments: Arguments) -> int:
         results = list(pool.map(_check, combinations, chunksize=chunk))
     problems = [problem for result in results for problem in result.problems]
     problems += _prediction_problems(arguments, directories)
+    problems += _recording_problems(arguments, directories)
     if problems:
         raise ConfigError(problems)
     notes = dict.fromkeys(note for result in results for note in result.notes)
@@ -125,16 +126,23 @@ def _prediction_problems(arguments: Arguments, directories: Sequence[Path]) -> I
             yield from error.problems
 
 
+def _recording_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
+    """What is wrong with the ways to record, beyond the one that was chosen and checked in every combination."""
+    if not any(word.lstrip("+~").startswith("recording") for word in arguments.overrides):
+        for option in options("recording", directories):
+            yield from _check(([*arguments.overrides, f"recording={option}"], arguments.conf)).problems
+
+
 def _registry_check(notes: list[str]) -> Check | None:
     """The check against GStreamer's registry; what it could not look at goes to the notes."""
     try:
-        from runner.apply import check_plan, missing_plugins
+        from runner.apply import check_plan, missing_plugins, missing_recorders
     except ImportError:
         notes.append("nothing was checked against the GStreamer registry: its Python bindings are not installed")
         return None
 
     def check(plan: Plan) -> list[ModelError]:
-        notes.extend(f"not checked: {sentence}" for sentence in missing_plugins(plan))
+        notes.extend(f"not checked: {sentence}" for sentence in (*missing_plugins(plan), *missing_recorders(plan)))
         return check_plan(plan)
 
     return check

@@ -1,0 +1,221 @@
+"""One camera recorded from its source into a file: every frame as it enters the pipeline, nothing lost unnoticed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from gi.repository import GLib, Gst
+
+from runner.graph import Plan
+from runner.gst.pipeline import counted
+from runner.gst.source import loop_clip
+
+CHECK_MS = 100
+SILENT_S = 10.0  # a source that delivers nothing for so long has failed
+WRITE_S = 60.0  # an encoder or a disk that does nothing for so long has failed
+LAST_S = 1.0  # each of the last frames is looked at, so that the file ends with the right one
+
+
+class Stage(Enum):
+    """How far a recording is."""
+
+    RECORDING = "recording"
+    FINISHED = "finished"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What was recorded of one camera so far.
+
+    frames     frames kept
+    seconds    from the first to the end of the last one, by their own time
+    missing    frames that this time has room for and that are not there
+    overruns   frames that found the queue before the encoder full, also beyond the end
+    repeated   frames that the source sent twice to keep its rate, those of a clip not counted
+    left_out   frames that the source left out to keep its rate, likewise
+    width, height  px, 0 before the first frame
+    began      time of the first frame, s since 1970; 0 before it
+    why        what failed, or ""
+    """
+
+    stage: Stage = Stage.RECORDING
+    frames: int = 0
+    seconds: float = 0.0
+    missing: int = 0
+    overruns: int = 0
+    repeated: int = 0
+    left_out: int = 0
+    width: int = 0
+    height: int = 0
+    began: float = 0.0
+    why: str = ""
+
+
+class Recorder:
+    """Records one camera. Everything happens in the thread of GLib's main loop, where not said otherwise.
+
+    path        file that is written; closed and complete as soon as the stage is FINISHED
+    duration_s  length of the recording, s; None: until `finish`
+    """
+
+    def __init__(self, plan: Plan, path: str, duration_s: float | None) -> None:
+        self._plan, self._duration_s = plan, duration_s
+        self._pipeline = Gst.parse_launch(plan.recording(path))
+        self._queue, self._counter = map(self._pipeline.get_by_name, ("waiting", "recorded"))
+        self._out = self._counter.get_static_pad("src")
+        self._recorded = Recorded()
+        self._overruns = 0
+        self._first = Gst.CLOCK_TIME_NONE  # ns of running time
+        self._end: tuple[int, int] | None = None  # ns of running time at which the recording is cut, frames until then
+        self._counting_down = self._finishing = False
+        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
+        self._rated = _fixed_rate(self._pipeline) if not plan.loops else []
+
+    def start(self) -> None:
+        """Begin; what cannot begin is FAILED at the next look."""
+        self._queue.connect("overrun", self._on_overrun)
+        self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
+        for element in self._rated:
+            element.set_property("skip-to-first", True)  # else the first frame is repeated for the time before it
+        if self._plan.loops:
+            loop_clip(self._pipeline, self._plan)
+        bus = self._pipeline.get_bus()
+        bus.add_signal_watch()
+        bus.connect("message::error", self._on_error)
+        bus.connect("message::eos", self._on_eos)
+        self._moved = (0, time.monotonic())
+        self._watching = GLib.timeout_add(CHECK_MS, self._watch)
+        self._pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
+
+    def sample(self) -> Recorded:
+        """What was recorded so far."""
+        if self._recorded.stage is Stage.RECORDING:
+            self._recorded = self._count()
+        return self._recorded
+
+    def finish(self) -> None:
+        """Keep what the source has delivered, and end the file; soon the stage is FINISHED."""
+        if self._recorded.stage is not Stage.RECORDING or self._finishing:
+            return
+        if self._first == Gst.CLOCK_TIME_NONE:
+            self._close(Stage.FAILED, "stopped before its first frame")
+            return
+        self._finishing, self._moved = True, (0, time.monotonic())
+        above = self._queue.get_static_pad("sink").get_peer()
+        above.add_probe(Gst.PadProbeType.IDLE, self._end_stream)
+
+    def stop(self) -> None:
+        """End at once; a file that is not FINISHED stays incomplete."""
+        if self._recorded.stage is Stage.RECORDING:
+            self._close(Stage.FAILED, "stopped before its file was finished")
+
+    def _close(self, stage: Stage, why: str = "") -> None:
+        self._recorded = replace(self._count(), stage=stage, why=why)
+        GLib.source_remove(self._watching)
+        self._pipeline.get_bus().remove_signal_watch()
+        self._pipeline.set_state(Gst.State.NULL)
+
+    # --- counting -----------------------------------------------------------------------------------------------------
+
+    def _count(self) -> Recorded:
+        if self._first == Gst.CLOCK_TIME_NONE:
+            return self._recorded
+        # The counter is read last: a frame that passes meanwhile must not look as if it were missing.
+        end, frames = self._end or (self._out.query_position(Gst.Format.TIME)[1], counted(self._counter)[0])
+        seconds = max(0, end - self._first) / Gst.SECOND
+        picture = self._out.get_current_caps().get_structure(0)
+        return Recorded(
+            frames=frames,
+            seconds=seconds,
+            missing=max(0, round(seconds * self._plan.camera.fps) - frames),
+            overruns=self._overruns,
+            repeated=sum(element.get_property("duplicate") for element in self._rated),
+            left_out=sum(element.get_property("drop") for element in self._rated),
+            width=picture.get_int("width")[1],
+            height=picture.get_int("height")[1],
+            began=self._recorded.began or self._began(),
+        )
+
+    def _began(self) -> float:
+        """The clock of the wall at the first frame."""
+        clock = self._pipeline.get_clock()
+        if clock is None:
+            return 0.0
+        age = clock.get_time() - self._pipeline.get_base_time() - self._first
+        return time.time() - float(age / Gst.SECOND)
+
+    # --- watching -----------------------------------------------------------------------------------------------------
+
+    def _watch(self) -> bool:
+        """A few times a second: whether frames come, and whether the end is near."""
+        now = self._count()
+        self._recorded = replace(self._recorded, began=now.began)
+        if now.frames != self._moved[0] and not self._finishing:
+            self._moved = (now.frames, time.monotonic())
+        if why := self._stuck():
+            self._close(Stage.FAILED, why)
+            return False
+        started = self._first != Gst.CLOCK_TIME_NONE
+        if started and self._duration_s is not None and now.seconds > self._duration_s - LAST_S:
+            self._count_down()
+        return True
+
+    def _stuck(self) -> str:
+        """What has not moved on for too long, or ""."""
+        still_s = time.monotonic() - self._moved[1]
+        if self._finishing or self._end is not None:
+            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else ""
+        if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
+            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else ""
+        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else ""
+
+    def _count_down(self) -> None:
+        """Look at every frame from now on, to cut at the right one."""
+        if not self._counting_down:
+            self._counting_down = True
+            self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_late_frame)
+
+    def _on_late_frame(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """From the streaming thread: the first frame beyond the end ends the file."""
+        assert self._duration_s is not None
+        frame = Gst.SECOND / float(self._plan.camera.fps)
+        time_ns = info.get_buffer().pts
+        if self._end is None and time_ns - self._first < self._duration_s * Gst.SECOND - frame / 2:
+            return Gst.PadProbeReturn.OK
+        if self._end is None:
+            self._end = (time_ns, counted(self._counter)[0] - 1)
+            pad.get_peer().send_event(Gst.Event.new_eos())
+        return Gst.PadProbeReturn.DROP
+
+    def _on_first_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """From the streaming thread."""
+        self._first = info.get_buffer().pts
+        return Gst.PadProbeReturn.REMOVE
+
+    def _end_stream(self, pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """Between two frames, from any thread. The pad stays blocked: nothing comes after the end."""
+        pad.get_peer().send_event(Gst.Event.new_eos())
+        return Gst.PadProbeReturn.OK
+
+    def _on_overrun(self, _queue: Gst.Element) -> None:
+        """From the streaming thread, for each frame that is thrown away."""
+        self._overruns += 1
+
+    def _on_error(self, _bus: Gst.Bus, message: Gst.Message) -> None:
+        self._close(Stage.FAILED, message.parse_error()[0].message)
+
+    def _on_eos(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
+        """The muxer has written its index, and the file is complete."""
+        if self._first == Gst.CLOCK_TIME_NONE:
+            self._close(Stage.FAILED, "its source ended before its first frame")
+        else:
+            self._close(Stage.FINISHED)
+
+
+def _fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
+    """The elements that repeat frames and leave some out to keep a rate, and count them."""
+    counts = ("duplicate", "drop", "skip-to-first")
+    return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]

@@ -1,0 +1,266 @@
+"""usage: tod-runner record [OVERRIDE ...] output=DIR [duration_s=N]
+
+Record each camera without loss: the frames as its source delivers them, in native size, before crop and scale, into
+DIR/CAMERA.mkv, and what was recorded into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with
+Ctrl-C; either way the files are complete. A file has its name only when it is complete; until then, and where its
+camera fails, it is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing, since the encoder or the disk was
+too slow, are counted and told. recording=NAME chooses the encoder, a file of conf/recording/.
+
+Before the start the disk must have room for the raw frames (width x height x 1.5 bytes x fps) times of_raw of
+conf/recording/, for duration_s or else for 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
+comes down to the margin ends, with status 1.
+
+  tod-runner record vehicle=tum_q7 source=v4l2 output=recordings/monday duration_s=60
+  tod-runner record vehicle=delivery_robot source=synthetic output=/tmp/rec duration_s=10
+  tod-runner record source=v4l2 recording=ffv1 '~cameras.rear_center' output=rec    smaller files; one camera less
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner import recordings
+from runner.compose import compose
+from runner.config import load
+from runner.errors import RunError, UserError
+from runner.model import Camera, Vehicle, plain
+from runner.sources import compile_plans, render_missing
+from runner.verbs import Arguments
+from runner.verbs.screen import progress_bar, say, streaming
+
+if TYPE_CHECKING:
+    from runner.apply import Recorded, RecordingSide
+
+SAMPLE_S = 0.25
+SHOW_S = 1.0  # between two lines of figures, where no bar shows how far it is
+Show = Callable[[Mapping[str, "Recorded"]], None]
+
+
+def run(arguments: Arguments) -> int:
+    duration, directory = _duration(arguments), _directory(arguments)
+    apply = streaming()
+    vehicle = load(arguments.overrides, arguments.conf, check=apply.check_plan)
+    _check_sources(vehicle)
+    recordings.make_directory(directory)
+    with progress_bar() as progress:
+        render_missing(vehicle, progress)
+    plans = compile_plans(vehicle)
+    apply.check_recorders(plans)
+    recordings.check_space(directory, vehicle.cameras.values(), vehicle.recording, duration)
+    files = recordings.claim_files(directory, vehicle.cameras)
+    session = _Session(vehicle, directory, duration)
+    with _interrupted(session), _shown(vehicle, files, duration) as show:
+        try:
+            side = apply.RecordingSide(plans, files, duration)
+            try:
+                session.watch(side, show)
+            finally:
+                side.stop()
+        finally:
+            recordings.remove_empty(files.values())
+    session.conclude(compose(arguments.overrides, arguments.conf).document)
+    return session.status()
+
+
+class _Session:
+    """One recording from start to end: names files when they are complete, and knows why it ends."""
+
+    def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None) -> None:
+        self._vehicle, self._directory, self._duration_s = vehicle, directory, duration_s
+        self._ended: dict[str, Recorded] = {}
+        self._finishing = False  # before the time that was asked for
+        self._kept: set[str] = set()  # cameras whose files are complete and have their names
+        self._problems: list[str] = []
+        self._losing: set[str] = set()
+        self._margin = recordings.margin(vehicle.cameras.values())
+        self.signal = 0  # the one that asked for the end
+
+    def watch(self, side: RecordingSide, show: Show) -> None:
+        """Until every camera has ended."""
+        while len(self._ended) < len(self._vehicle.cameras):
+            time.sleep(SAMPLE_S)
+            samples = side.sample()
+            show(samples)
+            for name, recorded in samples.items():
+                self._take(name, recorded)
+            if not self._finishing and (self.signal or self._is_full()):
+                self._finishing = True
+                side.finish()
+
+    def _take(self, name: str, recorded: Recorded) -> None:
+        if recorded.missing and name not in self._losing:
+            self._losing.add(name)
+            say(f"{name}: frames are missing")
+        if name in self._ended or recorded.stage.value == "recording":
+            return
+        self._ended[name] = recorded
+        unfinished = recordings.part(self._directory, name)
+        if recorded.stage.value == "failed":
+            before = f"; what came before is in {unfinished}" if unfinished.stat().st_size else ""
+            self._fail(f"{name}: {recorded.why}{before}")
+            return
+        try:
+            recordings.keep(self._directory, name)
+        except RunError as error:  # the other cameras go on
+            self._fail(f"{name}: {error}")
+            return
+        self._kept.add(name)
+        self._check_length(name, recorded)
+
+    def _check_length(self, name: str, recorded: Recorded) -> None:
+        """Whether a camera was recorded for as long as was asked for."""
+        asked = self._duration_s
+        if asked is not None and not self._finishing and recorded.seconds < asked - SAMPLE_S:
+            self._fail(f"{name}: its source ended after {recorded.seconds:.1f} of {asked:g} s")
+
+    def _is_full(self) -> bool:
+        free = shutil.disk_usage(self._directory).free
+        if free >= self._margin:
+            return False
+        left = f"{recordings.gigabytes(free)} left, {recordings.gigabytes(self._margin)} are kept free"
+        self._fail(f"{self._directory}: {left}: the recording ends early")
+        return True
+
+    def _fail(self, what: str) -> None:
+        self._problems.append(what)
+        say(what)
+
+    def conclude(self, configuration: Mapping[str, Any]) -> None:
+        """Tell what there is now, and write it down next to the files."""
+        cameras = {name: self._entry(self._vehicle.cameras[name], self._ended[name]) for name in self._vehicle.cameras}
+        if self._kept:
+            document = {
+                "tod_runner": version("tod-runner"),
+                "vehicle": self._vehicle.name,
+                "codec": self._vehicle.recording.codec,
+                "cameras": cameras,
+                "configuration": configuration,
+            }
+            recordings.write_index(self._directory, document)
+        kept = [name for name in cameras if name in self._kept]
+        for name in kept:
+            print(self._line(name, cameras[name]))
+        for name in kept:
+            for warning in _warnings(self._ended[name]):
+                print(f"{name}: {warning}", file=sys.stderr)
+
+    def _entry(self, camera: Camera, recorded: Recorded) -> dict[str, Any]:
+        kept = camera.name in self._kept
+        path = (recordings.final if kept else recordings.part)(self._directory, camera.name)
+        if not path.exists():
+            return {"failed": recorded.why}
+        entry: dict[str, Any] = {
+            "file": path.name,
+            "bytes": path.stat().st_size,
+            "width_px": recorded.width,
+            "height_px": recorded.height,
+            "fps": plain(camera.fps),
+            "frames": recorded.frames,
+            "seconds": round(recorded.seconds, 6),
+            "missing_frames": recorded.missing,
+            "overruns": recorded.overruns,
+            "repeated_frames": recorded.repeated,
+            "left_out_frames": recorded.left_out,
+            "began": round(recorded.began, 3),
+        }
+        return entry if kept else {"failed": recorded.why or "not named", **entry}
+
+    def _line(self, name: str, entry: Mapping[str, Any]) -> str:
+        size = f"{entry['width_px']}x{entry['height_px']} at {entry['fps']:g} Hz"
+        amount = f"{entry['frames']} frames in {entry['seconds']:.2f} s, {entry['bytes'] / 1e6:.1f} MB"
+        return f"{name}: {recordings.final(self._directory, name)}: {size}, {amount}"
+
+    def status(self) -> int:
+        if self._problems:
+            return 1
+        return 130 if self.signal == signal.SIGINT else 0
+
+
+def _warnings(recorded: Recorded) -> Iterator[str]:
+    """What a person should know who takes the file for all that the camera saw."""
+    if recorded.missing:
+        of = recorded.frames + recorded.missing
+        why = ", the encoder or the disk was too slow" if recorded.overruns else ""
+        yield f"WARNING: {recorded.missing} of {of} frames are missing{why}"
+    if recorded.repeated or recorded.left_out:
+        rate = "to keep the camera's fps"
+        yield f"WARNING: its source repeated {recorded.repeated} frames and left out {recorded.left_out} {rate}"
+
+
+def _duration(arguments: Arguments) -> float | None:
+    duration = arguments.number("duration_s")
+    if duration == 0:
+        raise UserError("command line", "duration_s", repr(arguments.values["duration_s"]), "must be above 0")
+    return duration
+
+
+def _directory(arguments: Arguments) -> Path:
+    if not arguments.values.get("output"):
+        raise UserError("command line", "output", "missing", "must be given: output=DIR, a directory for the files")
+    return Path(arguments.values["output"])
+
+
+def _check_sources(vehicle: Vehicle) -> None:
+    """Whether every source makes its frames by itself.
+
+    raises  UserError
+    """
+    pushed = [c.name for c in vehicle.cameras.values() if c.source.stand_in and not c.source.render]
+    if pushed:
+        rule = "its frames are pushed by a Python program, which `record` is not; choose another source"
+        raise UserError("command line", "source", ", ".join(pushed), rule)
+
+
+@contextmanager
+def _interrupted(session: _Session) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the recording with complete files; a second Ctrl-C ends it at once."""
+
+    def on_signal(number: int, _frame: object) -> None:
+        session.signal = session.signal or number
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        say("finishing the files")
+
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, on_signal) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _shown(vehicle: Vehicle, files: Mapping[str, Path], duration_s: float | None) -> Iterator[Show]:
+    """How far the recording is: bars where its length is known, else figures once a second."""
+    if duration_s is not None:
+        with progress_bar() as progress:
+
+            def show_share(samples: Mapping[str, Recorded]) -> None:
+                for name, recorded in samples.items():
+                    progress(name, min(1.0, recorded.seconds / duration_s))
+
+            yield show_share
+        return
+    last = 0.0
+
+    def show_figures(samples: Mapping[str, Recorded]) -> None:
+        nonlocal last
+        if time.monotonic() - last >= SHOW_S:
+            last = time.monotonic()
+            say("; ".join(_figures(name, recorded, files[name]) for name, recorded in samples.items()))
+
+    yield show_figures
+
+
+def _figures(name: str, recorded: Recorded, file: Path) -> str:
+    size = file.stat().st_size / 1e6 if file.exists() else 0
+    missing = f", {recorded.missing} missing" if recorded.missing else ""
+    return f"{name} {recorded.frames} frames{missing}, {recorded.seconds:.0f} s, {size:.0f} MB"
