@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
@@ -13,6 +14,7 @@ from runner.errors import RunError, UserError
 from runner.model import Camera
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.lanes import FRAMES, LaneSet
+from runner.recordings import INDEX
 
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma
@@ -75,11 +77,21 @@ def survey(path: Path, cache: Cache, progress: Callable[[int], None]) -> Sequenc
     if known is None:
         known = _look_through(path, form.fps, progress)
         cache.store(key, known)
-    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **asdict(form), **known)
+    said = asdict(form) | {"lossless": form.lossless or _recorded(path)}
+    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **said, **known)
     if sequence.frames < FEWEST_FRAMES:
         found = f"{path}: {sequence.frames} frames"
         raise UserError("command line", where, found, f"is too short, at least {FEWEST_FRAMES} are needed")
     return sequence
+
+
+def _recorded(path: Path) -> bool:
+    """Whether `tod-runner record` made the clip, which loses nothing whatever the codec."""
+    try:
+        cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]
+        return path.name in {camera["file"] for camera in cameras.values()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
 
 
 def _look_through(path: Path, fps: Fraction, progress: Callable[[int], None]) -> dict[str, Any]:
