@@ -30,6 +30,8 @@ class _Sps(NamedTuple):
 def grey_idr(unit: bytes) -> bytes | None:
     """An access unit in Annex B with the parameter sets of a given one, and a picture that is grey all over.
 
+    It has all its parameter sets, since those units that follow may come without.
+
     unit     an access unit in Annex B
     returns  None where it has no sequence parameter set, or one this cannot follow (scaling lists, 4:4:4, fields)
     """
@@ -38,7 +40,8 @@ def grey_idr(unit: bytes) -> bytes | None:
     parsed = _parse(sps[1:].replace(b"\0\0\3", b"\0\0")) if sps else None
     if sps is None or parsed is None:
         return None
-    parts = (sps, _nal(NAL_PPS, _pps(parsed)), _nal(NAL_IDR, _slice(parsed)))
+    own = [nal for nal in nals if nal and nal[0] & 0x1F == 8]
+    parts = (sps, *own, _nal(NAL_PPS, _pps(parsed)), _nal(NAL_IDR, _slice(parsed)))
     return b"".join(b"\0\0\0\1" + part for part in parts)
 
 

@@ -11,6 +11,7 @@ from runner.keyframe import Bits, grey_idr
 SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 PERIODS = 2  # of refresh, that make any picture exact: the second holds a whole wave, wherever the first began
+LATE = 4  # how much longer than stated a wave may take
 LONGEST_S = 20.0  # what is kept of a stream that never starts anew and states no refresh period
 
 
@@ -94,13 +95,22 @@ class Recent:
         if self._key is None:
             return unit._replace(exact=False)
         self._since.append(unit)
-        while self._since[0].arrived < unit.arrived - self._window:
-            self._since.popleft()
+        self._forget(unit.arrived)
         if unit.arrived < self._exact_from and self._wave() is not None:
             self._exact_from = unit.arrived
         if unit.arrived < self._exact_from:
             self._since[-1] = unit = unit._replace(exact=False)
         return unit
+
+    def _forget(self, now: float) -> None:
+        """Drop what is older than the window; waves that take longer, because frames come late, are kept whole."""
+        if any(unit.recovery is not None for unit in self._since):
+            spare, oldest = self._wave() or 0, now - LATE * self._window
+        else:
+            spare, oldest = len(self._since), now - self._window
+        while self._since[0].arrived < oldest or (spare > 0 and self._since[0].arrived < now - self._window):
+            self._since.popleft()
+            spare -= 1
 
     def burst(self) -> list[AccessUnit]:
         """Units to decode in order, of which the last is the newest; none before there is one to start with."""

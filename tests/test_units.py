@@ -37,6 +37,7 @@ def test_half_a_picture_is_left_out_and_half_an_idr_picture_becomes_a_grey_one()
     grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
     assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
     assert read_unit(grey.data, None, 0).key
+    assert PPS in grey.data  # of the stream: who follows may come without
     recent = Recent(refresh_s=1.0)
     shown = [recent.add(grey), *(recent.add(unit(2.5 + tenth / 10)) for tenth in range(1, 30))]
     assert [u.arrived for u in shown if u.exact] == [2.5 + tenth / 10 for tenth in range(20, 30)]
@@ -112,6 +113,24 @@ def test_a_grey_start_may_itself_be_the_beginning_of_the_wave():
     shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False, recovery=4))]
     shown += [recent.add(unit(tenth / 10)) for tenth in range(1, 8)]
     assert [u.arrived for u in shown if u.exact] == [0.4, 0.5, 0.6, 0.7]
+
+
+def test_a_wave_that_takes_longer_than_stated_is_kept_whole():
+    recent = Recent(refresh_s=1.0)
+    recent.add(unit(0, key=True))
+    for number in range(1, 59):  # a wave of ten frames takes three seconds, not one
+        recent.add(unit(number * 0.3, recovery=9 if number % 10 == 0 else None))
+    _, *rest = recent.burst()
+    assert [u.recovery for u in rest[:11]] == [9, *[None] * 9, 9]
+    assert len(rest) == 19
+
+
+def test_waves_that_never_end_are_forgotten():
+    recent = Recent(refresh_s=1.0)
+    recent.add(unit(0, key=True))
+    for number in range(1, 1000):
+        recent.add(unit(number / 10, recovery=5000))
+    assert len(recent.burst()) <= 2 + 80
 
 
 def test_a_new_idr_makes_everything_before_it_needless():
