@@ -52,7 +52,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
     """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
     known = list(known)
     near = get_close_matches(word, known, 1)
-    shown = [*known[:12], "..."] if len(known) > 12 else known
+    shown = [*known[:13], "..."] if len(known) > 13 else known
     return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
 
 

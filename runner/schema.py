@@ -193,6 +193,10 @@ def _explain(error: Any) -> Iterator[Finding]:
             for key in limit:
                 if key not in value:
                     yield Finding((*path, key), "missing", "must be given")
+        case "anyOf":
+            # Of several forms the one that was meant is the one of the right type.
+            meant = [inner for inner in error.context if inner.validator != "type"]
+            yield from _explain((meant or error.context)[0])
         case "propertyNames" | "not" | "if":
             yield Finding(path, shown(value), error.message)
         case _:

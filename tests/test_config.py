@@ -13,8 +13,8 @@ from runner.config import load
 from runner.errors import ConfigError, Problem
 from runner.model import Mode
 
-TOP_KEYS = "mode, fps_max, media, control, page, name, cameras, modes, graph, source, pqos, recording"
-CAMERA_KEYS = "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, ..."
+TOP_KEYS = "mode, fps_max, media, control, page, name, cameras, modes, graph, source, pqos, recording, study"
+CAMERA_KEYS = "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
     "kbps, bps, left, right, top, bottom, on, off (quote these two), or a caps template over {width} and {height}"
@@ -290,7 +290,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
             "/cameras@cameras.rear",
             "/camera@cameras.rear",
             "defaults: 'camera/compact_480p': no such file, "
-            "groups are /vehicle, /cameras, /modes, /graph, /source, /pqos, /recording",
+            "groups are /vehicle, /cameras, /modes, /graph, /source, /pqos, /recording, /study",
         ),
         (
             "@cameras.rear",

@@ -16,7 +16,7 @@ def count(group: str) -> int:
 
 def test_everything_that_is_packaged_is_valid() -> None:
     result = process("validate")
-    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos", "recording")))
+    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study")))
     combinations = count("vehicle") * count("modes") * count("graph") * count("source")
     assert (result.status, result.err) == (0, "")
     first, *notes = result.out.splitlines()
@@ -31,7 +31,7 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
 def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
     conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
-    groups = "the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/, recording/"
+    groups = "the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/, recording/, study/"
     assert problems(tod, conf) == [
         "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
         f"~/foo.yaml: belongs to no group, {groups}",

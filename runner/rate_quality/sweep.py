@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Meter, Metric
 
 LANES_VERSION = 1  # raise it with every change that changes scores
+SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is not there
 OVERHEAD = 0.1  # of an encoding at full size: what a lane costs whatever its size, decoding and looking at pictures
 
 
@@ -343,7 +344,8 @@ def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
     with ExitStack() as stack:
         try:
             own = {"n_workers": parallel, "threads_per_worker": 1, "dashboard_address": None}
-            client = stack.enter_context(Client(scheduler or stack.enter_context(LocalCluster(**own))))
+            address = scheduler or stack.enter_context(LocalCluster(**own))
+            client = stack.enter_context(Client(address, timeout=SCHEDULER_S))
         except OSError as error:
             raise RunError(f"the Dask scheduler {scheduler or ''} does not answer: {error}") from None
         yield client.get_executor()

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,10 +61,12 @@ def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
 
 
 @contextmanager
-def process(verb: str, *words: str, stdout: int = subprocess.PIPE) -> Iterator[subprocess.Popen[str]]:
+def process(
+    verb: str, *words: str, stdout: int = subprocess.PIPE, env: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[str]]:
     """A verb in a process of its own, killed at the end."""
     command = [sys.executable, "-m", "runner", verb, *words]
-    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **(env or {})}
     with subprocess.Popen(
         command, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT
     ) as child:

@@ -1,0 +1,414 @@
+"""Rate-quality models measured by the real encoders: the contract, the live pipeline's own quality, interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig import CHECKOUT, CLIPS, process, run, streaming, until
+from runner import schema
+from runner.commands import Command
+from runner.model import Roi
+from runner.rate_quality.artefact import read_model
+from runner.rate_quality.curves import Point, along, draw_curves, mean_score
+from runner.rate_quality.metrics import find_metric
+
+pytestmark = pytest.mark.gst
+cv2 = pytest.importorskip("cv2")
+pytest.importorskip("scipy")
+
+WIDTH, HEIGHT, FPS, FRAMES = 320, 192, 25, 60
+CAMERA = ("camera=front_center",)
+SMALL = ("scalings=[0.25,0.5,1.0]", "bitrates_kbps=[50,100,200,400,800]")
+
+
+def picture(number: int, texture: np.ndarray) -> np.ndarray:
+    """A street of sorts: a texture that slides, faster below, and a car that crosses."""
+    rows = np.arange(HEIGHT)[:, None]
+    columns = (np.arange(WIDTH)[None, :] + number * (rows // 24)) % texture.shape[1]
+    shown = texture[rows % texture.shape[0], columns].copy()
+    shown[90:120, (5 * number) % WIDTH : (5 * number) % WIDTH + 40] = 220
+    return shown
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds and a half of 320x192 at 25 Hz, nearly without loss."""
+    from runner.gst.clip_writer import write_clip
+
+    noise = np.random.default_rng(1).integers(0, 256, (HEIGHT, 2 * WIDTH)).astype(np.uint8)
+    texture = cv2.addWeighted(cv2.GaussianBlur(noise, (0, 0), 3), 2.0, cv2.GaussianBlur(noise, (0, 0), 0.8), 0.5, -190)
+    chroma = bytes([128]) * (WIDTH * HEIGHT // 2)
+    path = tmp_path_factory.mktemp("clip") / "street.mp4"
+    frames = (picture(number, texture).tobytes() + chroma for number in range(FRAMES))
+    write_clip(path, frames, WIDTH, HEIGHT, Fraction(FPS), quantizer=2)
+    return path
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> dict[str, str]:
+    return {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+
+
+def model(*words: str, cache: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    return run("model", *words, env=cache)
+
+
+@pytest.fixture(scope="module")
+def measured(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
+    """The full plan on the clip, measured once: directory, model file, what was printed."""
+    directory = tmp_path_factory.mktemp("measured")
+    words = (
+        "camera=front_center",
+        f"sequence={clip}",
+        f"output={directory}",
+        "metric=[mssim,psnr]",
+        "plan=full",
+        *SMALL,
+    )
+    done = model(*words, cache={"XDG_CACHE_HOME": str(directory / "cache")})
+    assert done.returncode == 0, done.stderr
+    return directory, json.loads((directory / "front_center.model.json").read_text()), done.stdout
+
+
+def test_a_model_leaves_what_the_contract_says(measured):
+    directory, document, printed = measured
+    assert schema.findings(document, "rate_quality") == []
+    assert len(document["points"]) == 15
+    assert {(p["scaling"], p["target_kbps"]) for p in document["points"]} >= {(0.25, 50), (1, 800)}
+    assert all(0 < p["mssim"] < 1 and 10 < p["psnr"] < 60 and p["encode_ms"] > 0 for p in document["points"])
+    assert [c["upper"] for c in document["crossings"]] == document["scaling"][1:]
+    assert all(c["low"] <= c["kbps"] <= c["high"] for c in document["crossings"])
+    clip = document["sequences"]["front_center"]
+    assert (clip["frames"], clip["width"], clip["fps"], clip["lossless"]) == (FRAMES, WIDTH, FPS, False)
+    assert clip["si"] > 10
+    assert clip["ti"] > 1
+    assert (directory / "front_center.png").read_bytes().startswith(b"\x89PNG")
+    assert (directory / "front_center.pdf").read_bytes().startswith(b"%PDF")
+    assert "was compressed before" in printed
+    assert "the sequence is 320x192 at 25 Hz, the camera 1920x1040 at 40 Hz" in printed
+
+
+def test_its_camera_is_mounted_and_drives(measured, tmp_path):
+    directory, document, _ = measured
+    shutil.copytree(CHECKOUT / "conf" / "cameras", tmp_path / "conf" / "cameras")
+    shutil.copy(directory / "front_center.yaml", tmp_path / "conf" / "cameras" / "measured.yaml")
+    words = (f"conf={tmp_path / 'conf'}", "cameras@cameras.front_center=measured")
+    done = run("validate", *words[:1], "vehicle=tum_q7", "modes=paper", "graph=h264_rtsp", "source=test")
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(run("print", *words, "format=json", "total_kbps=9000").stdout)["cameras"]["front_center"]
+    assert printed["decision"]["demand_kbps"] == document["b_full_kbps"]
+    ladder = list(zip(document["b_min_kbps"], document["scaling"], strict=True))
+    assert printed["decision"]["scaling"] == max(pair for pair in ladder if pair[0] <= printed["decision"]["kbps"])[1]
+    drive = ("source=test", "page.serve=false", "fps_max=5", "duration_s=6", "pqos=constant", "pqos.kbps=9000")
+    done = run("demo", *words, *drive)
+    assert done.returncode == 0, done.stderr
+    assert "front_center" in done.stdout
+
+
+def test_the_live_pipeline_has_the_same_quality(clip, measured):
+    _, document, _ = measured
+    points = {(p["scaling"], p["target_kbps"]): p["mssim"] for p in document["points"]}
+    reference = luma_of(clip)
+    form = [
+        f"cameras.front_center.{key}={value}"
+        for key, value in (("width_px", WIDTH), ("height_px", HEIGHT), ("fps", FPS))
+    ]
+    for scaling, kbps in ((0.25, 100), (0.5, 200), (1.0, 400)):
+        size = (round(WIDTH * scaling), round(HEIGHT * scaling))
+        with streaming("source=file", f"source.clip={clip}", *form, cameras=["front_center"]) as (side, _, plans, _):
+            values = {"roi": Roi(0, 0, WIDTH, HEIGHT), "size": size, "bitrate": kbps, "sending": True}
+            side.turn([Command("front_center", knob, value) for knob, value in values.items()])
+            pictures = received(plans[0], FRAMES)
+        scores = mssim(reference, pictures)
+        assert np.mean(scores) == pytest.approx(points[scaling, kbps], abs=1e-3)
+
+
+def luma_of(path: Path) -> list[np.ndarray]:
+    return pulled(f'filesrc location="{path}" ! decodebin ! videoconvert ! video/x-raw,format=I420', FRAMES)
+
+
+def received(plan, count: int) -> list[np.ndarray]:
+    """The first pictures that come over RTSP."""
+    return pulled(f"{plan.decoder} ! videoconvert ! video/x-raw,format=I420", count)
+
+
+def pulled(line: str, count: int) -> list[np.ndarray]:
+    from runner.gst import Gst
+    from runner.gst.lanes import _luma
+
+    pipeline = Gst.parse_launch(f"{line} ! appsink name=sink sync=false")
+    pipeline.set_state(Gst.State.PLAYING)
+    try:
+        samples = [pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND) for _ in range(count)]
+        return [_luma(sample.get_buffer(), sample.get_caps()) for sample in samples]
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+def mssim(reference: list[np.ndarray], pictures: list[np.ndarray]) -> list[float]:
+    meter = find_metric("mssim").meter((WIDTH, HEIGHT), Fraction(FPS))
+    for number, (before, after) in enumerate(zip(reference, pictures, strict=True)):
+        large = (
+            after if after.shape == before.shape else cv2.resize(after, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+        )
+        meter.add(number, np.ascontiguousarray(before), np.ascontiguousarray(large))
+    return list(meter.close().values())
+
+
+def test_what_was_measured_is_not_measured_again_and_another_metric_keeps_the_first(clip, tmp_path, cache):
+    words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
+    assert "(15 encoded, 0 known)" in model(*words, cache=cache).stdout
+    before = (tmp_path / "front_center.model.json").read_bytes()
+    assert "(0 encoded, 15 known)" in model(*words, cache=cache).stdout
+    assert (tmp_path / "front_center.model.json").read_bytes() == before
+    assert "(15 encoded, 0 known)" in model(*words, "metric=psnr", cache=cache).stdout
+    assert "(0 encoded, 15 known)" in model(*words, cache=cache).stdout
+    assert "(15 encoded, 0 known)" in model(*words, "graph=openh264_rtsp", cache=cache).stdout  # another encoder
+
+
+def test_a_cache_file_that_is_cut_in_half_is_told_and_measured_again(clip, tmp_path, cache):
+    words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
+    model(*words, cache=cache)
+    before = points_of(tmp_path)
+    files = sorted(Path(cache["XDG_CACHE_HOME"]).rglob("points/*.json"), key=lambda path: path.stat().st_size)
+    files[-1].write_bytes(files[-1].read_bytes()[: files[-1].stat().st_size // 2])
+    done = model(*words, cache=cache)
+    assert done.returncode == 0
+    assert f"{files[-1]}: cannot be read (" in done.stderr
+    assert "(1 encoded, 14 known)" in done.stdout
+    assert points_of(tmp_path) == before
+
+
+def points_of(directory: Path) -> list[dict]:
+    """All points but for the time they took."""
+    document = json.loads((directory / "front_center.model.json").read_text())
+    return [{key: value for key, value in point.items() if key != "encode_ms"} for point in document["points"]]
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(clip, measured, tmp_path, cache):
+    words = (
+        "camera=front_center",
+        f"sequence={clip}",
+        f"output={tmp_path}",
+        "plan=full",
+        "metric=[mssim,psnr]",
+        *SMALL,
+    )
+    kept = Path(cache["XDG_CACHE_HOME"]) / "tod-runner" / "points"
+    with process("model", *words, env=cache) as child:
+        until(lambda: kept.is_dir() and len(list(kept.glob("*.json"))) > 5, 60)  # the survey and some points
+        child.send_signal(signal.SIGINT)
+        assert child.wait(timeout=30) == 130
+    assert not (tmp_path / "front_center.yaml").exists()
+    assert list(kept.glob(".*")) == []
+    done = model(*words, cache=cache)
+    known = int(done.stdout.partition("encoded, ")[2].partition(" known")[0])
+    assert 5 <= known < 15
+    assert points_of(tmp_path) == points_of(measured[0])
+
+
+@pytest.mark.parametrize("workers", ["threads", "processes"])
+def test_other_workers_find_the_same(clip, measured, tmp_path, cache, workers):
+    words = (f"workers={workers}", "parallel=2", "plan=full", "metric=[mssim,psnr]")
+    done = model("camera=front_center", f"sequence={clip}", f"output={tmp_path}", *words, *SMALL, cache=cache)
+    assert done.returncode == 0, done.stderr
+    assert points_of(tmp_path) == points_of(measured[0])
+
+
+def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, cache, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))  # of the workers
+    words = ("plan=full", "metric=[mssim,psnr]", "workers=dask")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        where = f"scheduler={cluster.scheduler_address}"
+        kept = Path(cache["XDG_CACHE_HOME"]) / "tod-runner" / "points"
+        command = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", *words, where, *SMALL)
+        with process("model", *command, env=cache) as child:
+            until(lambda: kept.is_dir() and len(list(kept.glob("*.json"))) > 1, 90)  # a first set is done
+            os.kill(cluster.workers[0].pid, signal.SIGKILL)
+            assert child.wait(timeout=120) == 0, child.stdout.read()
+    assert points_of(tmp_path) == points_of(measured[0])
+
+
+def test_the_adaptive_plan_comes_to_the_same_as_the_full_one(clip, tmp_path, cache):
+    words = ("camera=front_center", f"sequence={clip}", "scalings=[0.25,0.5,0.75,1.0]")
+    found = {}
+    for plan in ("full", "adaptive"):
+        done = model(*words, f"output={tmp_path / plan}", f"plan={plan}", cache=cache)
+        assert done.returncode == 0, done.stderr
+        found[plan] = read_model(tmp_path / plan / "front_center.model.json")
+    full, adaptive = found["full"], found["adaptive"]
+    assert len(adaptive["points"]) <= len(full["points"]) / 3
+    assert adaptive["metric_every"] < 5  # of a short sequence more is looked at
+    assert lost(full, adaptive) < 1e-3
+    done = run("model", "compare", *(str(tmp_path / plan / "front_center.model.json") for plan in ("full", "adaptive")))
+    assert "plan       full -> adaptive" in done.stdout
+    assert "on the same sequences by the same encoder" in done.stdout
+
+
+def lost(full: dict, other: dict) -> float:
+    """The most quality that another model's choice loses against the full plan's, on the curves of the full plan."""
+    points = [
+        Point(Fraction(p["scaling"]), p["target_kbps"], p["actual_kbps"], p["encode_ms"], {"mssim": (p["mssim"],)})
+        for p in full["points"]
+    ]
+    curves = draw_curves(points, mean_score("mssim"))
+    best, mine = (
+        along(curves, [Fraction(factor) for factor in m["scaling"]], [c["kbps"] for c in m["crossings"]])
+        for m in (full, other)
+    )
+    return float(np.max((best - mine)[curves.kbps < full["b_full_kbps"]]))
+
+
+def test_a_mask_keeps_part_of_the_picture_out(clip, tmp_path, cache):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[: HEIGHT // 2] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
+    whole, half = (
+        (model(*words, *more, cache=cache), points_of(tmp_path))[1]
+        for more in ((), (f"masks.front_center={tmp_path / 'mask.png'}",))
+    )
+    assert [p["actual_kbps"] for p in whole] == [p["actual_kbps"] for p in half]
+    assert all(w["mssim"] != h["mssim"] for w, h in zip(whole, half, strict=True))
+    done = model(*words, f"masks.front_center={CHECKOUT / 'README.md'}", cache=cache)
+    assert (done.returncode, done.stderr.count("cannot be read as a picture")) == (2, 1)
+
+
+def test_cameras_of_a_vehicle_are_pooled(clip, tmp_path, cache):
+    for name in ("front", "rear", "mast"):
+        shutil.copy(clip, tmp_path / f"{name}.mp4")
+    words = (
+        "vehicle=delivery_robot",
+        f"sequence={tmp_path}",
+        f"output={tmp_path / 'out'}",
+        "pool={ends: [front, rear]}",
+    )
+    done = model(*words, "plan=full", *SMALL, cache=cache)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.yaml")) == ["ends.yaml", "mast.yaml"]
+    pooled = read_model(tmp_path / "out" / "ends.model.json")
+    assert sorted(pooled["sequences"]) == ["front", "rear"]
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+def launch(line: str, path: Path) -> None:
+    command = ["gst-launch-1.0", "-q", *line.split(), "!", "filesink", f"location={path}"]
+    subprocess.run(command, check=True, timeout=60)
+
+
+def two_sizes(path: Path) -> None:
+    """A stream that changes its size in the middle."""
+    parts = []
+    for number, size in enumerate(("320,height=192", "160,height=96")):
+        part = path.with_name(f"part{number}.ts")
+        launch(f"videotestsrc num-buffers=40 ! video/x-raw,width={size},framerate=25/1 ! x264enc ! mpegtsmux", part)
+        parts.append(part.read_bytes())
+    path.write_bytes(b"".join(parts))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("gone.mp4", None, "no such file"),
+        ("empty.mp4", b"", "the file is empty"),
+        ("noise.mp4", os.urandom(4096), "cannot be read as video"),
+        ("two.ts", two_sizes, "the size changes from 320x192 to 160x96 within the sequence"),
+    ],
+)
+def test_what_is_no_sequence_is_told(tmp_path, cache, name, content, said):
+    path = tmp_path / name
+    if callable(content):
+        content(path)
+    elif content is not None:
+        path.write_bytes(content)
+    done = model("camera=front_center", f"sequence={path}", f"output={tmp_path}", cache=cache)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("command line: sequence: ")
+    assert said in line
+
+
+def test_a_short_sequence_is_told(tmp_path, cache):
+    path = tmp_path / "short.mkv"
+    launch("videotestsrc num-buffers=9 ! video/x-raw,width=320,height=192,framerate=25/1 ! x264enc ! matroskamux", path)
+    done = model("camera=front_center", f"sequence={path}", f"output={tmp_path}", cache=cache)
+    assert done.returncode == 2
+    assert f"{path}: 9 frames: is too short, at least 25 are needed" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["bitrates_kbps=[100]"], "study.bitrates_kbps: [100]: must have at least 2 entries"),
+        (["bitrates_kbps=[200,100]"], "study.bitrates_kbps: [200, 100]: must rise"),
+        (
+            ["scalings=[0.05,1]"],
+            "scalings: 0.05 of 320x192: a side would be under 16 px, the factor must be at least 0.0833",
+        ),
+        (["metric=mssm"], "did you mean mssim?"),
+        (["metric=brisque"], "brisque"),
+        (["plan=fast"], "study.plan: 'fast': must be one of adaptive, full"),
+        (["pool={all: [front_center, rear]}"], "pool.all: 'rear': no such camera is measured"),
+        (["scheduler=tcp://127.0.0.1:1"], "is for workers=dask"),
+    ],
+)
+def test_a_wrong_wish_is_told(clip, tmp_path, cache, words, said):
+    done = model("camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *words, cache=cache)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_tool_and_a_missing_scheduler_are_told(clip, tmp_path, cache):
+    words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *SMALL)
+    done = model(*words, "metric=vmaf", cache={**cache, "TOD_FFMPEG": "/bin/true"})
+    assert done.returncode == 1
+    assert "libvmaf" in done.stderr
+    done = model(*words, "workers=dask", "scheduler=tcp://127.0.0.1:1", cache=cache)
+    assert done.returncode == 1
+    assert "the Dask scheduler tcp://127.0.0.1:1 does not answer" in done.stderr
+
+
+def test_a_full_disk_loses_nothing_that_is_finished(clip, tmp_path, cache):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", str(disk)]
+    if os.geteuid() or subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("mounting needs root")
+    words = ("camera=front_center", f"sequence={clip}", f"output={disk}", "plan=full", *SMALL)
+    try:
+        done = model(*words, cache=cache)
+        assert done.returncode == 1
+        assert f"{disk}/front_center." in done.stderr
+        assert "no space left on device" in done.stderr
+        assert [path.name for path in disk.iterdir() if path.name.startswith(".")] == []
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True)
+    assert "(0 encoded, 15 known)" in model(*words, cache=cache).stdout
+
+
+@pytest.mark.skipif(not CLIPS, reason="no recorded clips beside the project")
+def test_on_a_recorded_drive_each_factor_wins_a_range(tmp_path, cache):
+    clip = next(path for path in CLIPS if path.name == "forward_highway_day_540p25_A.mp4")
+    began = time.monotonic()
+    done = model("camera=front_center", f"sequence={clip}", f"output={tmp_path}", cache=cache)
+    assert done.returncode == 0, done.stderr
+    document = read_model(tmp_path / "front_center.model.json")
+    assert len(document["scaling"]) >= 3
+    assert len(document["points"]) <= 53
+    assert document["b_min_kbps"] == sorted(document["b_min_kbps"])
+    assert time.monotonic() - began < 600
