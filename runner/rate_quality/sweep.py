@@ -23,7 +23,7 @@ from runner.rate_quality.sequence import Sequence as Clip
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Meter, Metric
 
-LANES_VERSION = 1  # raise it with every change that changes scores
+LANES_VERSION = 2  # raise it with every change that changes scores
 SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is not there
 OVERHEAD = 0.1  # of an encoding at full size: what a lane costs whatever its size, decoding and looking at pictures
 
@@ -44,6 +44,11 @@ class Task:
     stride: int
     metrics: tuple[Metric, ...]
     mask: Mask | None
+
+    def scored(self, frame: int) -> bool:
+        """Whether a frame is scored: from the middle of the first stride on, since the very first picture is no sample
+        of the others."""
+        return frame % self.stride == self.stride // 2
 
     @property
     def cost(self) -> float:
@@ -107,7 +112,7 @@ class _References:
         self.every = any(metric.every_frame for metric in task.metrics)
 
     def wanted(self, frame: int) -> bool:
-        return self.every or frame % self._task.stride == 0
+        return self.every or self._task.scored(frame)
 
     def put(self, frame: int, luma: Luma) -> None:
         import numpy as np
@@ -153,8 +158,7 @@ class _Scoring:
     def close(self) -> dict[str, tuple[float, ...]]:
         """By metric, the scores of the sampled frames in order."""
         found = {name: meter.close() for name, meter in self._meters.items()}
-        stride = self._task.stride
-        return {name: tuple(scores[n] for n in sorted(scores) if n % stride == 0) for name, scores in found.items()}
+        return {name: tuple(scores[frame] for frame in sorted(scores)) for name, scores in found.items()}
 
     def _fill(self, end: int, references: _References) -> None:
         """Score all frames before `end` with what is on the screen."""
@@ -168,7 +172,7 @@ class _Scoring:
             raise RunError("the encoder leaves out the first frame")
         picture = _enlarged(self._shown, self._size)
         for name, meter in self._meters.items():
-            if self._every[name] or frame % self._task.stride == 0:
+            if self._every[name] or self._task.scored(frame):
                 meter.add(frame, reference, picture)
 
 

@@ -241,7 +241,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, 
 
 
 def test_the_adaptive_plan_comes_to_the_same_as_the_full_one(clip, tmp_path, cache):
-    words = ("camera=front_center", f"sequence={clip}", "scalings=[0.25,0.5,0.75,1.0]")
+    words = ("camera=front_center", f"sequence={clip}")
     found = {}
     for plan in ("full", "adaptive"):
         done = model(*words, f"output={tmp_path / plan}", f"plan={plan}", cache=cache)
@@ -250,7 +250,7 @@ def test_the_adaptive_plan_comes_to_the_same_as_the_full_one(clip, tmp_path, cac
     full, adaptive = found["full"], found["adaptive"]
     assert len(adaptive["points"]) <= len(full["points"]) / 3
     assert adaptive["metric_every"] < 5  # of a short sequence more is looked at
-    assert lost(full, adaptive) < 1e-3
+    assert lost(full, adaptive) < 3e-3  # of the 0.6 that these curves span; drives that were recorded span 0.1
     done = run("model", "compare", *(str(tmp_path / plan / "front_center.model.json") for plan in ("full", "adaptive")))
     assert "plan       full -> adaptive" in done.stdout
     assert "on the same sequences by the same encoder" in done.stdout
