@@ -2,10 +2,10 @@
 
   python bench/model.py CLIP
 
-Timed are whole processes with an empty cache, the adaptive plan of `tod-runner model` first. Against it: the full plan;
-the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales up and has
-its ssim filter compare; and the full grid with scikit-image's MSSIM on every frame, extrapolated from a sample of points
-and frames. Beside the times: how far the choice of the adaptive plan is from that of the full one.
+Timed are whole processes with an empty cache, the adaptive plan of `tod-runner model` first. Against it: the full
+plan; the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales up
+and has its ssim filter compare; and the full grid with scikit-image's MSSIM on every frame, extrapolated from one point
+and some frames. Beside the times: what either plan chose.
 """
 
 from __future__ import annotations

@@ -14,7 +14,9 @@ from runner.errors import ConfigError, Problem
 from runner.model import Mode
 
 TOP_KEYS = "mode, fps_max, media, control, page, name, cameras, modes, graph, source, pqos, recording, study"
-CAMERA_KEYS = "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
+CAMERA_KEYS = (
+    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
+)
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
     "kbps, bps, left, right, top, bottom, on, off (quote these two), or a caps template over {width} and {height}"
