@@ -20,7 +20,7 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     """
     identity = pipeline.get_by_name(plan.source[-1].name)
     pace = identity.get_static_pad("sink")
-    _Loop(pace.get_peer())
+    _Loop(pace.get_peer(), identity, float(plan.camera.fps))
     _born_on_release(pace)
     clip = _Pace(identity, float(plan.camera.fps))
     GLib.timeout_add(CHECK_MS, clip.keep)
@@ -29,8 +29,10 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
 class _Loop:
     """Watches the pad in front of the pacing element. Nothing of the first seek, a flush, is seen behind it."""
 
-    def __init__(self, pad: Gst.Pad) -> None:
-        self._pad = pad
+    def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
+        self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
+        self._begins = True  # the next segment is a round, and not one that is told again with another offset
+        self._round: tuple[int, int] | None = None  # where this round began: running time in ns, frames before it
         self._sought = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
         pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
@@ -49,12 +51,32 @@ class _Loop:
             case Gst.EventType.FLUSH_START:
                 return Gst.PadProbeReturn.DROP
             case Gst.EventType.FLUSH_STOP:
-                self._flushed = True
+                self._flushed = self._begins = True
                 return Gst.PadProbeReturn.DROP
+            case Gst.EventType.SEGMENT if self._begins:
+                self._begins = False
+                self._make_room(info.get_event().parse_segment().base)
             case Gst.EventType.SEGMENT_DONE | Gst.EventType.EOS:
+                self._begins = True
                 self._seek(Gst.SeekFlags.SEGMENT)
                 return Gst.PadProbeReturn.DROP
         return Gst.PadProbeReturn.OK
+
+    def _make_room(self, base: int) -> None:
+        """Let a round last as long as its frames.
+
+        Demuxers count it to the beginning of its last frame, which the first one of the next round then coincides with.
+        """
+        identity = self._identity()
+        if identity is None:
+            return
+        base -= self._pad.get_offset()  # as the demuxer says it
+        frames = identity.get_property("stats").get_value("num-buffers")
+        if self._round:
+            began, before = self._round
+            missing = round((frames - before) / self._fps * Gst.SECOND) - (base - began)
+            self._pad.set_offset(self._pad.get_offset() + missing)
+        self._round = (base, frames)
 
     def _seek(self, flags: Gst.SeekFlags) -> None:
         event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)

@@ -172,7 +172,7 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, wishes: W
         worst = max(fallen, key=lambda pair: score(pair[0]) - score(pair[1]))
         pair = " to ".join(str(point.target_kbps) for point in worst)
         where = f"worst for {_shown(worst[0].scaling)} from {pair} kbit/s, by {score(worst[0]) - score(worst[1]):.2g}"
-        yield f"{len(fallen)} times more bitrate looks worse; {where}"
+        yield f"more bitrate looks worse in {len(fallen)} place{'' if len(fallen) == 1 else 's'}; {where}"
     for factor in curves.quality:
         over = [point for point in points if point.scaling == factor and not point.holds]
         if over:
