@@ -1,1 +1,6 @@
-"""Rate-quality models of live encoders, measured offline: the running system never scores video."""
+"""Rate-quality models, measured offline with the live graph's own encoder (paper, sections III and V-A).
+
+    sequence -> plans -> sweep -> task (lanes, metrics) -> Point -> curves -> choice -> artefact, plots
+
+`measure.py` walks this line for each camera. `curves`, `plans`, `choice`, `lanes` and `compare` are pure.
+"""

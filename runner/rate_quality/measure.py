@@ -19,7 +19,8 @@ from runner.rate_quality.metrics import Metric, find_metric
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.sequence import as_filmed, survey
 from runner.rate_quality.study import Study, check_size, stride
-from runner.rate_quality.sweep import Sweep, open_executor, parallel_tasks
+from runner.rate_quality.sweep import Sweep
+from runner.rate_quality.workers import open_executor, parallel_tasks
 from runner.sources import cache_directory
 
 if TYPE_CHECKING:
