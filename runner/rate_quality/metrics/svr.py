@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from runner.errors import UserError
@@ -93,7 +93,7 @@ def _read(path: Path) -> str:
 
 
 def _is_opencv(text: str) -> bool:
-    return text.startswith(("%YAML", "<?xml"))
+    return text.startswith("%YAML")
 
 
 def _expect(path: Path, place: str, found: object, rule: str, good: bool) -> None:
@@ -157,55 +157,71 @@ def _number(path: Path, place: str, text: str) -> float:
 
 
 # --- OpenCV ---------------------------------------------------------------------------------------------------------
+# Read as the YAML that it nearly is: cv2.FileStorage takes the process with it on files that are damaged.
 
 
 def _opencv_kernels(path: Path, text: str, features: int) -> Kernels:
     """The first node of a file that cv::ml::SVM::save wrote."""
-    file = _storage(path, text)
-    node = file.root().getNode(file.root().keys()[0])
-    kind, kernel = node.getNode("svmType").string(), node.getNode("kernel")
+    node = _mapping(next(iter(_document(path, text).values())))
+    kernel, decisions = _mapping(node.get("kernel")), node.get("decision_functions")
+    kind, shape = node.get("svmType", ""), kernel.get("type", "")
     _expect(path, "svmType", kind, "must be EPS_SVR", kind == "EPS_SVR")
-    shape = kernel.getNode("type").string()
     _expect(path, "kernel.type", shape, "must be RBF", shape == "RBF")
-    decision = node.getNode("decision_functions").at(0)
-    alpha = _row(path, "alpha", decision.getNode("alpha"))
-    vectors = [_row(path, "support_vectors", row) for row in _items(node.getNode("support_vectors"))]
+    decision = _mapping(decisions[0] if isinstance(decisions, list) and decisions else None)
+    alpha = _row(path, "alpha", decision.get("alpha"))
+    rows = node.get("support_vectors")
+    vectors = [_row(path, "support_vectors", row) for row in (rows if isinstance(rows, list) else ())]
     sizes = {len(row) for row in vectors}
     _expect(path, "support_vectors", sorted(sizes), f"each must have {features} features", sizes == {features})
     _expect(path, "alpha", len(alpha), f"must have {len(vectors)} numbers", len(alpha) == len(vectors))
-    rho, gamma = (_real(path, name, at.getNode(name)) for name, at in (("rho", decision), ("gamma", kernel)))
+    rho, gamma = (_real(path, name, at.get(name)) for name, at in (("rho", decision), ("gamma", kernel)))
     return Kernels(np.array(vectors), np.array(alpha), rho, gamma)
 
 
 def _opencv_ranges(path: Path, text: str, features: int) -> Ranges:
     """The matrix `range`: a row of the least, a row of the most of each feature."""
-    file = _storage(path, text)  # its nodes live no longer
-    found = file.getNode("range").mat()
-    shape = None if found is None else found.shape
-    _expect(path, "range", shape, f"must be a matrix of 2 x {features}", shape == (2, features))
-    assert found is not None
-    least, most = found.astype(np.float64)
-    return Ranges(least, most)
+    found = _mapping(_document(path, text).get("range"))
+    shape = (found["rows"], found["cols"]) if {"rows", "cols", "data"} <= found.keys() else None
+    values = _row(path, "range", found.get("data"))
+    good = shape == (2, features) and len(values) == 2 * features
+    _expect(path, "range", shape, f"must be a matrix of 2 x {features}", good)
+    return Ranges(np.array(values[:features]), np.array(values[features:]))
 
 
-def _storage(path: Path, text: str) -> cv2.FileStorage:
+class _OpenCvLoader(yaml.SafeLoader):
+    """YAML with OpenCV's own tag for matrices, which are mappings."""
+
+
+def _matrix(loader: _OpenCvLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+_OpenCvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
+def _document(path: Path, text: str) -> dict[str, Any]:
+    """A file whose first line is OpenCV's own form of a YAML directive."""
     try:
-        file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError):
+        document = yaml.load(text.partition("\n")[2], _OpenCvLoader)
+    except yaml.YAMLError:
         raise UserError(str(path), "", None, "is not what OpenCV writes") from None
-    _expect(path, "", text[:20], "holds nothing", file.isOpened() and bool(file.root().keys()))
-    return file
+    _expect(path, "", text[:20], "holds nothing", isinstance(document, dict) and bool(document))
+    return dict(document)
 
 
-def _items(node: cv2.FileNode) -> Iterable[cv2.FileNode]:
-    return (node.at(i) for i in range(node.size()))
+def _mapping(node: Any) -> dict[str, Any]:
+    return node if isinstance(node, dict) else {}
 
 
-def _row(path: Path, place: str, node: cv2.FileNode) -> list[float]:
-    return [_real(path, place, item) for item in _items(node)]
+def _row(path: Path, place: str, node: Any) -> list[float]:
+    return [_real(path, place, item) for item in (node if isinstance(node, list) else ())]
 
 
-def _real(path: Path, place: str, node: cv2.FileNode) -> float:
-    value = node.real() if node.isReal() or node.isInt() else math.nan
-    _expect(path, place, node.string() if node.isString() else None, "must be a finite number", math.isfinite(value))
+def _real(path: Path, place: str, node: Any) -> float:
+    """A number; YAML 1.1 takes OpenCV's "1.5e-01" for one and its "2.e+00" for text."""
+    try:
+        value = math.nan if isinstance(node, bool) else float(node)
+    except (TypeError, ValueError):
+        value = math.nan
+    _expect(path, place, node, "must be a finite number", math.isfinite(value))
     return value
