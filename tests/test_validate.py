@@ -114,3 +114,10 @@ def test_ways_to_record_are_checked_though_none_is_chosen(
     conf.change("recording/ffv1.yaml", {old: new})
     (found,) = problems(tod, conf, *ONE)
     assert found.startswith(f"~/recording/ffv1.yaml: {told}")
+
+
+def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> None:
+    conf.change("study/paper.yaml", {"[50, 63,": "[63, 50,"})
+    (problem,) = problems(tod, conf, *ONE)
+    assert problem.startswith("~/study/paper.yaml: bitrates_kbps: [63, 50, ")
+    assert problem.endswith(": must rise")

@@ -20,6 +20,7 @@ from runner.rate_quality.sequence import Sequence as Clip
 
 VERSION = 1
 SCHEMA = "rate_quality"
+MARK = "Measured by `tod-runner model`"  # stands in each camera YAML that was written here
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,7 @@ def to_yaml(measured: Measured) -> str:
     camera, choice = measured.camera, measured.choice
     lines = [
         "# yaml-language-server: $schema=../../schemas/camera.schema.json",
-        f"# Measured by `tod-runner model` on {', '.join(Path(clip.path).name for clip in measured.clips.values())},"
+        f"# {MARK} on {', '.join(Path(clip.path).name for clip in measured.clips.values())},"
         f" plan {measured.plan}, by {measured.metric}.",
         *(f"# {warning}" for warning in measured.warnings),
         f"width_px: {camera.width}",

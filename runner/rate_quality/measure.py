@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from runner.errors import RunError, UserError
 from runner.graph import compile_graph
 from runner.model import Camera, ModelError, Progress, Vehicle
 from runner.rate_quality import plans
-from runner.rate_quality.artefact import Measured, dumps, to_json, to_yaml
+from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest, write_whole
 from runner.rate_quality.choice import Wishes, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
@@ -46,14 +47,34 @@ def measure(
     """
     metrics = tuple(_metric(study, name) for name in study.metrics)
     cache = Cache(cache_directory() / "points", say)
-    clips = {name: survey(path, cache, lambda frames: None) for name, path in sequences.items()}
-    parallel = parallel_tasks(study.parallel)
     alone = {name: (name,) for name in sequences if not any(name in members for members in study.pool.values())}
+    models = {**alone, **study.pool}
+    _check_output(output, models)
+    clips = {name: survey(path, cache, say) for name, path in sequences.items()}
+    parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
-        for model, members in {**alone, **study.pool}.items():
+        for model, members in models.items():
             sweeps = [_sweep(vehicle, study, name, clips[name], metrics, cache, executor, parallel) for name in members]
             measured = _measure(model, vehicle, study, sweeps, metrics, progress)
             yield _write(measured, output, sweeps)
+
+
+def _check_output(output: Path, models: Iterable[str]) -> None:
+    """Whether models may be written there, before hours of work: nobody else's camera is overwritten.
+
+    raises  UserError
+    """
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=output):
+            pass
+    except OSError as error:
+        rule = f"cannot be written to: {(error.strerror or str(error)).lower()}"
+        raise UserError("command line", "output", repr(str(output)), rule) from None
+    for path in (output / f"{model}.yaml" for model in models):
+        if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
+            rule = "is there and was not written by tod-runner model; choose another directory"
+            raise UserError("command line", "output", repr(str(path)), rule)
 
 
 def _metric(study: Study, name: str) -> Metric:

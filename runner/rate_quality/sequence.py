@@ -61,11 +61,11 @@ def decoding(path: str, fps: Fraction) -> str:
     return f'filesrc location="{quoted}" ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}'
 
 
-def survey(path: Path, cache: Cache, progress: Callable[[int], None]) -> Sequence:
+def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
     """Look a clip through.
 
-    progress  told how many frames were seen
-    raises    UserError where it cannot be used
+    say     told, in a line, that this takes a while
+    raises  UserError where it cannot be used
     """
     from runner.apply import discover
 
@@ -75,7 +75,8 @@ def survey(path: Path, cache: Cache, progress: Callable[[int], None]) -> Sequenc
     key = digest("survey", SURVEY_VERSION, sha256)
     known = cache.load(key)
     if known is None:
-        known = _look_through(path, form.fps, progress)
+        say(f"looking through {path}")
+        known = _look_through(path, form.fps)
         cache.store(key, known)
     said = asdict(form) | {"lossless": form.lossless or _recorded(path)}
     sequence = Sequence(path=str(path.resolve()), sha256=sha256, **said, **known)
@@ -94,7 +95,7 @@ def _recorded(path: Path) -> bool:
         return False
 
 
-def _look_through(path: Path, fps: Fraction, progress: Callable[[int], None]) -> dict[str, Any]:
+def _look_through(path: Path, fps: Fraction) -> dict[str, Any]:
     from runner.apply import run_lanes
     from runner.rate_quality.siti import spatial, temporal
 
@@ -111,7 +112,7 @@ def _look_through(path: Path, fps: Fraction, progress: Callable[[int], None]) ->
 
     line = f"{decoding(str(path.resolve()), fps)} ! identity name={FRAMES} ! fakesink sync=false"
     try:
-        run_lanes(LaneSet(line, fps, ()), look, lambda *_: None, progress)
+        run_lanes(LaneSet(line, fps, ()), look, lambda *_: None, lambda _: None)
     except RunError as error:
         raise UserError("command line", "sequence", repr(str(path)), f"cannot be decoded to its end: {error}") from None
     means = {"si_mean": fmean(si or [0.0]), "ti_mean": fmean(ti or [0.0])}

@@ -23,7 +23,7 @@ import yaml
 
 from runner import schema
 from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
-from runner.config import Check, load, load_run
+from runner.config import Check, load, load_run, load_study
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
 from runner.model import ModelError
@@ -44,6 +44,7 @@ def run(arguments: Arguments) -> int:
         results = list(pool.map(_check, combinations, chunksize=chunk))
     problems = [problem for result in results for problem in result.problems]
     problems += _prediction_problems(arguments, directories)
+    problems += _study_problems(arguments, directories)
     problems += _recording_problems(arguments, directories)
     if problems:
         raise ConfigError(problems)
@@ -131,6 +132,15 @@ def _recording_problems(arguments: Arguments, directories: Sequence[Path]) -> It
     if not any(word.lstrip("+~").startswith("recording") for word in arguments.overrides):
         for option in options("recording", directories):
             yield from _check(([*arguments.overrides, f"recording={option}"], arguments.conf)).problems
+
+
+def _study_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
+    """What is wrong with the ways of measuring models."""
+    for option in options("study", directories):
+        try:
+            load_study([*arguments.overrides, f"study={option}"], arguments.conf)
+        except ConfigError as error:
+            yield from error.problems
 
 
 def _registry_check(notes: list[str]) -> Check | None:

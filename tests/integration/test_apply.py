@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import socket
+import subprocess
+import sys
 import time
 
 import pytest
@@ -229,3 +231,17 @@ def test_a_port_in_use_is_told_in_one_line():
         check_port_free(vehicle.media)
     where = f"127.0.0.1:{vehicle.media.port}"
     assert str(told.value) == f"cannot listen on {where}: address already in use; choose another port"
+
+
+def test_other_modules_may_throw_beside_gstreamer():
+    # GStreamer loads libunwind; a C++ exception that meets its functions ends the process.
+    script = (
+        "import runner.apply, cv2\n"
+        "try:\n    cv2.FileStorage('%YAML:1.0\\n---\\na: [', cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)\n"
+        "except (cv2.error, SystemError):\n    pass\n"
+        "import matplotlib.figure\nprint('alive')"
+    )
+    pytest.importorskip("cv2")
+    pytest.importorskip("matplotlib")
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "alive\n")

@@ -337,7 +337,7 @@ def test_what_is_no_sequence_is_told(tod, tmp_path, cache, monkeypatch, name, co
     monkeypatch.setenv("XDG_CACHE_HOME", cache["XDG_CACHE_HOME"])
     status, out, err = tod("model", "camera=front_center", f"sequence={path}", f"output={tmp_path}")
     assert (status, out) == (2, "")
-    (line,) = err.splitlines()
+    line = err.splitlines()[-1]
     assert line.startswith("command line: sequence: ")
     assert said in line
 
@@ -371,7 +371,20 @@ def test_a_wrong_wish_is_told(tod, clip, tmp_path, cache, monkeypatch, words, sa
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *words)
     assert status == 2
     assert said in err
-    assert not (tmp_path / "out").exists()
+    assert list(tmp_path.glob("out/*")) == []
+
+
+def test_a_camera_of_the_users_own_is_not_overwritten(tod, clip, tmp_path):
+    own = tmp_path / "front_center.yaml"
+    own.write_text("width_px: 1920\n")
+    status, _, err = tod("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}")
+    assert status == 2
+    assert err == (
+        f"command line: output: '{own}': is there and was not written by tod-runner model; choose another directory\n"
+    )
+    assert own.read_text() == "width_px: 1920\n"
+    status, _, err = tod("model", "camera=front_center", f"sequence={clip}", "output=/proc/models")
+    assert (status, err.count("command line: output: '/proc/models': cannot be written to: ")) == (2, 1)
 
 
 def test_a_missing_tool_and_a_missing_scheduler_are_told(clip, tmp_path, cache):
