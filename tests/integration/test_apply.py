@@ -235,13 +235,8 @@ def test_a_port_in_use_is_told_in_one_line():
 
 def test_other_modules_may_throw_beside_gstreamer():
     # GStreamer loads libunwind; a C++ exception that meets its functions ends the process.
-    script = (
-        "import runner.apply, cv2\n"
-        "try:\n    cv2.FileStorage('%YAML:1.0\\n---\\na: [', cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)\n"
-        "except (cv2.error, SystemError):\n    pass\n"
-        "import matplotlib.figure\nprint('alive')"
-    )
     pytest.importorskip("cv2")
     pytest.importorskip("matplotlib")
+    script = "import cv2, runner.apply, matplotlib.ft2font as module; print(hasattr(module, 'nothing'))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (0, "alive\n")
+    assert (done.returncode, done.stdout) == (0, "False\n")
