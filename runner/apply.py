@@ -210,6 +210,7 @@ class OperatorSide:
     report      told, from another thread, what happens to a camera
     on_unit     told, from the camera's streaming thread, each access unit that comes
     on_picture  told, from the camera's streaming thread, each decoded picture
+    arrivals    keep when each access unit came, for the samples
     Without these no Python runs per frame.
     """
 
@@ -219,9 +220,10 @@ class OperatorSide:
         report: Report,
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
+        arrivals: bool = False,
     ) -> None:
         self._glib = _Glib()
-        self._receivers = {plan.camera.name: Receiver(plan, report, on_unit, on_picture) for plan in plans}
+        self._receivers = {p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals) for p in plans}
 
         def start() -> None:
             for receiver in self._receivers.values():

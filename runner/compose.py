@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study")
 COMMAND_LINE = "command line"
+PICKED = "picked"  # package in which a group's file is composed alone
+WHOLE = ("vehicle",)  # groups whose files speak of the whole document
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
 
 
@@ -89,6 +91,51 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
     parts += reversed(list(_file_parts(directories, choices)))
     return _resolved(config, parts)
+
+
+def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: Path | None = None) -> Composed:
+    """A configuration that was composed before, with the user's overrides on top; a group's file replaces that part.
+
+    base    the document, as a drive keeps it; name: where it stands, for messages
+    raises  ConfigError
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    parsed = _parse_overrides(overrides)
+    problems = [p for override in parsed for p in _choice_problems(override, conf_directories(user))]
+    if problems:
+        raise ConfigError(problems)
+    config = OmegaConf.create(base)
+    for override in sorted(parsed, key=lambda o: not o.choice):
+        try:
+            if override.text.startswith("~"):
+                above, _, key = override.key.rpartition(".")
+                OmegaConf.select(config, above).pop(key)
+            for key, value in _replaced(override, user):
+                OmegaConf.update(config, key, value, merge=not override.choice)
+        except (OmegaConfBaseException, ValueError, TypeError, AttributeError, KeyError) as error:
+            rule = str(error).partition("\n")[0]
+            raise ConfigError([Problem(COMMAND_LINE, override.key, None, rule)]) from None
+    parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
+    document = cast("dict[str, Any]", OmegaConf.to_container(config))
+    return Composed(document, [*parts, Part(name, (), base)])
+
+
+def _replaced(override: Override, user: Path | None) -> Iterator[tuple[str, Any]]:
+    """Keys that an override of a composed document sets, and to what."""
+    if override.text.startswith("~"):
+        return
+    if not override.choice:
+        yield override.key, override.value
+        return
+    group, _, package = override.key.lstrip("/").partition("@")
+    if group in WHOLE:
+        document = compose([f"{group}={override.value}"], user).document
+        yield from ((key, document[key]) for key in ("name", "cameras"))
+    else:
+        document = compose([f"+{group}@{PICKED}={override.value}"], user).document
+        yield package or group, document[PICKED]
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------

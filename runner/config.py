@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import rules, schema, sources
 from runner.commands import KnobValue
-from runner.compose import Composed, compose, conf_directories
+from runner.compose import Composed, compose, conf_directories, recompose
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, compile_graph
 from runner.model import (
@@ -48,6 +48,7 @@ T = TypeVar("T")
 
 
 Check = Callable[[Plan], Iterable[ModelError]]
+Base = tuple[dict[str, Any], str]  # a composed configuration of before, and where it stands
 
 
 def load(
@@ -56,6 +57,7 @@ def load(
     *,
     runnable: bool = True,
     check: Check | None = None,
+    base: Base | None = None,
 ) -> Vehicle:
     """The vehicle that the configuration describes.
 
@@ -63,14 +65,20 @@ def load(
     user       directory whose files shadow the packaged ones and may add any
     runnable   check also what only a run needs: that clips, devices and addresses are named and files are there
     check      what else may be wrong with a compiled plan: the GStreamer registry's view
+    base       what the overrides change; None: the packaged and the user's files
     raises     ConfigError with all problems
     """
-    builder = _Builder(compose(overrides, user), runnable, check)
+    builder = _Builder(composed(overrides, user, base), runnable, check)
     return builder.finished(builder.vehicle())
 
 
 def load_run(
-    overrides: Sequence[str], user: Path | None, *, runnable: bool = True, check: Check | None = None
+    overrides: Sequence[str],
+    user: Path | None,
+    *,
+    runnable: bool = True,
+    check: Check | None = None,
+    base: Base | None = None,
 ) -> tuple[Vehicle, Pqos, Track | None]:
     """The vehicle, its source of predictions, and the drive that gives positions where no GPS does.
 
@@ -79,7 +87,7 @@ def load_run(
     from runner.pqos import build_pqos
     from runner.pqos.track import build_track
 
-    builder = _Builder(compose(overrides, user), runnable, check)
+    builder = _Builder(composed(overrides, user, base), runnable, check)
     vehicle = builder.vehicle()
     if not builder.fine("pqos"):
         raise ConfigError(builder.problems)
@@ -88,6 +96,14 @@ def load_run(
     # A map that cannot be read is told once, though the drive goes through its points.
     track = builder.attempt(("pqos",), lambda: build_track(settings, bases)) if pqos else None
     return builder.finished(vehicle), builder.finished(pqos), track
+
+
+def composed(overrides: Sequence[str], user: Path | None, base: Base | None = None) -> Composed:
+    """The configuration as plain data, not yet checked.
+
+    raises  ConfigError where it cannot be composed
+    """
+    return recompose(*base, overrides, user) if base else compose(overrides, user)
 
 
 def load_study(overrides: Sequence[str], user: Path | None, *, check: Check | None = None) -> tuple[Vehicle, Study]:

@@ -158,3 +158,10 @@ def to_json(event: Event) -> dict[str, Any]:
         else:
             document[name] = plain(value) if isinstance(value, Fraction) else value
     return document
+
+
+def describe(event: Event) -> str:
+    """An event in a few words: its name and what it says."""
+    said = to_json(event)
+    words = (f"{key} {value}" for key, value in said.items() if key not in ("t", "event"))
+    return " ".join((said["event"], *words))

@@ -14,10 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.config import load_run
+from runner.config import composed, load_run
 from runner.control import OFFLINE, Link, read_request
+from runner.drive.log import Log
 from runner.graph import rtsp_url
-from runner.loop import Log, Loop
+from runner.loop import Loop
 from runner.model import Progress
 from runner.sources import compile_plans, render_missing
 
@@ -78,7 +79,14 @@ def live_vehicle(
     render_missing(vehicle, progress)
     plans = compile_plans(vehicle)
     apply.check_machine(plans)
-    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: say(f"{camera}: {what}"))
+    config = composed(overrides, conf).document if log else {}
+    drive = Log(log, "vehicle", config, apply.versions(e for p in plans for e in (*p.source, *p.vehicle)), say)
+
+    def note(what: str) -> None:
+        say(what)
+        drive.tell("note", text=what)
+
+    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: note(f"{camera}: {what}"))
 
     def on_request(payload: bytes) -> None:
         document, identity, problem = read_request(payload)
@@ -97,7 +105,7 @@ def live_vehicle(
         loop.tell_again()  # the broker has told the last will, or forgotten everything
 
     link = Link(vehicle.name, vehicle.control, ("state", OFFLINE), {"request": on_request}, on_connected)
-    loop = Loop(vehicle, side, pqos, track, Log(log), link.publish, say)
+    loop = Loop(vehicle, side, pqos, track, drive, link.publish, note)
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:
@@ -109,3 +117,4 @@ def live_vehicle(
         live.stop()
         link.close("state", OFFLINE)
         side.stop()
+        drive.close()

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from runner.commands import Command, KnobValue
+from runner.drive.log import Log, run_lines
 from runner.events import (
     ClockAdvanced,
     Event,
     OperatorConnected,
     OperatorDisconnected,
     PositionReported,
+    describe,
     parse,
     to_json,
 )
@@ -40,23 +40,6 @@ class Applier(Protocol):
     def applied(self) -> Mapping[str, Mapping[str, KnobValue]]: ...
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
-
-
-class Log:
-    """The drive log: lines of JSON appended one by one, so that a killed process loses at most the last one.
-
-    directory  None: nothing is kept
-    """
-
-    def __init__(self, directory: Path | None) -> None:
-        self._file = None
-        if directory is not None:
-            directory.mkdir(parents=True, exist_ok=True)
-            self._file = (directory / "drive.jsonl").open("a", encoding="utf-8", buffering=1)
-
-    def write(self, document: Mapping[str, Any]) -> None:
-        if self._file:
-            self._file.write(json.dumps(document, ensure_ascii=False) + "\n")
 
 
 class _Asked(NamedTuple):
@@ -118,6 +101,7 @@ class Loop:
     def run(self, duration_s: float | None = None) -> None:
         """Work until stopped, or for a time."""
         self._began = time.monotonic()
+        self.log.begin()
         self._warned = 0
         self._run = start(self.vehicle)
         self._take(ClockAdvanced(t=0.0))
@@ -180,7 +164,8 @@ class Loop:
     def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:
         before, self._run = self._run, after
         self.applier.turn(after.commands)
-        self.log.write(to_json(event))
+        for line in run_lines(to_json(event), before, after, describe(event)):
+            self.log.write(line)
         if isinstance(event, PositionReported):
             self._position = event
         if after.refused:
@@ -195,11 +180,8 @@ class Loop:
             self._tell_decision(before, event)
 
     def _tell_decision(self, before: Run, event: Event) -> None:
-        after = self._run
-        commands = [command.to_json() for command in after.commands]
-        self.log.write({"t": after.state.t, **after.decision.to_json(), "log": "decision", "commands": commands})
-        self._cause = _cause(event)
-        for name, now in after.decision.settings.items():
+        self._cause = describe(event)
+        for name, now in self._run.decision.settings.items():
             was = before.decision.settings[name]
             if (was.scaling, was.sending) != (now.scaling, now.sending):
                 self.report(f"{self._cause} -> {name}: {now.reason}")
@@ -255,7 +237,7 @@ class Loop:
             "cameras": cameras,
             "refused": self.refused,
         }
-        self.log.write({**telemetry, "log": "telemetry"})
+        self.log.write({"t": t, "log": "telemetry", **telemetry})
         self.publish("telemetry", telemetry)
 
 
@@ -265,10 +247,3 @@ def _said(t: float, result: str, reason: str) -> dict[str, Any]:
 
 def _knobs_to_json(camera: str, knobs: Mapping[str, KnobValue]) -> dict[str, Any]:
     return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
-
-
-def _cause(event: Event) -> str:
-    """An event in a few words."""
-    said = to_json(event)
-    words = (f"{key} {value}" for key, value in said.items() if key not in ("t", "event"))
-    return " ".join((said["event"], *words))

@@ -92,6 +92,16 @@ def event_validator(name: str) -> Draft202012Validator | None:
     return Draft202012Validator(definition | {"properties": properties})
 
 
+@cache
+def log_validator(kind: str) -> Draft202012Validator | None:
+    """Validator of one kind of line in a drive's files; None: there is no such kind."""
+    if kind not in log_kinds():
+        return None
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator({"$ref": f"drive.schema.json#/$defs/{kind}"}, registry=_registry())
+
+
 def read_json(text: str | bytes) -> Any:
     """A JSON document that comes from outside, its numbers finite: NaN, Infinity and 1e999 are none.
 
@@ -129,8 +139,23 @@ def event_problem(document: Any) -> str:
         return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
     if check.is_valid(document):
         return ""
-    problems = _explained(check.iter_errors(document))
-    return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in problems)
+    return _in_one_line(check.iter_errors(document))
+
+
+def log_problem(document: Mapping[str, Any]) -> str:
+    """What is wrong with a line of a drive's file that is no event, in one line; "" if nothing is."""
+    kind = document["log"]
+    check = log_validator(kind) if isinstance(kind, str) else None
+    if check is None:
+        return f"log: {shown(kind)}: unknown kind of line, {suggest(str(kind), log_kinds())}"
+    if check.is_valid(document):
+        return ""
+    return _in_one_line(check.iter_errors(document))
+
+
+@cache
+def log_kinds() -> tuple[str, ...]:
+    return tuple(schema_document("drive")["properties"]["log"]["enum"])
 
 
 @cache
@@ -171,6 +196,11 @@ def _oddities(value: Any, path: Path) -> Iterator[Finding]:
             yield from _oddities(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
+
+
+def _in_one_line(errors: Iterable[Any]) -> str:
+    found = _explained(errors)
+    return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 
 
 def _explained(errors: Iterable[Any]) -> list[Finding]:

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from runner.drive.read import read_line
 from runner.events import EVENTS, BitratePredicted, CameraConfigured, RoiSet, WeightsSet, parse, to_json
 from runner.model import Roi
 from runner.schema import event_names, event_problem
-from runner.verbs.replay import read_event
 
 EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.0, "event": "mode_selected", "mode": "automatic"},
@@ -130,4 +130,4 @@ def test_what_is_no_event(document: Any, problem: str) -> None:
     ],
 )
 def test_what_is_no_json(line: str, problem: str) -> None:
-    assert read_event(line)[1] == problem
+    assert read_line(line)[1] == problem

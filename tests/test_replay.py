@@ -15,7 +15,6 @@ from helpers import Command, UserConf, process, vehicle
 from shared_data import shared
 
 from runner.events import BitratePredicted, to_json
-from runner.loop import Log
 from runner.model import Vehicle
 from runner.pqos import Pqos, build_pqos
 from runner.verbs.replay import events, replay
@@ -146,7 +145,7 @@ def test_standard_input_and_output() -> None:
 )
 def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, told: str | None) -> None:
     with events_file.open("a") as file:
-        file.write(f'{{"log": "telemetry", "t": 0}}\n{bad}\n{lines([predicted(9, 1)])}')
+        file.write(f'{{"log": "note", "t": 0, "text": ""}}\n{bad}\n{lines([predicted(9, 1)])}')
     events_file.write_text(events_file.read_text().replace('"t": 1,', '"t": 0.5,', 1))
     output = events_file.with_name("out.jsonl")
     for words in ([], [f"output={output}"]):
@@ -169,7 +168,7 @@ def test_bad_lines_on_standard_input() -> None:
     "word, told",
     [
         ("input=/nowhere.jsonl", "command line: input: '/nowhere.jsonl': no such file or directory"),
-        ("input=/", "command line: input: '/': is a directory"),
+        ("input=/", "command line: input: '/drive.jsonl': no such file or directory"),
         ("output=/nowhere/out.jsonl", "command line: output: '/nowhere/out.jsonl': no such file or directory"),
         ("output=/", "command line: output: '/': is a directory"),
     ],
@@ -276,16 +275,127 @@ def test_a_recorded_trace_causes_fewer_changes_of_size_when_steady() -> None:
 # --- drive logs -------------------------------------------------------------------------------------------------------
 
 
-def test_a_drive_log_replays_to_what_it_says_was_decided(tmp_path: Path) -> None:
-    log, story = Log(tmp_path / "drive"), [predicted(0, 3000), CLOCK | {"t": 0.1}, predicted(0.2, 8000)]
-    decided = answers(story)
-    for event, line in zip(story, decided, strict=True):
-        log.write(event)
-        log.write({"t": line["t"], "log": "decision", "mode": "automatic", "commands": line["commands"]})
-        log.write({"t": line["t"], "log": "telemetry", "cameras": {}})
-    written = (tmp_path / "drive" / "drive.jsonl").read_text()
-    again = [json.loads(line) for line in replay(VEHICLE, events(written.splitlines(), "drive"))]
-    assert again == decided
+@pytest.fixture
+def drive(tmp_path: Path, tod: Command, story: Path) -> Path:
+    """A drive with a prediction, a switched camera, a weight and a refused request, as `replay` writes it."""
+    directory = tmp_path / "drive"
+    result = tod("replay", *PAPER, "cameras.front_left.weight=3", f"input={story}", f"log={directory}")
+    assert result.status == 0, result.err
+    return directory
+
+
+@pytest.fixture
+def story(tmp_path: Path) -> Path:
+    path = tmp_path / "story.jsonl"
+    switched = {"t": 0.3, "event": "camera_switched", "camera": "rear_center", "on": False}
+    weights = {"t": 0.4, "event": "weights_set", "weights": {"front_right": 2}}
+    refused = {"t": 0.5, "event": "total_set", "kbps": 4000}
+    where = {"t": 0.6, "event": "position_reported", "lat": 51.999233, "lon": 11.0, "speed_mps": 8.0, "heading_deg": 90}
+    story = [predicted(0, 3000.5), CLOCK | {"t": 0.1}, predicted(0.2, 8000), switched, weights, refused, where]
+    path.write_text(lines(story))
+    return path
+
+
+def test_a_drive_replays_to_the_decisions_that_it_holds(tod: Command, drive: Path, story: Path) -> None:
+    """With the configuration it was driven with, though nobody names it again, from wherever it is read."""
+    again = tod("replay", f"input={drive}")
+    assert again.out == tod("replay", *PAPER, "cameras.front_left.weight=3", f"input={story}").out
+    assert again.out == tod("replay", f"input={drive / 'drive.jsonl'}").out
+    assert again.out == process("replay", stdin=(drive / "drive.jsonl").read_bytes()).out
+    held = [json.loads(line) for line in (drive / "drive.jsonl").read_text().splitlines()]
+    assert held[0]["log"] == "began" and held[-1]["log"] == "ended"
+    decisions = [line for line in held if line.get("log") == "decision"]
+    answered = [line for line in map(json.loads, again.out.splitlines()) if line["commands"]]
+    keys = ("t", "mode", "total_kbps", "cameras", "commands")
+    assert [[line[key] for key in keys] for line in decisions] == [[line[key] for key in keys] for line in answered]
+    assert decisions[-1]["cause"] == "weights_set weights {'front_right': 2}"
+
+
+def test_a_drive_is_its_own_answer_when_it_is_replayed_into_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
+    assert tod("replay", f"input={drive}", f"log={tmp_path / 'again'}").status == 0
+    assert (tmp_path / "again" / "drive.jsonl").read_text() == (drive / "drive.jsonl").read_text()
+
+
+@pytest.mark.parametrize(
+    "override, changed",
+    [
+        ("modes=steady", {"modes"}),
+        ("cameras.front_left.weight=1", {"cameras"}),
+        ("vehicle=delivery_robot", {"name", "cameras"}),
+        ("cameras@cameras.rear_center=mast_1200p", {"cameras"}),
+        ("pqos=constant", {"pqos"}),
+        ("mode=collective", {"mode"}),
+        ("~cameras.rear_center", {"cameras"}),
+    ],
+)
+def test_overrides_change_the_configuration_of_a_drive(
+    tod: Command, drive: Path, tmp_path: Path, override: str, changed: set[str]
+) -> None:
+    result = tod("replay", override, f"input={drive}", f"log={tmp_path / 'if'}")
+    assert result.status == 0, result.err
+    before, after = (json.loads((d / "drive.jsonl").open().readline())["config"] for d in (drive, tmp_path / "if"))
+    assert {key for key in before if before[key] != after.get(key)} == changed
+
+
+@pytest.mark.parametrize(
+    "override, told",
+    [
+        ("modes=stedy", "command line: modes: stedy: no such file in conf/modes/, did you mean steady?"),
+        ("cameras.front_left.wieght=1", "command line: cameras.front_left.wieght: unknown key, did you mean weight?"),
+        ("fps_max=fast", "command line: fps_max: 'fast': must be a number or null"),
+    ],
+)
+def test_wrong_overrides_of_a_drive_are_told(tod: Command, drive: Path, override: str, told: str) -> None:
+    result = tod("replay", override, f"input={drive}")
+    assert (result.status, result.out) == (2, "")
+    assert result.err.splitlines()[0] == told
+
+
+def test_a_configuration_that_is_no_longer_valid_is_told_of_the_drive(tod: Command, drive: Path) -> None:
+    path = drive / "drive.jsonl"
+    path.write_text(path.read_text().replace('"fps_max": null', '"fps_mox": null', 1))
+    result = tod("replay", f"input={drive}")
+    assert result.status == 2
+    assert result.err.splitlines()[0] == f"{path}: line 1: config: fps_mox: unknown key, did you mean fps_max?"
+
+
+def test_a_drive_that_was_cut_off_is_replayed_to_its_last_whole_line(tod: Command, drive: Path) -> None:
+    path, whole = drive / "drive.jsonl", tod("replay", f"input={drive}").out
+    text = path.read_text().splitlines(keepends=True)
+    at = next(number for number, line in enumerate(text) if "weights_set" in line and "event" in line)
+    path.write_text("".join(text[:at]) + text[at][:20])
+    result = tod("replay", f"input={drive}")
+    assert result.status == 0
+    assert whole.startswith(result.out) and result.out.count("\n") == 4
+    assert result.err == f"{path}: line {at + 1} is cut off and was left out\n"
+
+
+def test_files_that_are_no_drive_are_told(tod: Command, drive: Path, tmp_path: Path) -> None:
+    path = drive / "drive.jsonl"
+    first, *_ = path.read_text().splitlines(keepends=True)
+
+    def told(text: str) -> str:
+        path.write_text(text)
+        result = tod("replay", f"input={drive}")
+        assert (result.status, result.out) == (2, "")
+        return result.err.removeprefix(str(path))
+
+    assert told(first.replace('"format": 1', '"format": 2')) == ": line 1: format: 2: this version reads format 1\n"
+    operator = first.replace('"side": "vehicle"', '"side": "operator"')
+    assert told(operator) == ": line 1: side: 'operator': has no events, they are in drive.jsonl\n"
+    assert told(first.replace('"versions"', '"version"')).startswith(": line 1: version: unknown key, did you mean")
+    assert told(first + '{"t": 1, "log": "decisoin"}\n').endswith("unknown kind of line, did you mean decision?\n")
+    result = tod("replay", f"input={tmp_path}")
+    assert result.err == f"command line: input: '{tmp_path}/drive.jsonl': no such file or directory\n"
+
+
+def test_a_drive_is_never_written_over(tod: Command, drive: Path, story: Path) -> None:
+    before = (drive / "drive.jsonl").read_bytes()
+    result = tod("replay", f"input={story}", f"log={drive}")
+    assert result.status == 2
+    rule = "holds a drive already (drive.jsonl), choose another directory"
+    assert result.err == f"command line: log: '{drive}': {rule}\n"
+    assert (drive / "drive.jsonl").read_bytes() == before
 
 
 def test_what_the_log_writes_is_what_replay_reads() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gi.repository import Gst
 
@@ -28,6 +29,8 @@ class Received:
     width, height  px of the decoded picture, 0 before the first
     latency_ms  capture to decode of the last sampled frame; None before the first
     rebuilt     how often the pipeline was built anew
+    arrivals    of each access unit since the sample before, where wanted: when it came and when it was captured,
+                s since 1970 by this machine's and by the vehicle's clock
     """
 
     frames: int = 0
@@ -38,6 +41,7 @@ class Received:
     height: int = 0
     latency_ms: float | None = None
     rebuilt: int = 0
+    arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
 OnUnit = Callable[[str, AccessUnit], None]  # camera, what came
@@ -53,6 +57,7 @@ class Receiver:
 
     on_unit     told each access unit from the streaming thread
     on_picture  told each decoded picture from the streaming thread
+    arrivals    keep when each access unit came
     Without these no Python runs per frame.
     """
 
@@ -62,8 +67,10 @@ class Receiver:
         report: Callable[[str, str], None],
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
+        arrivals: bool = False,
     ) -> None:
         self._sink_name = plan.operator[-1].name
+        self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         launch = f"{plan.decoder} ! {PICTURES.format(name=self._sink_name)}" if on_picture else plan.receiver
@@ -81,7 +88,7 @@ class Receiver:
 
     def sample(self) -> Received:
         """What has come so far; asks for the latency of the next frame."""
-        received = self._count()
+        received = replace(self._count(), arrivals=self._arrived())
         now = time.monotonic()
         if received.frames != self._moved[0] or not self.should_send:
             self._moved = (received.frames, now)
@@ -103,6 +110,8 @@ class Receiver:
         pipeline.connect("deep-element-added", self._on_element)
         if self._on_unit:
             self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_access_unit)
+        if self._arrivals is not None:
+            self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
 
@@ -131,6 +140,15 @@ class Receiver:
         if captured is not None:
             self._latency_ms = 1000 * (time.time() - captured)
         return Gst.PadProbeReturn.REMOVE
+
+    def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        self._arrivals.append((time.time(), capture_time(info.get_buffer())))  # type: ignore[union-attr]
+        return Gst.PadProbeReturn.OK
+
+    def _arrived(self) -> tuple[tuple[float, float | None], ...]:
+        """What has arrived since the last call; more may come meanwhile."""
+        arrivals = self._arrivals or ()
+        return tuple(self._arrivals.popleft() for _ in range(len(arrivals)))  # type: ignore[union-attr]
 
     def _on_access_unit(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         arrived, buffer = time.time(), info.get_buffer()

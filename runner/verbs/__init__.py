@@ -22,7 +22,7 @@ class Verb(NamedTuple):
 VERBS = {
     "print": Verb("what would run, and why; starts nothing", "runner.verbs.print", ("total_kbps", "format")),
     "validate": Verb("check every file and every combination", "runner.verbs.validate", ()),
-    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output")),
+    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "duration_s")),

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from runner.broker import private_broker
 from runner.config import load_run
+from runner.drive.log import check_free
 from runner.errors import RunError
 from runner.sources import render_missing
 from runner.verbs import Arguments
@@ -45,11 +46,14 @@ def run(arguments: Arguments) -> int:
         render_missing(vehicle, progress)
     own = [*arguments.overrides, *([f"conf={arguments.conf}"] if arguments.conf else [])]
     log = [f"log={arguments.values['log']}"] if "log" in arguments.values else []
+    if directory := arguments.path("log"):
+        for side in ("vehicle", "operator"):
+            check_free(directory, side)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no side is left behind
     with tempfile.TemporaryFile("w+") as said, private_broker(vehicle.control):
         with (
             _side("vehicle", [*own, *log], said.fileno()) as vehicle_side,
-            _side("operator", [*own, f"duration_s={duration}"]) as operator_side,
+            _side("operator", [*own, *log, f"duration_s={duration}"]) as operator_side,
         ):
             try:
                 status = operator_side.wait()

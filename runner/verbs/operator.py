@@ -1,9 +1,10 @@
-"""usage: tod-runner operator [OVERRIDE ...] [duration_s=N]
+"""usage: tod-runner operator [OVERRIDE ...] [duration_s=N] [log=DIR]
 
 The operator's side: receives every camera by the operator graph of the configuration and decodes it. A browser on this
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
 bitrates and factors, charts, the drive, and why each decision was made. The terminal shows a table of the same. Ends
-with Ctrl-C or after duration_s, with a summary of how well what came followed what was decided.
+with Ctrl-C or after duration_s, with a summary of how well what came followed what was decided. With log=DIR all that
+comes is written to DIR/operator.jsonl, for `report` and `export`.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
@@ -21,7 +22,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from runner.config import load
+from runner.config import composed, load
+from runner.drive.heard import listener
+from runner.drive.log import Log
 from runner.model import Vehicle
 from runner.sources import compile_plans
 from runner.station import Station
@@ -41,6 +44,10 @@ def run(arguments: Arguments) -> int:
     apply = streaming()
     duration = arguments.number("duration_s")
     vehicle = load(arguments.overrides, arguments.conf, runnable=False, check=apply.check_plan)
+    log = arguments.path("log")
+    plans = compile_plans(vehicle)
+    config = composed(arguments.overrides, arguments.conf).document if log else {}
+    versions = apply.versions(element for plan in plans for element in plan.operator)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -48,9 +55,13 @@ def run(arguments: Arguments) -> int:
     with Table() as table:
         station = Station(vehicle)
         station.listeners.append(table.tell)
+        drive = Log(log, "operator", config, versions, station.note)
+        if log:
+            station.listeners.append(listener(station, drive))
         with _served(vehicle, station) as page:
             station.connect()
-            side = apply.OperatorSide(compile_plans(vehicle), station.report, page.show if page else None)
+            side = apply.OperatorSide(plans, station.report, page.show if page else None, arrivals=log is not None)
+            drive.begin()
             gc.freeze()  # what is loaded by now stays: collecting it again and again would hold up frames
             until = None if duration is None else time.monotonic() + duration
             # A terminal that takes nothing (Ctrl-S) may hold up the table, and nothing else.
@@ -65,6 +76,7 @@ def run(arguments: Arguments) -> int:
                 sampling.join()
                 station.close()
                 side.stop()
+                drive.close()
     show_summary(station.meters, station.samples)
     return 0
 

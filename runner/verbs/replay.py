@@ -1,16 +1,23 @@
-"""usage: tod-runner replay [OVERRIDE ...] [input=FILE] [output=FILE]
+"""usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json says what an
 event is. A line that is no event ends the run with its number; what was put out before stays. An event that cannot be
 accepted is answered with "accepted": false and the reason, and the run goes on.
 
+A drive (the directory that log= wrote, or its drive.jsonl) is replayed with the configuration that it was driven with:
+the decisions are those of the drive. Overrides change that configuration and so answer "what if"; with log= the answer
+is written as a drive of its own, for `report`.
+
 Predictions are those of the input. With a pqos= on the command line they are dropped and that source predicts instead,
 from the positions and times of the input; its events are marked "source": "pqos".
 
   echo '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}' | tod-runner replay modes=paper
-  tod-runner replay input=drive/drive.jsonl modes=steady output=steadier.jsonl
-  tod-runner replay input=drive/drive.jsonl pqos=map pqos.file=other_map.csv
+  tod-runner replay input=drive output=decisions.jsonl
+  tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
+  tod-runner replay input=drive pqos=map pqos.file=other_map.csv
+  tod-runner replay input=drive cameras.rear_center.weight=2
+  tod-runner replay input=drive vehicle=delivery_robot
 """
 
 from __future__ import annotations
@@ -20,52 +27,92 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, TextIO
 
-from runner.config import load, load_run
+from runner.config import composed, load, load_run
+from runner.drive.log import FILES, Log, run_lines
+from runner.drive.read import Line, check_began, is_log, read_line, read_lines
 from runner.errors import UserError
-from runner.events import BitratePredicted, Event, parse, to_json
+from runner.events import BitratePredicted, Event, describe, parse, to_json
 from runner.model import Vehicle
-from runner.schema import event_problem, read_json
+from runner.schema import log_problem
 from runner.step import Run, start, step
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
+Heard = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
+
 _encode = json.JSONEncoder(ensure_ascii=False).encode
 
 
 def run(arguments: Arguments) -> int:
-    pqos: Pqos | None = None
-    if any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides):
-        vehicle, pqos, _ = load_run(arguments.overrides, arguments.conf, runnable=False)
-    else:
-        vehicle = load(arguments.overrides, arguments.conf, runnable=False)
-    with _input(arguments) as (name, lines), _output(arguments) as output:
-        for line in replay(vehicle, events(lines, name), pqos):
-            output.write(line)
+    with _input(arguments) as (name, text):
+        lines, began = _begin(text, name)
+        vehicle, pqos, log = _load(arguments, name, began)
+        with _output(arguments) as output:
+            for line in replay(vehicle, events(lines, name), pqos, log):
+                output.write(line)
+            log.close()
     return 0
 
 
-def replay(vehicle: Vehicle, inputs: Iterable[tuple[dict[str, Any], Event]], pqos: Pqos | None = None) -> Iterator[str]:
+def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Line | None]:
+    """All lines again, and the beginning of the drive that they are; None: they are but events."""
+    lines = iter(text)
+    first = list(islice(lines, 1))
+    line, problem = read_line(first[0]) if first else ({}, "")
+    if problem or not is_log(line) or line["log"] != "began":
+        return chain(first, lines), None
+    if problem := log_problem(line):
+        raise UserError(f"{name}: line 1", "", None, problem)
+    check_began(line, name)
+    if line["side"] != "vehicle":
+        raise UserError(f"{name}: line 1", "side", repr(line["side"]), f"has no events, they are in {FILES['vehicle']}")
+    return chain(first, lines), line
+
+
+def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None, Log]:
+    """The configuration of the drive, or the composed one, with the overrides on top; and a log for the answer."""
+    base = (began["config"], f"{name}: line 1: config") if began else None
+    overrides, directory, pqos = arguments.overrides, arguments.path("log"), None
+    if any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in overrides):
+        vehicle, pqos, _ = load_run(overrides, arguments.conf, runnable=False, base=base)
+    else:
+        vehicle = load(overrides, arguments.conf, runnable=False, base=base)
+    config = composed(overrides, arguments.conf, base).document if directory else {}
+    log = Log(directory, "vehicle", config, {}, lambda what: print(what, file=sys.stderr))
+    log.begin(began["time"] if began else 0.0)
+    return vehicle, pqos, log
+
+
+def replay(
+    vehicle: Vehicle, inputs: Iterable[Heard], pqos: Pqos | None = None, log: Log | None = None
+) -> Iterator[str]:
     """One line of JSON per event, in order.
 
     pqos  predicts in place of the events' own predictions
+    log   written as the vehicle would have
     """
     now = start(vehicle)
+    for document, event in inputs if pqos is None else _predicted(inputs, pqos):
+        before, now = now, step(vehicle, now, event)
+        if log:
+            for line in run_lines(to_json(event), before, now, describe(event)):
+                log.write(line)
+        yield answer(document, now)
+
+
+def _predicted(inputs: Iterable[Heard], pqos: Pqos) -> Iterator[Heard]:
+    """The events with the predictions of another source in place of their own."""
     for document, event in inputs:
-        if pqos is None:
-            now = step(vehicle, now, event)
-            yield answer(document, now)
-            continue
         if not isinstance(event, BitratePredicted):
-            now = step(vehicle, now, event)
-            yield answer(document, now)
+            yield document, event
         prediction = pqos.observe(event)
         if prediction is not None:
-            now = step(vehicle, now, prediction)
-            yield answer(to_json(prediction) | {"source": "pqos"}, now)
+            yield to_json(prediction) | {"source": "pqos"}, prediction
 
 
 def answer(document: dict[str, Any], now: Run) -> str:
@@ -81,40 +128,21 @@ def answer(document: dict[str, Any], now: Run) -> str:
     return _encode(line) + "\n"
 
 
-def events(lines: Iterable[str], name: str) -> Iterator[tuple[dict[str, Any], Event]]:
-    """Events of a JSON Lines text, each with the JSON it came from. Lines of a drive log that are no events are passed.
+def events(lines: Iterable[str], name: str) -> Iterator[Heard]:
+    """Events of a JSON Lines text, each with the JSON it came from. What else a drive's file says is passed over.
 
     raises  UserError with the number of the line
     """
-    last = 0.0
-    for number, line in enumerate(lines, 1):
-        document, problem = read_event(line)
-        if not problem and _is_log(document):
+    last, warnings = 0.0, list[str]()
+    for number, document in read_lines(lines, name, warnings, events=True):
+        if is_log(document):
             continue
-        if not problem and document["t"] < last:
+        if document["t"] < last:
             problem = f"t: {document['t']}: must not fall, the event before was at {last}"
-        if problem:
             raise UserError(f"{name}: line {number}", "", None, problem)
         last = document["t"]
         yield document, parse(document)
-
-
-def read_event(line: str) -> tuple[Any, str]:
-    """The JSON of a line, and what is wrong with it as an event, or ""."""
-    try:
-        document = read_json(line.rstrip())
-    except RecursionError:
-        return None, "not JSON: nested too deeply"
-    except json.JSONDecodeError as error:
-        return None, f"not JSON: {error.msg} (column {error.pos + 1})"
-    except ValueError as error:
-        return None, f"not JSON: {error}"
-    return document, "" if _is_log(document) else event_problem(document)
-
-
-def _is_log(document: Any) -> bool:
-    """Whether it is a line of a drive log that tells what the vehicle did: a decision, telemetry."""
-    return isinstance(document, dict) and "log" in document and "event" not in document
+    print("\n".join(warnings), end="\n" if warnings else "", file=sys.stderr)
 
 
 @contextmanager
@@ -124,6 +152,8 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
         yield "standard input", sys.stdin
         return
+    if path.is_dir():
+        path /= FILES["vehicle"]
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             yield str(path), file

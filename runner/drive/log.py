@@ -1,0 +1,144 @@
+"""What one side of a drive says, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from runner.errors import UserError
+from runner.step import Run
+
+FORMAT = 1
+FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
+
+
+class Log:
+    """One side's file in the directory of a drive. May be used from any thread.
+
+    directory  None: nothing is kept
+    config     the composed configuration
+    versions   of what the drive is made with, by name
+    report     told once, if the file cannot be written any further: the drive goes on without its log
+    raises     UserError where the directory holds a drive already, or cannot be written
+
+    Every line is one write to the system, so that a killed process loses at most the last one.
+    What comes before `begin` is kept until then.
+    """
+
+    def __init__(
+        self,
+        directory: Path | None,
+        side: str,
+        config: Mapping[str, Any],
+        versions: Mapping[str, str],
+        report: Callable[[str], None],
+    ) -> None:
+        if directory is not None:
+            check_free(directory, side)
+        self._directory, self._fd = directory, -1
+        self._side, self._config, self._versions, self._report = side, config, versions, report
+        self._lock = threading.Lock()
+        self._began: float | None = None
+        self._past: float | None = None  # of a drive of the past, the time of its last line
+        self.time = 0.0  # of the beginning, s since 1970
+        self._early: list[Mapping[str, Any]] = []
+
+    def begin(self, at: float | None = None) -> None:
+        """Time 0 of the drive: now the file is there.
+
+        at  s since 1970, of a drive of the past whose lines bring their times; None: now
+        """
+        if self._directory is not None:
+            self._fd = _create(self._directory, self._side)
+        self.time = time.time() if at is None else at
+        first = {
+            "t": 0.0,
+            "log": "began",
+            "side": self._side,
+            "format": FORMAT,
+            "time": self.time,
+            "versions": {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions},
+            "config": self._config,
+        }
+        with self._lock:
+            self._began, self._past = time.monotonic(), None if at is None else 0.0
+            for line in (first, *self._early):
+                self._append(line)
+
+    def now(self) -> float:
+        """Time since the beginning, s."""
+        if self._past is not None or self._began is None:
+            return self._past or 0.0
+        return round(time.monotonic() - self._began, 6)
+
+    def write(self, line: Mapping[str, Any]) -> None:
+        """One line: an event, or what a key `log` names."""
+        with self._lock:
+            if self._began is None:
+                self._early.append(line)
+                return
+            if self._past is not None:
+                self._past = line["t"]
+            self._append(line)
+
+    def tell(self, kind: str, **keys: Any) -> None:
+        """One line of a kind, at this moment."""
+        self.write({"t": self.now(), "log": kind, **keys})
+
+    def close(self) -> None:
+        """The clean end."""
+        with self._lock:
+            self._append({"t": self.now(), "log": "ended"})
+            if self._fd >= 0:
+                os.close(self._fd)
+            self._fd = -1
+
+    def _append(self, line: Mapping[str, Any]) -> None:
+        if self._fd < 0:
+            return
+        data = (json.dumps(line, ensure_ascii=False) + "\n").encode()
+        try:
+            if os.write(self._fd, data) == len(data):
+                return
+            why = "no space left on device"
+        except OSError as error:
+            why = (error.strerror or str(error)).lower()
+        os.close(self._fd)
+        self._fd = -1
+        self._report(f"the drive goes on without its log: {FILES[self._side]}: {why}")
+
+
+def check_free(directory: Path, side: str) -> None:
+    """raises UserError where this side of a drive is there already"""
+    if os.path.lexists(directory / FILES[side]):
+        raise _refused(directory, f"holds a drive already ({FILES[side]}), choose another directory")
+
+
+def _create(directory: Path, side: str) -> int:
+    """A new file of a drive, open for appending."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
+        return os.open(directory / FILES[side], flags, 0o666)
+    except OSError as error:
+        raise _refused(directory, (error.strerror or str(error)).lower()) from None
+
+
+def _refused(directory: Path, rule: str) -> UserError:
+    return UserError("command line", "log", repr(str(directory)), rule)
+
+
+def run_lines(event: Mapping[str, Any], before: Run, after: Run, cause: str) -> Iterable[dict[str, Any]]:
+    """What a drive log says of one event: the event, and what was decided where that changed."""
+    yield dict(event)
+    if after.commands or after.decision != before.decision:
+        commands = [command.to_json() for command in after.commands]
+        decision = after.decision.to_json()
+        yield {"t": after.state.t, "log": "decision", "cause": cause, **decision, "commands": commands}

@@ -1,0 +1,135 @@
+"""Drives as they lie on disk, read back and checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from runner.drive.log import FILES, FORMAT
+from runner.errors import UserError
+from runner.schema import event_problem, log_problem, read_json
+
+Line = dict[str, Any]
+PASSED_OVER = ("decision", "telemetry", "note", "video", "ended")  # where the vehicle's events alone are wanted
+
+
+@dataclass(frozen=True)
+class Side:
+    """What one side wrote.
+
+    began  its first line: time (s since 1970), versions, config
+    lines  all others, in their order
+    ended  whether it came to a clean end
+    """
+
+    began: Line
+    lines: list[Line]
+    ended: bool
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A directory that `log=` wrote.
+
+    sides     by name: vehicle, operator, link; a drive may lack any of them
+    warnings  what a person should know before trusting it
+    """
+
+    path: Path
+    sides: Mapping[str, Side]
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return self.path.resolve().name
+
+
+def read_drive(directory: Path) -> Drive:
+    """All that lies in the directory of a drive.
+
+    raises  UserError with file and line of the first mistake
+    """
+    where = str(directory)
+    if not directory.is_dir():
+        rule = "must be a directory that log= wrote" if directory.exists() else "no such directory"
+        raise UserError(where, "", None, rule)
+    warnings: list[str] = []
+    files = {side: directory / name for side, name in FILES.items()}
+    sides = {side: _side(side, path, warnings) for side, path in files.items() if path.is_file()}
+    if not sides.keys() & {"vehicle", "operator"}:
+        raise UserError(where, "", None, f"holds no drive: neither {FILES['vehicle']} nor {FILES['operator']}")
+    return Drive(directory, sides, warnings)
+
+
+def _side(side: str, path: Path, warnings: list[str]) -> Side:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        lines = [line for _, line in read_lines(file, str(path), warnings)]
+    began = check_began(lines[0] if lines else None, str(path))
+    if began["side"] != side:
+        raise UserError(f"{path}: line 1", "side", repr(began["side"]), f"must be {side}")
+    ended = lines[-1].get("log") == "ended"
+    if not ended:
+        warnings.append(f"{path}: has no end; the process was killed, or still runs")
+    return Side(began, lines[1:], ended)
+
+
+def check_began(line: Line | None, name: str) -> Line:
+    """The first line of a drive's file.
+
+    raises  UserError where it is another
+    """
+    if line is None:
+        raise UserError(name, "", None, "is empty: nothing was logged")
+    if line.get("log") != "began":
+        raise UserError(f"{name}: line 1", "", None, "is no beginning of a drive: must be a file that log= wrote")
+    if line["format"] != FORMAT:
+        raise UserError(f"{name}: line 1", "format", str(line["format"]), f"this version reads format {FORMAT}")
+    return line
+
+
+def read_lines(
+    lines: Iterable[str], name: str, warnings: list[str], *, events: bool = False
+) -> Iterator[tuple[int, Line]]:
+    """The lines of a drive's file with their numbers, each checked against its schema.
+
+    events  give events only, and the beginning; what else a side wrote is not looked at
+
+    In a drive, a last line without an end, which a killed process left, is left out and told.
+
+    raises  UserError with the number of the first line that is wrong
+    """
+    drive = False
+    for number, text in enumerate(lines, 1):
+        line, problem = read_line(text)
+        if is_log(line):
+            drive = True
+            if events and line["log"] in PASSED_OVER:
+                continue
+            problem = problem or log_problem(line)
+        if problem and drive and not text.endswith("\n"):
+            warnings.append(f"{name}: line {number} is cut off and was left out")
+            return
+        if problem:
+            raise UserError(f"{name}: line {number}", "", None, problem)
+        yield number, line
+
+
+def read_line(text: str) -> tuple[Line, str]:
+    """The JSON of a line, and what is wrong with it as JSON and as an event, or ""."""
+    try:
+        line = read_json(text.rstrip())
+    except RecursionError:
+        return {}, "not JSON: nested too deeply"
+    except json.JSONDecodeError as error:
+        return {}, f"not JSON: {error.msg} (column {error.pos + 1})"
+    except ValueError as error:
+        return {}, f"not JSON: {error}"
+    return line, "" if is_log(line) else event_problem(line)
+
+
+def is_log(line: Any) -> bool:
+    """Whether a line tells what a side did or saw, and is no event."""
+    return isinstance(line, dict) and "log" in line and "event" not in line
