@@ -60,6 +60,10 @@ class Decision:
     total: Kbps
     settings: Mapping[str, Setting]
 
+    def says_the_same(self, other: Decision) -> bool:
+        """Whether it is equal and for the same reasons."""
+        return self == other and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
+
     def to_json(self) -> dict[str, Any]:
         return {
             "mode": self.mode.value,

@@ -31,6 +31,7 @@ from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, TextIO
 
 from runner.config import composed, load, load_run
+from runner.decision import Decision
 from runner.drive.log import FILES, Log, run_lines
 from runner.drive.read import Line, check_began, is_log, read_line, read_lines
 from runner.errors import UserError
@@ -55,6 +56,7 @@ def run(arguments: Arguments) -> int:
         with _output(arguments) as output:
             for line in replay(vehicle, events(lines, name), pqos, log):
                 output.write(line)
+        if log:
             log.close()
     return 0
 
@@ -74,7 +76,7 @@ def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Line | None]:
     return chain(first, lines), line
 
 
-def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None, Log]:
+def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None, Log | None]:
     """The configuration of the drive, or the composed one, with the overrides on top; and a log for the answer."""
     base = (began["config"], f"{name}: line 1: config") if began else None
     overrides, directory, pqos = arguments.overrides, arguments.path("log"), None
@@ -82,7 +84,9 @@ def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle,
         vehicle, pqos, _ = load_run(overrides, arguments.conf, runnable=False, base=base)
     else:
         vehicle = load(overrides, arguments.conf, runnable=False, base=base)
-    config = composed(overrides, arguments.conf, base).document if directory else {}
+    if directory is None:
+        return vehicle, pqos, None
+    config = composed(overrides, arguments.conf, base).document
     log = Log(directory, "vehicle", config, {}, lambda what: print(what, file=sys.stderr))
     log.begin(began["time"] if began else 0.0)
     return vehicle, pqos, log
@@ -96,13 +100,13 @@ def replay(
     pqos  predicts in place of the events' own predictions
     log   written as the vehicle would have
     """
-    now = start(vehicle)
+    now, answers = start(vehicle), _Answers()
     for document, event in inputs if pqos is None else _predicted(inputs, pqos):
         before, now = now, step(vehicle, now, event)
         if log:
             for line in run_lines(to_json(event), before, now, describe(event)):
                 log.write(line)
-        yield answer(document, now)
+        yield answers.line(document, now)
 
 
 def _predicted(inputs: Iterable[Heard], pqos: Pqos) -> Iterator[Heard]:
@@ -115,17 +119,27 @@ def _predicted(inputs: Iterable[Heard], pqos: Pqos) -> Iterator[Heard]:
             yield to_json(prediction) | {"source": "pqos"}, prediction
 
 
-def answer(document: dict[str, Any], now: Run) -> str:
-    """The line that answers an event: what was heard, what is in force, what was commanded."""
-    line = {"t": document["t"], "event": document["event"]}
-    if "source" in document:
-        line["source"] = document["source"]
-    line["accepted"] = not now.refused
-    if now.refused:
-        line["reason"] = now.refused
-    line |= now.decision.to_json()
-    line["commands"] = [command.to_json() for command in now.commands]
-    return _encode(line) + "\n"
+class _Answers:
+    """The lines that answer events: what was heard, what is in force, what was commanded."""
+
+    def __init__(self) -> None:
+        self._decision: Decision | None = None
+        self._text = ""  # of that decision; most events change nothing
+
+    def line(self, document: dict[str, Any], now: Run) -> str:
+        heard = {"t": document["t"], "event": document["event"]}
+        if "source" in document:
+            heard["source"] = document["source"]
+        heard["accepted"] = not now.refused
+        if now.refused:
+            heard["reason"] = now.refused
+        commands = _encode([command.to_json() for command in now.commands])
+        return f'{_encode(heard)[:-1]}, {self._in_force(now.decision)}, "commands": {commands}}}\n'
+
+    def _in_force(self, decision: Decision) -> str:
+        if self._decision is None or not decision.says_the_same(self._decision):
+            self._decision, self._text = decision, _encode(decision.to_json())[1:-1]
+        return self._text
 
 
 def events(lines: Iterable[str], name: str) -> Iterator[Heard]:
