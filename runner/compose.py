@@ -19,10 +19,10 @@ from runner.resources import directory
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study")
+GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
 COMMAND_LINE = "command line"
 PICKED = "picked"  # package in which a group's file is composed alone
-WHOLE = ("vehicle",)  # groups whose files speak of the whole document
+WHOLE = ("vehicle", "experiment")  # groups whose files speak of the whole document
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
 
 
@@ -84,10 +84,10 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     if problems:
         raise ConfigError(problems)
     config, choices = _compose(parsed, directories)
-    vehicle = find_file(directories, "vehicle", choices.get("vehicle", ""))
-    if vehicle.exists() and PACKAGE_HEADER not in vehicle.read_text(encoding="utf-8"):
-        rule = f"must begin with the line {PACKAGE_HEADER}"
-        raise ConfigError([Problem(label(vehicle, directories), "", None, rule)])
+    for file in (find_file(directories, group, choices.get(group, "")) for group in WHOLE):
+        if file.exists() and PACKAGE_HEADER not in file.read_text(encoding="utf-8"):
+            rule = f"must begin with the line {PACKAGE_HEADER}"
+            raise ConfigError([Problem(label(file, directories), "", None, rule)])
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
     parts += reversed(list(_file_parts(directories, choices)))
     return _resolved(config, parts)
@@ -130,7 +130,9 @@ def _replaced(override: Override, user: Path | None) -> Iterator[tuple[str, Any]
         yield override.key, override.value
         return
     group, _, package = override.key.lstrip("/").partition("@")
-    if group in WHOLE:
+    if group == "experiment":
+        raise ValueError("an experiment is a configuration of its own: name what of it is to change")
+    if group == "vehicle":
         document = compose([f"{group}={override.value}"], user).document
         yield from ((key, document[key]) for key in ("name", "cameras"))
     else:
@@ -426,7 +428,7 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
         group, _, package = key.partition("@")
         if group.startswith("hydra") or group not in GROUPS or name == "None":
             continue
-        where = tuple(package.split(".")) if package else () if group == "vehicle" else (group,)
+        where = tuple(package.split(".")) if package else () if group in WHOLE else (group,)
         yield from _with_bases(find_file(directories, group, name), group, where, directories)
 
 

@@ -89,6 +89,12 @@ def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Me
     return draft.but(total=start_kbps if state.collective_total is None else state.collective_total), memory
 
 
+@rule(gives=["total"])
+def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
+    """The total is what the file says, whatever is predicted: for comparison."""
+    return draft.but(total=kbps), memory
+
+
 @rule(gives=["demand"], reads=["on", "rois"])
 def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI."""
@@ -106,6 +112,15 @@ def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
     """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
     assert draft.total is not None
     return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+
+
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
+def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Each camera that is on gets the same, times its weight, and nobody more than the demand: for comparison."""
+    assert draft.total is not None
+    # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
+    weights = {name: state.weights[name] / demand if demand else allocation.ZERO for name, demand in draft.demand.items()}
+    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
