@@ -62,10 +62,14 @@ def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
 
 @contextmanager
 def process(
-    verb: str, *words: str, stdout: int = subprocess.PIPE, env: Mapping[str, str] | None = None
+    verb: str,
+    *words: str,
+    stdout: int = subprocess.PIPE,
+    env: Mapping[str, str] | None = None,
+    before: Sequence[str] = (),
 ) -> Iterator[subprocess.Popen[str]]:
-    """A verb in a process of its own, killed at the end."""
-    command = [sys.executable, "-m", "runner", verb, *words]
+    """A verb in a process of its own, killed at the end; `before` comes before its command line."""
+    command = [*before, sys.executable, "-m", "runner", verb, *words]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **(env or {})}
     with subprocess.Popen(
         command, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT

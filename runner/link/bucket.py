@@ -1,0 +1,78 @@
+"""A drop-tail queue behind a token bucket: what the relay does, as the kernel's tbf does it. Pure: time is given."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+from runner.link.limit import Counters, burst_bytes, queue_bytes
+
+T = TypeVar("T")
+
+
+class Bucket(Generic[T]):
+    """Packets wait until the bucket holds as many tokens (bytes) as they are long.
+
+    Departures are reckoned, not observed: who looks late finds every packet with the time at which it left, and a
+    scheduler that is late costs no rate. Times are seconds of any clock that does not go back.
+    """
+
+    def __init__(self, kbps: float, queue_ms: float, now: float) -> None:
+        self._queue_ms = queue_ms
+        self._items: deque[tuple[int, T]] = deque()
+        self._backlog = 0  # bytes
+        self._at = now  # when `_tokens` was right
+        self._passed = self._packets = self._dropped = 0
+        self._set(kbps)
+        self._tokens: float = self._burst
+
+    def _set(self, kbps: float) -> None:
+        self._rate = kbps * 1000 / 8  # bytes/s
+        self._burst, self._limit = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
+
+    def set_rate(self, kbps: float, now: float) -> None:
+        """From now on; take what is due before. What waits stays, even if it now waits longer than queue_ms."""
+        self._fill(now)
+        self._set(kbps)
+
+    def has_room(self, size: int) -> bool:
+        return self._backlog + size <= self._limit
+
+    def put(self, size: int, item: T, now: float, *, keep: bool = False) -> None:
+        """A packet comes; it is dropped where the queue has no room, unless it is to be kept."""
+        if not (keep or self.has_room(size)):
+            self._dropped += 1
+            return
+        if not self._items:
+            self._fill(now)
+        self._items.append((size, item))
+        self._backlog += size
+
+    def due(self) -> float | None:
+        """When the next packet leaves; None: nothing waits."""
+        if not self._items:
+            return None
+        return self._at + max(0.0, self._items[0][0] - self._tokens) / self._rate
+
+    def take(self, now: float) -> Iterator[tuple[float, T]]:
+        """Packets that have left by now, each with the time when it did."""
+        while (when := self.due()) is not None and when <= now:
+            self._fill(when)
+            size, item = self._items.popleft()
+            self._tokens -= size
+            self._backlog -= size
+            self._passed += size
+            self._packets += 1
+            yield when, item
+
+    def counters(self, now: float) -> Counters:
+        tokens = self._tokens + max(0.0, now - self._at) * self._rate
+        wait_ms = 1000 * max(0.0, self._backlog - tokens) / self._rate
+        return Counters(wait_ms, self._passed, self._packets, self._dropped)
+
+    def _fill(self, now: float) -> None:
+        # A packet longer than the bucket gets the tokens that it needs, too.
+        most = max(self._burst, self._items[0][0]) if self._items else self._burst
+        self._tokens = min(most, self._tokens + max(0.0, now - self._at) * self._rate)
+        self._at = max(self._at, now)

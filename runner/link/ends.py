@@ -1,0 +1,35 @@
+"""What a link of either kind looks like from outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from runner.link.limit import Shaper
+from runner.model import Endpoint
+
+
+@dataclass(frozen=True)
+class Ends:
+    """How both sides are started so that what goes from vehicle to operator passes the link.
+
+    vehicle_command     what comes before the vehicle's command line
+    vehicle_overrides   where the vehicle's RTSP server listens and where it finds the broker
+    operator_overrides  where the operator finds both
+    broker              where the broker is to listen
+    shaper              sets the rate and counts
+    """
+
+    vehicle_command: tuple[str, ...]
+    vehicle_overrides: tuple[str, ...]
+    operator_overrides: tuple[str, ...]
+    broker: Endpoint
+    shaper: Shaper
+
+
+def overrides(media: Endpoint, control: Endpoint) -> tuple[str, ...]:
+    """The words that tell a side where RTSP server and broker are."""
+    return tuple(
+        f"{key}={value}"
+        for name, endpoint in (("media", media), ("control", control))
+        for key, value in ((f"{name}.host", endpoint.host), (f"{name}.port", endpoint.port))
+    )

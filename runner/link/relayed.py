@@ -1,0 +1,51 @@
+"""A link without root: a process of its own between vehicle and operator, `runner.link.relay`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from runner.link.child import Child
+from runner.link.ends import Ends, overrides
+from runner.link.limit import Counters, Limit
+from runner.model import Endpoint
+
+
+@contextmanager
+def relayed(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
+    """The relay while it is needed: the operator's RTSP and the vehicle's MQTT go through it.
+
+    media, control  where RTSP server and broker listen, on this machine
+    raises          RunError
+    """
+    settings = {
+        "media": [media.host, media.port],
+        "control": [control.host, control.port],
+        "kbps": limit.kbps(0),
+        "queue_ms": limit.queue_ms,
+        "delay_ms": limit.delay_ms,
+    }
+    paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    relay = Child("relay", (sys.executable, "-m", "runner.link.relay", json.dumps(settings)), environment)
+    try:
+        listens = relay.answer()
+        for_operator = overrides(Endpoint(media.host, listens["media"]), control)
+        for_vehicle = overrides(media, Endpoint(control.host, listens["control"]))
+        yield Ends((), for_vehicle, for_operator, control, _Relay(relay))
+    finally:
+        relay.end()
+
+
+class _Relay:
+    """The relay's process as a shaper."""
+
+    def __init__(self, child: Child) -> None:
+        self._child = child
+
+    def limit(self, kbps: float) -> Counters:
+        return Counters(**self._child.ask(str(kbps)))
