@@ -35,6 +35,7 @@ from runner.model import (
 )
 
 if TYPE_CHECKING:
+    from runner.experiment import Experiment, LinkSettings
     from runner.pqos import Pqos
     from runner.pqos.track import Track
     from runner.rate_quality.study import Study
@@ -104,6 +105,25 @@ def composed(overrides: Sequence[str], user: Path | None, base: Base | None = No
     raises  ConfigError where it cannot be composed
     """
     return recompose(*base, overrides, user) if base else compose(overrides, user)
+
+
+def load_experiment(overrides: Sequence[str], user: Path | None) -> tuple[Experiment, LinkSettings | None]:
+    """What the demo drives, and the limited link between its sides.
+
+    raises  ConfigError with all problems, also those of maps and traces
+    """
+    from runner.experiment import Experiment, read_experiment, read_link
+
+    builder = _Builder(compose(overrides, user), runnable=False, check=None)
+    builder.vehicle()
+    document, bases = builder.composed.document, [*conf_directories(user), Path.cwd()]
+    experiment = builder.part(("experiment",), read_experiment) if "experiment" in document else Experiment()
+    if "link" not in document:
+        return builder.finished(experiment), None
+    link = None
+    if builder.fine("pqos"):
+        link = builder.part(("link",), lambda data: read_link(data, document["pqos"], bases))
+    return builder.finished(experiment), builder.finished(link)
 
 
 def load_study(overrides: Sequence[str], user: Path | None, *, check: Check | None = None) -> tuple[Vehicle, Study]:

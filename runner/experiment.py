@@ -1,4 +1,4 @@
-"""A drive that anyone can repeat: how long, how often, over which link. Read from the `experiment` and `link` sections."""
+"""A drive that anyone can repeat: how long, how often, over which link; the `experiment` and `link` sections."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from runner.events import ClockAdvanced, Event
-from runner.model import exact
+from runner.link.limit import Limit
+from runner.model import Kbps, exact
 from runner.pqos import Pqos, build_pqos, trace
 from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
@@ -20,32 +21,24 @@ STEP_S = 0.1  # at which the rate of a link follows a map
 class Experiment:
     """What the demo drives.
 
-    about       what it shows, in a sentence
+    about       what it shows, in a sentence, or ""
     duration_s  length of each drive, s
     claims      name of what a publication reports of such a drive, or ""
     runs        by name, the overrides that each of several drives adds; empty: one drive
     """
 
-    about: str
-    duration_s: float
+    about: str = ""
+    duration_s: float = 60
     claims: str = ""
     runs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """A link of limited rate between the two sides.
-
-    kind      netns or relay
-    kbps_at   rate in force at a time of the drive (s), kbit/s
-    queue_ms  longest wait before the link
-    delay_ms  one way, without any queue
-    """
+    """A link of limited rate between the two sides: its kind, netns or relay, and what it does to packets."""
 
     kind: str
-    kbps_at: Callable[[float], float]
-    queue_ms: float
-    delay_ms: float
+    limit: Limit
 
 
 def read_experiment(data: Mapping[str, Any]) -> Experiment:
@@ -53,35 +46,35 @@ def read_experiment(data: Mapping[str, Any]) -> Experiment:
     return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs)
 
 
-def read_link(
-    data: Mapping[str, Any], pqos: Mapping[str, Any], duration_s: float, bases: Sequence[Path]
-) -> LinkSettings:
+def read_link(data: Mapping[str, Any], pqos: Mapping[str, Any], bases: Sequence[Path]) -> LinkSettings:
     """The link that the `link` section describes.
 
-    pqos        the section of that name, which the rate follows where the link names no file
-    duration_s  how long the rate is known ahead
-    raises      ModelError with the key of the link's or of the pqos section, what was found and what is right
+    pqos    the section of that name, which the rate follows where the link names no file
+    bases   directories in which a relative file is looked up
+    raises  ModelError with the key, what was found and what is right
     """
-    share = float(data["share"])
     if data["file"]:
-        path = find_file(data, "file", bases)
-        rates = trace(path, data["loop"], exact(0))
-        kbps_at: Callable[[float], float] = lambda t: share * float(rates(t))
+        rates = trace(find_file(data, "file", bases), data["loop"], exact(0))
     else:
-        truth = build_pqos({**pqos, "look_ahead_s": 0}, bases)
-        known = _sampled(truth, build_track(pqos, bases), duration_s)
-        kbps_at = lambda t: share * known[min(max(0, int(t / STEP_S)), len(known) - 1)]
-    return LinkSettings(data["kind"], kbps_at, float(data["queue_ms"]), float(data["delay_ms"]))
+        rates = _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
+    share = float(data["share"])
+
+    def kbps_at(t: float) -> float:
+        return share * float(rates(t))
+
+    return LinkSettings(data["kind"], Limit(kbps_at, float(data["queue_ms"]), float(data["delay_ms"])))
 
 
-def _sampled(source: Pqos, track: Track | None, duration_s: float) -> list[float]:
-    """What a source of predictions states for each moment of a drive, kbit/s, every STEP_S."""
-    rates: list[float] = []
-    last = 0.0
-    for step in range(int(duration_s / STEP_S) + 1):
-        t = step * STEP_S
-        event: Event = ClockAdvanced(t=t) if track is None else track.at(t)
-        prediction = source.observe(event)
-        last = last if prediction is None else float(prediction.kbps)
-        rates.append(last)
-    return rates
+def _known(source: Pqos, track: Track | None) -> Callable[[float], Kbps]:
+    """What a source of predictions states for each moment of a drive, kbit/s; 0 where it states nothing."""
+    rates: list[Kbps] = []
+
+    def kbps_at(t: float) -> Kbps:
+        while len(rates) * STEP_S <= t:
+            now = len(rates) * STEP_S
+            event: Event = ClockAdvanced(t=now) if track is None else track.at(now)
+            prediction = source.observe(event)
+            rates.append(prediction.kbps if prediction else rates[-1] if rates else exact(0))
+        return rates[int(t / STEP_S)]
+
+    return kbps_at

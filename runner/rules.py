@@ -119,7 +119,8 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     """Each camera that is on gets the same, times its weight, and nobody more than the demand: for comparison."""
     assert draft.total is not None
     # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
-    weights = {name: state.weights[name] / demand if demand else allocation.ZERO for name, demand in draft.demand.items()}
+    wanted = {name: demand for name, demand in draft.demand.items() if demand}
+    weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
     return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
 
 
