@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -83,14 +83,20 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     problems = [p for override in parsed for p in _choice_problems(override, directories)]
     if problems:
         raise ConfigError(problems)
+    _check_headers({o.key: str(o.value) for o in parsed if o.choice}, directories)
     config, choices = _compose(parsed, directories)
-    for file in (find_file(directories, group, choices.get(group, "")) for group in WHOLE):
-        if file.exists() and PACKAGE_HEADER not in file.read_text(encoding="utf-8"):
-            rule = f"must begin with the line {PACKAGE_HEADER}"
-            raise ConfigError([Problem(label(file, directories), "", None, rule)])
+    _check_headers(choices, directories)
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]
     parts += reversed(list(_file_parts(directories, choices)))
     return _resolved(config, parts)
+
+
+def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
+    """Whether files that speak of the whole document say so; Hydra would put them elsewhere without a word."""
+    for file in (find_file(directories, group, choices[group]) for group in WHOLE if group in choices):
+        if file.exists() and PACKAGE_HEADER not in file.read_text(encoding="utf-8"):
+            rule = f"must begin with the line {PACKAGE_HEADER}"
+            raise ConfigError([Problem(label(file, directories), "", None, rule)])
 
 
 def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: Path | None = None) -> Composed:
@@ -285,7 +291,8 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         group, name = _place(wanted)
         known = options(group, directories)
         hint = suggest(name, known) if known else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
-        file = label(find_file(directories, *_place(where)), directories)
+        overriding = _overriding(group, name, directories)
+        file = overriding or label(find_file(directories, *_place(where)), directories)
         return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
     lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
     rule = "; ".join(lines)
@@ -322,6 +329,17 @@ def _chooser(key: str, directories: Sequence[Path]) -> str:
         return sum(str(k).removeprefix("/") == key for k in keys)
 
     return label(max(_files(directories), key=times), directories)
+
+
+def _overriding(group: str, name: str, directories: Sequence[Path]) -> str:
+    """The file whose defaults list chooses a file of a group in place of another, or ""; Hydra names its reader."""
+    for path in _files(directories):
+        content = load_file(path)
+        entries = content.get("defaults") if isinstance(content, dict) else None
+        pairs = [pair for entry in entries or () if isinstance(entry, dict) for pair in entry.items()]
+        if any(str(key).replace(" /", " ") == f"override {group}" and value == name for key, value in pairs):
+            return label(path, directories)
+    return ""
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -423,8 +441,8 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
     """The files behind a composition, in the order in which Hydra merged them."""
     root = find_file(directories, "", "config")
     yield Part(label(root, directories), (), load_file(root), root)
-    # Mounted files first: a vehicle file says last what belongs to the place.
-    for key, name in sorted(choices.items(), key=lambda item: "@" not in item[0]):
+    # Mounted files first: a vehicle file says last what belongs to the place. An experiment has the last word.
+    for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
         group, _, package = key.partition("@")
         if group.startswith("hydra") or group not in GROUPS or name == "None":
             continue

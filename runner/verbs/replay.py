@@ -23,7 +23,6 @@ from the positions and times of the input; its events are marked "source": "pqos
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -36,6 +35,7 @@ from runner.drive.log import FILES, Log, run_lines
 from runner.drive.read import Line, check_began, is_log, read_line, read_lines
 from runner.errors import UserError
 from runner.events import BitratePredicted, Event, describe, parse, to_json
+from runner.files import whole_file
 from runner.model import Vehicle
 from runner.schema import log_problem
 from runner.step import Run, start, step
@@ -184,16 +184,5 @@ def _output(arguments: Arguments) -> Iterator[TextIO]:
         sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)  # type: ignore[union-attr]
         yield sys.stdout
         return
-    # What is there and no file, such as /dev/null, is written to as it is.
-    special = path.exists() and not path.is_file()
-    unfinished = path if special else path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        file = unfinished.open("w", encoding="utf-8")
-    except OSError as error:
-        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
-    try:
-        with file:
-            yield file
-    finally:
-        if not special:
-            unfinished.replace(path)  # also after a bad line: what was put out before stays
+    with whole_file(path, also_after_errors=True) as file:  # also after a bad line: what was put out before stays
+        yield file

@@ -23,7 +23,7 @@ import yaml
 
 from runner import schema
 from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
-from runner.config import Check, load, load_run, load_study
+from runner.config import Check, load, load_experiment, load_run, load_study
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
 from runner.model import ModelError
@@ -45,7 +45,7 @@ def run(arguments: Arguments) -> int:
     problems = [problem for result in results for problem in result.problems]
     problems += _prediction_problems(arguments, directories)
     problems += _study_problems(arguments, directories)
-    problems += _recording_problems(arguments, directories)
+    problems += _choice_problems(arguments, directories)
     if problems:
         raise ConfigError(problems)
     notes = dict.fromkeys(note for result in results for note in result.notes)
@@ -121,17 +121,31 @@ def _prediction_problems(arguments: Arguments, directories: Sequence[Path]) -> I
     chosen = any(word.lstrip("+~").startswith("pqos") for word in arguments.overrides)
     for option in [""] if chosen else options("pqos", directories):
         words = [*arguments.overrides, f"pqos={option}"] if option else arguments.overrides
-        try:
-            load_run(words, arguments.conf, runnable=False)
-        except ConfigError as error:
-            yield from error.problems
+        yield from _run_problems(words, arguments.conf)
 
 
-def _recording_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
-    """What is wrong with the ways to record, beyond the one that was chosen and checked in every combination."""
-    if not any(word.lstrip("+~").startswith("recording") for word in arguments.overrides):
-        for option in options("recording", directories):
-            yield from _check(([*arguments.overrides, f"recording={option}"], arguments.conf)).problems
+def _choice_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
+    """What is wrong with files that no combination chose: ways to record, links, experiments with all their runs."""
+    for group in ("recording", "link", "experiment"):
+        if any(word.lstrip("+~").startswith(group) for word in arguments.overrides):
+            continue
+        for option in options(group, directories):
+            words = [*arguments.overrides, f"{group}={option}"]
+            try:
+                experiment, _ = load_experiment(words, arguments.conf)
+            except ConfigError as error:
+                yield from error.problems
+                continue
+            for added in ((), *experiment.runs.values()) if group == "experiment" else ((),):
+                yield from _run_problems([*words, *added], arguments.conf)
+
+
+def _run_problems(overrides: list[str], user: Path | None) -> list[Problem]:
+    try:
+        load_run(overrides, user, runnable=False, check=_registry_check([]))
+    except ConfigError as error:
+        return error.problems
+    return []
 
 
 def _study_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:

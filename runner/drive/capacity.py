@@ -1,0 +1,106 @@
+"""A bandwidth map from drives: what came through where the link was really the limit. Pure.
+
+What arrives says how much a link carries only while more is sent than it carries; at all other times it says how much
+was sent. A sample counts where, over its second, packets were lost or frames waited: what came is then what it gave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from runner.drive.series import Positions, Series, Values
+
+WINDOW_S = 1.0  # that the rates of the samples are taken over
+WAITED_MS = 50.0  # more than the least latency of the drive: the queue before the link was filling
+GAP_S = 2.0  # positions further apart say nothing of the time between
+EARTH_M = 6378137.0  # WGS-84 equatorial radius
+
+
+class Sample(NamedTuple):
+    """What the link gave at a place: degrees, kbit/s of encoded video."""
+
+    lat: float
+    lon: float
+    kbps: float
+
+
+class Cell(NamedTuple):
+    """One square of the ground: mean place of its samples, a percentile of their rates (kbit/s), and their number."""
+
+    lat: float
+    lon: float
+    kbps: float
+    samples: int
+
+
+def limited_samples(drive: Series) -> list[Sample]:
+    """The samples of a drive in which the link was the limit."""
+    received = [camera.received for camera in drive.cameras.values() if camera.received]
+    if not received or drive.positions is None:
+        return []
+    t, kbps = drive.actual
+    limited = np.zeros(t.shape, dtype=bool)
+    for camera in received:
+        limited |= _lost(t, camera.t, camera.lost) | _waited(t, camera.arrival_t, camera.arrival_ms)
+    lat, lon = _at(drive.positions, t)
+    known = limited & np.isfinite(kbps) & np.isfinite(lat)
+    return [Sample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
+
+
+def cells(samples: Iterable[Sample], percentile: float, cell_m: float) -> list[Cell]:
+    """Squares of the ground, in the order in which they were first met.
+
+    percentile  of the rates in a cell, 0 to 100: 10 is what the link gave in nine of ten samples
+    cell_m      side of a square, m
+    """
+    found: dict[tuple[int, int], list[Sample]] = {}
+    first: Sample | None = None
+    for sample in samples:
+        first = first or sample
+        found.setdefault(_square(sample, first, cell_m), []).append(sample)
+    return [_cell(inside, percentile) for inside in found.values()]
+
+
+def _cell(inside: list[Sample], percentile: float) -> Cell:
+    lat, lon, kbps = np.array(inside).T
+    # The lower of two neighbours: between them nothing was measured.
+    return Cell(lat.mean(), lon.mean(), float(np.percentile(kbps, percentile, method="lower")), len(inside))
+
+
+def _square(sample: Sample, origin: Sample, cell_m: float) -> tuple[int, int]:
+    """Column and row, on the plane around the first sample."""
+    east = np.radians(np.remainder(sample.lon - origin.lon + 180, 360) - 180) * np.cos(np.radians(origin.lat)) * EARTH_M
+    north = np.radians(sample.lat - origin.lat) * EARTH_M
+    return int(np.floor(east / cell_m)), int(np.floor(north / cell_m))
+
+
+def _lost(at: Values, t: Values, lost: Values) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Whether packets were lost in the second before each time."""
+    before = np.interp(at - WINDOW_S, t, lost)
+    more: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = np.interp(at, t, lost) > before
+    return more
+
+
+def _waited(at: Values, t: Values, latency_ms: Values) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Whether half of the frames that came in the second before each time had waited."""
+    waited = np.zeros(at.shape, dtype=bool)
+    if not np.isfinite(latency_ms).any():
+        return waited
+    late = latency_ms > np.nanmin(latency_ms) + WAITED_MS
+    ends, begins = np.searchsorted(t, at, "right"), np.searchsorted(t, at - WINDOW_S, "right")
+    count = np.append(0, np.cumsum(late))
+    frames = ends - begins
+    waited[frames > 0] = (2 * (count[ends] - count[begins]) >= frames)[frames > 0]
+    return waited
+
+
+def _at(positions: Positions, t: Values) -> tuple[Values, Values]:
+    """Degrees in the middle of the second before each time; nan where no position is near."""
+    middle = t - WINDOW_S / 2
+    nearest = np.abs(positions.t[None, :] - middle[:, None]).min(axis=1) if t.size else np.empty(0)
+    far = nearest > GAP_S
+    lat, lon = (np.interp(middle, positions.t, values) for values in (positions.lat, positions.lon))
+    return np.where(far, np.nan, lat), np.where(far, np.nan, lon)
