@@ -1,0 +1,169 @@
+"""What a side writes of a drive and what is read back: whole lines whatever happens, clear words on what is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner.drive.log import Log
+from runner.drive.read import read_drive
+from runner.errors import UserError
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+NOTES = """
+import sys
+from pathlib import Path
+from runner.drive.log import Log
+
+said = []
+log = Log(Path(sys.argv[1]), "vehicle", dict(), dict(), said.append)
+log.begin()
+{limit}
+for number in range({count}):
+    log.tell("note", text=f"{{number}} " + "x" * 5000)
+log.close()
+print(len(said), *said)
+"""
+
+
+def written(directory: Path, side: str = "drive.jsonl") -> list[str]:
+    return (directory / side).read_text().splitlines(keepends=True)
+
+
+def child(directory: Path, count: str, limit: str = "") -> subprocess.Popen[str]:
+    code = NOTES.format(count=count, limit=limit)
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(directory)], stdout=subprocess.PIPE, text=True, env=environment
+    )
+
+
+def begun(directory: Path, config: dict[str, Any] | None = None) -> Log:
+    log = Log(directory, "vehicle", config or {}, {"GStreamer": "1.22"}, lambda what: None)
+    log.begin()
+    return log
+
+
+def test_a_drive_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    log = Log(tmp_path / "a" / "drive", "operator", {"name": "tum_q7"}, {"GStreamer": "1.22"}, lambda what: None)
+    log.tell("note", text="before the beginning")
+    assert not (tmp_path / "a").exists()  # what does not begin leaves nothing
+    log.begin()
+    log.tell("note", text="grün")
+    log.close()
+    log.tell("note", text="after the end")
+    drive = read_drive(tmp_path / "a" / "drive")
+    assert (drive.name, drive.warnings, list(drive.sides)) == ("drive", [], ["operator"])
+    side = drive.sides["operator"]
+    assert (side.began["config"], side.began["versions"]["GStreamer"]) == ({"name": "tum_q7"}, "1.22")
+    assert abs(side.began["time"] - time.time()) < 60
+    assert [line.get("text") for line in side.lines] == ["before the beginning", "grün", None]
+    assert side.ended
+
+
+def test_a_killed_process_loses_at_most_its_last_line(tmp_path: Path) -> None:
+    with child(tmp_path, "10**9") as process:
+        while not (tmp_path / "drive.jsonl").exists() or len(written(tmp_path)) < 50:
+            assert process.poll() is None
+        process.send_signal(signal.SIGKILL)
+    lines = written(tmp_path)
+    whole = lines if lines[-1].endswith("\n") else lines[:-1]
+    assert [json.loads(line)["text"].split()[0] for line in whole[1:]] == [str(n) for n in range(len(whole) - 1)]
+    drive = read_drive(tmp_path)
+    assert len(drive.sides["vehicle"].lines) == len(whole) - 1
+    assert drive.warnings[-1] == f"{tmp_path / 'drive.jsonl'}: has no end; the process was killed, or still runs"
+
+
+def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
+    """A limit on the size of files is what a full disk is: a part of a line is written, then nothing."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (70_000, 70_000))"
+    with child(tmp_path, "100", limit) as process:
+        told, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert told == "1 the drive goes on without its log: drive.jsonl: no space left on device\n"
+    drive = read_drive(tmp_path)
+    assert 10 <= len(drive.sides["vehicle"].lines) <= 14
+    assert "is cut off and was left out" in drive.warnings[0]
+
+
+def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
+    log = begun(tmp_path)
+
+    def write(name: str) -> None:
+        for number in range(200):
+            log.tell("note", text=f"{name} {number} " + name * 3000)
+
+    threads = [threading.Thread(target=write, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    log.close()
+    lines = read_drive(tmp_path).sides["vehicle"].lines
+    assert len(lines) == 4 * 200 + 1
+    for name in "abcd":
+        assert [line["text"].split()[1] for line in lines[:-1] if line["text"][0] == name] == [
+            str(n) for n in range(200)
+        ]
+
+
+def test_where_nothing_can_be_written_is_told_before_the_drive(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"command line: log: '.*/file': (file exists|not a directory)"):
+        begun(tmp_path / "file")
+    begun(tmp_path / "drive").close()
+    with pytest.raises(UserError, match=r"holds a drive already \(drive.jsonl\), choose another directory"):
+        Log(tmp_path / "drive", "vehicle", {}, {}, print)
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (lambda lines: [], "{file}: is empty: nothing was logged"),
+        (lambda lines: lines[1:], "{file}: line 1: is no beginning of a drive: must be a file that log= wrote"),
+        (lambda lines: ['{"a": 1}\n'], "{file}: line 1: event: missing: must be given"),
+        (lambda lines: ["PK\x03\x04 no text\n"], "{file}: line 1: not JSON: Expecting value (column 1)"),
+        (lambda lines: [*lines[:2], "{\n", *lines[2:]], "{file}: line 3: not JSON: "),
+        (
+            lambda lines: [lines[0], lines[1].replace('"text"', '"txt"')],
+            "{file}: line 2: txt: unknown key, did you mean text?",
+        ),
+        (
+            lambda lines: [lines[0].replace('"vehicle"', '"operator"')],
+            "{file}: line 1: side: 'operator': must be vehicle",
+        ),
+        (
+            lambda lines: [lines[0].replace('"format": 1', '"format": 9')],
+            "{file}: line 1: format: 9: this version reads format 1",
+        ),
+    ],
+)
+def test_what_is_no_drive_is_told_with_its_line(tmp_path: Path, change: Any, told: str) -> None:
+    log = begun(tmp_path)
+    log.tell("note", text="a")
+    log.close()
+    file = tmp_path / "drive.jsonl"
+    file.write_text("".join(change(written(tmp_path))))
+    with pytest.raises(UserError) as error:
+        read_drive(tmp_path)
+    assert str(error.value).startswith(told.format(file=file))
+
+
+def test_a_directory_without_a_drive_is_told(tmp_path: Path) -> None:
+    for path, rule in (
+        (tmp_path, "holds no drive: neither drive.jsonl nor operator.jsonl"),
+        (tmp_path / "nowhere", "no such directory"),
+        (Path(__file__), "must be a directory that log= wrote"),
+    ):
+        with pytest.raises(UserError) as error:
+            read_drive(path)
+        assert str(error.value) == f"{path}: {rule}"
