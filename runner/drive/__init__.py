@@ -1,0 +1,1 @@
+"""A drive that was logged: read back, put on one time axis, measured, drawn."""
