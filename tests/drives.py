@@ -104,7 +104,9 @@ class _Made:
         names = list(self.vehicle.cameras)
         self.now = start(self.vehicle)
         self.rate = dict.fromkeys(names, 0.0)  # kbit/s that comes out of each encoder
-        self.count = {name: dict.fromkeys(("frames", "bytes", "got", "got_bytes", "lost", "rebuilt"), 0) for name in names}
+        self.count = {
+            name: dict.fromkeys(("frames", "bytes", "got", "got_bytes", "lost", "rebuilt"), 0) for name in names
+        }
         self.due = dict.fromkeys(names, 0.0)  # when the next frame is captured
         self.arrivals: dict[str, list[list[float | None]]] = {name: [] for name in names}
         self.past: list[tuple[float, dict[str, tuple[int, int]]]] = []
@@ -250,7 +252,15 @@ def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: floa
             points.append(
                 {"scaling": factor, "target_kbps": kbps, "actual_kbps": kbps * 0.97, "encode_ms": 3.0, "mssim": quality}
             )
-    clip = {"file": "clip.mkv", "sha256": "0", "width": 1920, "height": 1040, "fps": 40, "codec": "FFV1", "lossless": True}
+    clip = {
+        "file": "clip.mkv",
+        "sha256": "0",
+        "width": 1920,
+        "height": 1040,
+        "fps": 40,
+        "codec": "FFV1",
+        "lossless": True,
+    }
     clip |= {"frames": 100, "si": 50.0, "ti": 20.0, "si_mean": 45.0, "ti_mean": 15.0}
     document = {
         "version": 1,

@@ -313,8 +313,11 @@ def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[An
 
 
 def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Line:
-    if samples:
-        return _line((t, line["actual_kbps"]) for t, line in samples)
+    """Measured total; unknown before the first second of video, whose rate is taken over a window yet to fill."""
+    received = [camera.received for camera in cameras.values() if camera.received]
+    if received:
+        t, y = _line((t, line["actual_kbps"]) for t, line in samples)
+        return Line(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
     return Line(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
 
@@ -407,10 +410,14 @@ def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Rec
     came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.get("arrivals") or ()]
     arrivals = np.array(came, dtype=float).reshape(-1, 2)
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
+    t = np.array([t for t, *_ in received], dtype=float)
+    frames = counted(column("frames"))
     return Received(
-        t=np.array([t for t, *_ in received], dtype=float),
-        **{key: column(key) for key in ("fps", "kbps", "width", "height", "latency_ms")},
-        **{key: counted(column(key)) for key in ("frames", "bytes", "lost", "rebuilt")},
+        t=t,
+        kbps=_settled(t, column("kbps"), frames),
+        **{key: column(key) for key in ("fps", "width", "height", "latency_ms")},
+        frames=frames,
+        **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
         arrival_t=arrivals[:, 0],
         arrival_ms=arrivals[:, 1],
     )
@@ -420,6 +427,12 @@ def _sent(sent: Sequence[tuple[float, Mapping[str, Any]]]) -> Sent:
     t = np.array([t for t, _ in sent], dtype=float)
     frames, sizes = (counted(np.array([c[key] for _, c in sent], dtype=float)) for key in ("frames", "bytes"))
     return Sent(t, frames, sizes, rate(t, sizes))
+
+
+def _settled(t: Values, kbps: Values, frames: Values) -> Values:
+    """A rate that is nan until the window it is taken over has filled with video once."""
+    came = t[frames > 0]
+    return np.where(t >= (came[0] if came.size else np.inf) + RATE_WINDOW_S, kbps, np.nan)
 
 
 def counted(counter: Values) -> Values:
