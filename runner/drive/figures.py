@@ -225,7 +225,7 @@ def latency(drives: Rows) -> Figure | str:
             _latency_axis(axes.yaxis, wide=wide)
         axes.set_ylabel("latency in ms")
         axes.tick_params(labelbottom=False)
-        axes.set_title(drive.series.label if len(drives) > 1 else "(a) Each second, all cameras")
+        axes.set_title(drive.series.label if len(drives) > 1 else "(a) Over time")
         _draw_freezes(strip, drive, unit)
     grid[0].set_xlim(0, max(drive.series.end for drive in drives) / unit)
     if not wide:
