@@ -112,15 +112,13 @@ def bitrate_on_track(drives: Rows) -> Figure | str:
     if not shown:
         return "no positions were logged"
     tracks = [_on_track(drive) for drive in shown]
-    known = np.concatenate([kbps[np.isfinite(kbps)] for *_, kbps in tracks])
+    known = np.concatenate([kbps for *_, kbps in tracks])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     height = sum(_height(drive.positions) for drive in shown if drive.positions)
     figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
     grid = figure.subplots(len(shown), squeeze=False)[:, 0]
     for axes, drive, (east, north, kbps) in zip(grid, shown, tracks, strict=True):
-        points = axes.scatter(
-            east, north, c=kbps, s=7, lw=0, cmap=_viridis(), vmin=low, vmax=high, zorder=2, plotnonfinite=False
-        )
+        points = axes.scatter(east, north, c=kbps, s=7, lw=0, cmap=_viridis(), vmin=low, vmax=high, zorder=2)
         _mark_way(axes, drive)
         _dress_map(axes, drive, titled=len(shown) > 1)
         _colour_bar(figure, axes, points, drive)
@@ -345,6 +343,7 @@ def on_track(drive: Series) -> tuple[Values, Values, Values, Values]:
     t = drive.actual.t if drive.measured else places.t
     t = t[(t >= places.t[0]) & (t <= places.t[-1])]
     kbps = np.interp(t, *drive.actual) if drive.measured else held(drive.allocated, t)
+    t, kbps = t[np.isfinite(kbps)], kbps[np.isfinite(kbps)]
     return t, np.interp(t, places.t, places.east), np.interp(t, places.t, places.north), kbps
 
 
@@ -377,6 +376,7 @@ def _mark_way(axes: Axes, drive: Series) -> None:
         arrow = MarkerStyle(">").rotated(deg=float(angle))
         axes.plot(x[at], y[at], marker=arrow, ms=5, mfc="white", mec="black", mew=0.6, zorder=4)
     ends = (("start", 0, "o"), ("end", -1, "s"))
+    axes.plot(x, y, color=LINK, lw=1.2, zorder=1)  # also where no bitrate is known
     for text, at, marker in ends:
         axes.plot(x[at], y[at], marker=marker, ms=5.5, mfc="white", mec="black", mew=1.0, zorder=5, ls="", label=text)
 

@@ -18,7 +18,7 @@ from runner.drive.document import number, rules, when
 from runner.drive.figures import METRICS, on_track
 from runner.drive.series import CameraSeries, Line, Series, Values
 from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
-from runner.drive.tables import VERDICTS, camera_rows, drive_rows, shown
+from runner.drive.tables import MEANING, VERDICTS, camera_rows, drive_rows, shown
 from runner.errors import RunError
 
 STATIC = Path(__file__).parent / "static"
@@ -108,8 +108,9 @@ def _body(
     yield "</div>"
     if left_out:
         yield "".join(f'<p class="muted">{escape(each)}</p>' for each in left_out)
+    meaning = f'<p class="muted">{escape(MEANING)}</p>'
     for drive in drives:
-        yield _section(f"Cameras{_of(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
+        yield _section(f"Cameras{_of(drive, several)}", _table("Statistics by camera", camera_rows(drive)) + meaning)
         yield _reasons(drive, _of(drive, several))
 
 
@@ -284,9 +285,11 @@ def _track(series: Series) -> dict[str, Any] | None:
     if series.positions is None:
         return None
     t, east, north, kbps = on_track(series)
-    each = _stride(len(t))
+    places = series.positions
+    each, every = _stride(len(t)), _stride(len(places.t))
+    way = {"x": _rounded(places.east[::every], 1), "y": _rounded(places.north[::every], 1)}
     columns = {"t": (t, 2), "x": (east, 1), "y": (north, 1), "kbps": (kbps, 0)}
-    return {key: _rounded(values[::each], digits) for key, (values, digits) in columns.items()}
+    return {key: _rounded(values[::each], digits) for key, (values, digits) in columns.items()} | {"way": way}
 
 
 def _quantiles(values: Values) -> list[float | None]:

@@ -10,6 +10,10 @@ from runner.drive.statistics import CameraStatistics, Latency, Statistics
 Row = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
+MEANING = (
+    "Arrival and decode: latency since capture. Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
+    " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer."
+)
 SIZES = 3  # as many sizes of pictures are told, those seen longest
 
 
@@ -17,7 +21,7 @@ def camera_rows(drive: Statistics) -> tuple[Row, list[Row]]:
     """Headings, and a row for each camera."""
     kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
     headings: Row = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
-    headings += ("capture to arrival\nmedian / p95 / p99 ms", "capture to decode\nmedian / p95 / p99 ms")
+    headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
     headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind)
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 

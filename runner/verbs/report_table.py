@@ -36,7 +36,7 @@ def show(drives: Sequence[Statistics], checks: Mapping[str, Sequence[Check]], le
 def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if number else "left", no_wrap=not number or "\n" in heading)
+        table.add_column(heading, justify="right" if number else "left", no_wrap=True, overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
     return table

@@ -39,6 +39,14 @@ const axis = (title, more = {}) => ({
 const time = (more = {}) => axis("time in s", { range: [0, data.end], ...more });
 const hold = { shape: "hv" };
 
+/** An axis of latencies, logarithmic where they spread: plotly's own numbers on it leave digits out. */
+function spread(title, low, high, more = {}) {
+  const log = low > 0 && high / low > WIDE;
+  const marks = [-1, 0, 1, 2, 3, 4, 5].flatMap((power) => [1, 2, 5].map((digit) => digit * 10 ** power));
+  const range = log ? [Math.log10(low * 0.95), Math.log10(high * 1.05)] : [Math.min(0, low), high * 1.05];
+  return axis(title, { range, type: log ? "log" : "linear", ...(log ? { tickvals: marks } : {}), ...more });
+}
+
 function totals(drive) {
   const traces = [];
   if (drive.link) {
@@ -106,7 +114,6 @@ const latency = (drive, part) => (part === 0 ? latencyOverTime(drive) : distribu
 function latencyOverTime(drive) {
   const { t, median, p95, freezes, watched } = drive.latency;
   const [low, high] = extent(data.drives.flatMap((d) => known([...d.latency.median, ...d.latency.p95])));
-  const wide = low > 0 && high / low > WIDE;
   const hover = (name) => `%{y:.0f} ms ${name}<extra></extra>`;
   const traces = [
     line({ t, y: p95 }, "95th percentile", themed("late"), {}, hover("95th percentile")),
@@ -124,8 +131,7 @@ function latencyOverTime(drive) {
   const strip = Math.min(0.4, 0.06 + 0.055 * frozen.length);
   const said = watched ? "no freezes" : "arrivals were not logged: freezes are not known";
   const annotations = frozen.length ? [] : [{ text: said, showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.03, font: { size: 12, color: themed("muted") } }];
-  const range = wide ? [Math.log10(low * 0.9), Math.log10(high * 1.1)] : [Math.min(0, low), high * 1.05];
-  const yaxis = axis("latency in ms", { domain: [strip + 0.08, 1], range, type: wide ? "log" : "linear", dtick: wide ? "D2" : undefined });
+  const yaxis = spread("latency in ms", low, high, { domain: [strip + 0.08, 1] });
   const yaxis2 = axis("", { domain: [0, strip], type: "category", tickfont: { size: 11 }, visible: frozen.length > 0 });
   return { traces, layout: { xaxis: time({ anchor: "free", position: 0 }), yaxis, yaxis2, annotations, bargap: 0.2, barmode: "overlay", hovermode: "closest" } };
 }
@@ -140,27 +146,27 @@ function distribution(drive) {
     : Object.entries(drive.cameras).filter(([, camera]) => camera.latency.length).map(([name, camera]) => curve(camera.latency, name, colourOf(drive, name)));
   if (!several) traces.push(curve(drive.latency.all, "all cameras", themed("text"), { dash: "dash", width: 2.4 }));
   const [low, high] = extent(data.drives.flatMap((d) => d.latency.all.slice(0, -1)));
-  const wide = low > 0 && high / low > WIDE;
   const of = data.drives.some((d) => d.latency.of === "arrival") ? "arrival" : "decode";
-  const xaxis = axis(`latency from capture to ${of} in ms`, { type: wide ? "log" : "linear", range: wide ? [Math.log10(low), Math.log10(high)] : [Math.min(0, low), high], dtick: wide ? "D2" : undefined });
+  const xaxis = spread(`latency from capture to ${of} in ms`, low, high);
   return { traces, layout: { xaxis, yaxis: axis("share of frames", { range: [0, 1.01], tickformat: ".0%", tickvals: [0, 0.25, 0.5, 0.75, 0.95] }) } };
 }
 
 function bitrate_on_track(drive) {
-  const { t, x, y, kbps } = drive.track;
+  const { t, x, y, kbps, way } = drive.track;
   const tracks = data.drives.filter((d) => d.track).flatMap((d) => known(d.track.kbps));
   const [cmin, cmax] = extent(tracks);
   const bar = { title: { text: "kbit/s", side: "top", font: { size: 13 } }, thickness: 12, outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
   const mark = (at, symbol, name) => ({
-    type: "scatter", mode: "markers", x: [x.at(at)], y: [y.at(at)], name, hoverinfo: "skip",
+    type: "scatter", mode: "markers", x: [way.x.at(at)], y: [way.y.at(at)], name, hoverinfo: "skip",
     marker: { symbol, size: 13, color: themed("panel"), line: { width: 2.5, color: themed("text") } },
   });
   const here = { type: "scatter", mode: "markers", x: [], y: [], name: "where you point at", showlegend: false, hoverinfo: "skip", marker: { symbol: "circle-open", size: 22, color: themed("text"), line: { width: 4 } } };
   const traces = [
+    { type: "scatter", mode: "lines", ...way, name: "way", showlegend: false, hoverinfo: "skip", line: { color: themed("line"), width: 2 } },
     { type: "scatter", mode: "markers", x, y, customdata: t, name: "track", showlegend: false,
       marker: { color: kbps, cmin, cmax, colorscale: viridis(), size: 7, colorbar: bar },
       hovertemplate: "%{customdata:.1f} s: %{marker.color:,.0f} kbit/s<br>%{x:.0f} m east, %{y:.0f} m north<extra></extra>" },
-    arrows(x, y), mark(0, "circle", "start"), mark(-1, "square", "end"), here,
+    arrows(way.x, way.y), mark(0, "circle", "start"), mark(-1, "square", "end"), here,
   ];
   return { traces, layout: { xaxis: axis("m east of the start"), yaxis: axis("m north of the start", { scaleanchor: "x" }), hovermode: "closest" } };
 }
