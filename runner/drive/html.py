@@ -155,7 +155,7 @@ def _about(drive: Statistics, *, several: bool) -> str:
     ]
     if series.link:
         facts.append(("dropped on the link", f"{series.link.dropped[-1]:.0f} packets"))
-    facts += [(f"versions, {side}", ", ".join(f"{k} {v}" for k, v in each.items())) for side, each in _versions(series)]
+    facts += [(heading, ", ".join(f"{k} {v}" for k, v in each.items())) for heading, each in _versions(series)]
     listed = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts)
     told = "".join(f"<li>{escape(each)}</li>" for each in (*series.warnings, *drive.notes))
     notes = f'<ul class="warnings" aria-label="What to know">{told}</ul>' if told else ""
@@ -170,9 +170,11 @@ def _rules(series: Series) -> str:
 
 
 def _versions(series: Series) -> list[tuple[str, Mapping[str, str]]]:
-    """By side, or once where all are the same."""
+    """By heading, for each side, or once where all are the same."""
     sides = [(side, each) for side, each in series.versions.items() if each]
-    return sides[:1] if all(each == sides[0][1] for _, each in sides) else sides
+    if sides and all(each == sides[0][1] for _, each in sides):
+        return [("versions", sides[0][1])]
+    return [(f"versions, {side}", each) for side, each in sides]
 
 
 def _figure(name: str, drives: Sequence[Statistics]) -> str:

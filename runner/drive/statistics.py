@@ -164,7 +164,7 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Stat
         rebuilt=_sum(camera.rebuilt for camera in each),
         metric=metrics.pop() if len(metrics) == 1 else "",
         quality=mean(np.array([e.mean for e in estimates])) if len({e.metric for e in estimates}) == 1 else NAN,
-        notes=tuple(_notes(cameras)),
+        notes=tuple(_notes(drive, cameras)),
     )
 
 
@@ -200,8 +200,12 @@ def _arrivals_logged(got: Received) -> bool:
     return bool(got.arrival_t.size) or not got.frames[-1]
 
 
-def _notes(cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
-    """What to know of the estimates of quality."""
+def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
+    """What is missing, and what to know of the estimates of quality."""
+    if not drive.measured:
+        yield "neither what was sent nor what was received was logged: only what was decided is known"
+    if drive.positions is None:
+        yield "no positions were logged: it is not on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     for name, quality in estimated.items():
         if quality.clamped > 0:
