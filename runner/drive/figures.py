@@ -59,6 +59,7 @@ STYLE: dict[Any, Any] = {
     "legend.columnspacing": 1.0,
     "legend.handletextpad": 0.5,
     "legend.borderaxespad": 0.0,
+    "text.parse_math": False,  # a drive's name may hold any character
     "pdf.fonttype": 42,  # fonts as text, as journals want them
     "savefig.dpi": 300,
 }
@@ -200,7 +201,8 @@ def totals(drives: Rows) -> Figure:
 
 def latency(drives: Rows) -> Figure | str:
     """Latency over time with freezes, and how it is distributed."""
-    if not any(latencies(drive.series)[1].size for drive in drives):
+    drives = [drive for drive in drives if has_latency(drive)]
+    if not drives:
         return "no latency was logged: that takes an operator's log"
     unit, label = _unit(drives)
     heights = [height for drive in drives for height in (1.15, _strip_height(drive))]
@@ -240,6 +242,7 @@ def quality(drives: Rows) -> Figure | str:
     if not metrics:
         return "no rate-quality models were found, see `tod-runner model --help`; models=DIR names where they are"
     metric = sorted(metrics)[0]
+    drives = [drive for drive in drives if has_quality(drive)]
 
     def draw(axes: Axes, drive: Statistics, panel: Panel) -> None:
         for name, style in _styles(drive.series, panel):
@@ -249,6 +252,14 @@ def quality(drives: Rows) -> Figure | str:
 
     figure, _ = _by_panel(drives, draw, f"estimated {METRICS.get(metric, metric)}", sharey=True)
     return figure
+
+
+def has_latency(drive: Statistics) -> bool:
+    return bool(latencies(drive.series)[1].size)
+
+
+def has_quality(drive: Statistics) -> bool:
+    return any(camera.quality for camera in drive.cameras.values())
 
 
 FIGURES: dict[str, Callable[[Rows], Figure | str]] = {
@@ -279,14 +290,16 @@ def _by_panel(
     """A row for each drive, a column for each panel of cameras, legends below."""
     columns = max(len(drive.series.panels) for drive in drives)
     figure, grid = _rows(drives, columns, 1.55, sharey)
+    above: Sequence[Panel] = ()
     for row, drive in zip(grid, drives, strict=True):
         for number, (axes, panel) in enumerate(zip_longest(row, drive.series.panels)):
             if panel is None:
                 axes.set_axis_off()
                 continue
             draw(axes, drive, panel)
-            if drive is drives[0] or drive.series.panels != drives[0].series.panels:
+            if drive.series.panels != above:
                 axes.set_title(f"({chr(ord('a') + number)}) {panel.title}" if columns > 1 else panel.title)
+        above = drive.series.panels
         row[0].set_ylabel(label if len(drives) == 1 else f"{drive.series.label}\n{label}")
     for number in range(columns):
         grid[-1, number].set_xlabel(_unit(drives)[1])
@@ -439,7 +452,7 @@ def _draw_freezes(axes: Axes, drive: Statistics, unit: float) -> None:
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="y", visible=False)
     if frozen:
-        axes.set_ylabel("freezes", rotation=90)
+        axes.text(1.0, 1.04, "freezes", transform=axes.transAxes, ha="right", va="bottom", fontsize=6)
         return
     text = "arrivals were not logged" if drive.freezes is None else "no freezes"
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=6)

@@ -15,7 +15,7 @@ import numpy as np
 from runner.drive.checks import Check
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
-from runner.drive.figures import METRICS, on_track
+from runner.drive.figures import METRICS, has_latency, has_quality, on_track
 from runner.drive.series import CameraSeries, Line, Series, Values
 from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
 from runner.drive.tables import MEANING, VERDICTS, camera_rows, drive_rows, shown
@@ -193,6 +193,8 @@ def _charts(name: str, drives: Sequence[Statistics]) -> Iterable[tuple[int, int,
     several = len(drives) > 1
     for index, drive in enumerate(drives):
         label = drive.series.label if several else ""
+        if (name == "latency" and not has_latency(drive)) or (name == "quality" and not has_quality(drive)):
+            continue
         if name in ("bitrates", "scaling", "quality"):
             for part, panel in enumerate(drive.series.panels):
                 yield index, part, ": ".join(filter(None, (label, panel.title)))

@@ -207,17 +207,19 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     if drive.positions is None:
         yield "no positions were logged: it is not on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
+    clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
+    if clamped:
+        yield f"estimated quality: bitrates that no model was measured at, the nearest one stands in: {clamped} of the time"
     for name, quality in estimated.items():
-        if quality.clamped > 0:
-            yield (
-                f"{name}: {quality.clamped:.0%} of the time at bitrates outside those that its rate-quality model was"
-                " measured at; the nearest one stands in"
-            )
         if quality.unknown:
             factors = ", ".join(f"{factor:g}" for factor in quality.unknown)
             yield f"{name}: its rate-quality model was not measured at the factors {factors}, no estimate for them"
     if len({quality.metric for quality in estimated.values()}) > 1:
         yield "the rate-quality models of the cameras are of different metrics, there is no quality of the whole drive"
+
+
+def _part(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else "<1%"
 
 
 # --- latency and freezes ----------------------------------------------------------------------------------------------

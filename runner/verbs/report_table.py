@@ -17,7 +17,7 @@ from runner.drive.tables import VERDICTS, camera_rows, drive_rows
 
 def show(drives: Sequence[Statistics], checks: Mapping[str, Sequence[Check]], left_out: Sequence[str]) -> None:
     """The cameras of each drive, the drives beside each other, claims, and what to know of them."""
-    console = Console(width=None if sys.stdout.isatty() else 180)
+    console = Console(width=None if sys.stdout.isatty() else 190)
     for drive in drives:
         console.print(_table(drive.series.label, *camera_rows(drive)))
         for told in (*drive.series.warnings, *drive.notes):
