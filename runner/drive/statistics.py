@@ -209,7 +209,7 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
-        yield f"estimated quality: bitrates that no model was measured at, the nearest one stands in: {clamped} of the time"
+        yield f"estimated quality: bitrates not measured, where the nearest one stands in: {clamped} of the time"
     for name, quality in estimated.items():
         if quality.unknown:
             factors = ", ".join(f"{factor:g}" for factor in quality.unknown)
