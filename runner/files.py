@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from runner.errors import UserError
+from runner.errors import RunError, UserError
 
 
 @contextmanager
@@ -36,3 +36,18 @@ def whole_file(path: Path, argument: str = "output", *, also_after_errors: bool 
             unfinished.replace(path)
         elif not special:
             unfinished.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """A file that is there wholly or not at all.
+
+    raises  RunError
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None

@@ -48,6 +48,12 @@ def driving_test(drive: Series) -> list[Check]:
 CLAIMS: Mapping[str, Callable[[Series], list[Check]]] = {"driving_test": driving_test}
 
 
+def claims(drive: Series) -> list[Check]:
+    """Those that the drive's experiment names; none where it names none."""
+    named = str((drive.config.get("experiment") or {}).get("claims"))
+    return CLAIMS[named](drive) if named in CLAIMS else []
+
+
 def _length(drive: Series) -> Check:
     return Check("The test takes approximately 100 s", f"{drive.end:.0f} s", abs(drive.end - 100) <= 10)
 
@@ -75,7 +81,9 @@ def _tops_are_equal(drive: Series) -> Check:
     tops = drive.panels[1].cameras
     allocated = np.array([_kbps(drive, name) for name in tops])
     apart = float((allocated.max(axis=0) - allocated.min(axis=0)).max())
-    return Check("The bitrates of the top views are controlled equally", f"at most {apart:.0f} kbit/s apart", apart <= 1)
+    return Check(
+        "The bitrates of the top views are controlled equally", f"at most {apart:.0f} kbit/s apart", apart <= 1
+    )
 
 
 def _tops_get_less(drive: Series) -> Check:
@@ -105,7 +113,9 @@ def _shallow(drive: Series) -> Check:
     inside, elsewhere = held(drive.predicted, at), held(drive.predicted, _times(Span(0, drive.end)))
     less = bool(np.nanmax(inside) < np.nanmedian(elsewhere)) if drive.end >= end else False
     changed = [name for name in drive.cameras if np.unique(_factor(drive, name, _times(Span(begin, end)))).size > 1]
-    outcome = f"{np.nanmin(inside):.0f} to {np.nanmax(inside):.0f} kbit/s, changes of {', '.join(changed) or 'no camera'}"
+    outcome = (
+        f"{np.nanmin(inside):.0f} to {np.nanmax(inside):.0f} kbit/s, changes of {', '.join(changed) or 'no camera'}"
+    )
     return Check(claim, outcome, less and not changed)
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from runner.errors import RunError
+from runner.files import write_whole
 from runner.rate_quality.curves import Point
 
 
@@ -53,21 +52,6 @@ class Cache:
 
     def _path(self, key: str) -> Path:
         return self._directory / f"{key}.json"
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """A file that is there wholly or not at all.
-
-    raises  RunError
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
 
 
 def point_to_json(point: Point, identities: Mapping[str, str]) -> dict[str, Any]:

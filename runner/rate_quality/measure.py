@@ -8,11 +8,12 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from runner.errors import RunError, UserError
+from runner.files import write_whole
 from runner.graph import compile_graph
 from runner.model import Camera, ModelError, Progress, Vehicle
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
-from runner.rate_quality.cache import Cache, file_digest, write_whole
+from runner.rate_quality.cache import Cache, file_digest
 from runner.rate_quality.choice import Wishes, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.lanes import Lane, cut, fragment

@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from runner.files import write_whole
 from runner.model import plain
 from runner.rate_quality.artefact import Measured
-from runner.rate_quality.cache import write_whole
 from runner.rate_quality.curves import Curves, along, draw_curves, mean_score
 
 if TYPE_CHECKING:

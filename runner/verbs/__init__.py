@@ -12,11 +12,15 @@ from runner.errors import UserError
 
 
 class Verb(NamedTuple):
-    """A verb: what it does in a few words, where it lives, which arguments it takes."""
+    """A verb: what it does in a few words, where it lives, which arguments it takes.
+
+    takes  what words without = are, which come in any number; "": there are none
+    """
 
     summary: str
     module: str
     arguments: tuple[str, ...]
+    takes: str = ""
 
 
 VERBS = {
@@ -25,9 +29,11 @@ VERBS = {
     "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
-    "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "duration_s")),
+    "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
+    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), "DRIVE"),
+    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), "DRIVE"),
     "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", ()),
 }
 
@@ -49,12 +55,16 @@ EXTRAS = {
 
 @dataclass(frozen=True, slots=True)
 class Arguments:
-    """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra."""
+    """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra.
+
+    words  those without =, where the verb takes any
+    """
 
     verb: str
     overrides: list[str]
     conf: Path | None = None
     values: dict[str, str] = field(default_factory=dict)
+    words: tuple[str, ...] = ()
 
     @staticmethod
     def parse(verb: str, words: Sequence[str]) -> Arguments:
@@ -64,19 +74,21 @@ class Arguments:
         """
         own = (*VERBS[verb].arguments, "conf")
         values: dict[str, str] = {}
-        overrides = []
+        overrides, plain = [], []
         for word in words:
             key, equals, value = word.partition("=")
             if equals and key in own:
                 values[key] = value
             elif word.startswith("-"):
                 raise UserError("command line", "", word, "there are no flags; write NAME=VALUE, or --help")
+            elif VERBS[verb].takes and (not equals or "/" in key):  # a path may hold a = of its own
+                plain.append(word)
             elif not equals and not word.startswith("~"):
                 raise UserError("command line", "", word, "must be NAME=VALUE")
             else:
                 overrides.append(word)
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
-        return Arguments(verb, overrides, Path(conf) if conf else None, values)
+        return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain))
 
     def choice(self, key: str, options: Sequence[str]) -> str:
         """One of some words; the first where it is not given."""

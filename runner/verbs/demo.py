@@ -1,13 +1,14 @@
-"""usage: tod-runner demo [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT]
+"""usage: tod-runner demo [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
 
 Both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a drive
 through a bandwidth map in mode A. Open the page that it names, http://127.0.0.1:8090/, in a browser; the table in the
 terminal shows the same. Every camera runs at 5 Hz for each core, which carries eight full HD cameras, both sides and a
 browser without a GPU; give fps_max=40, or null for the cameras' own rates.
 
-With log=DIR both sides write what they do and see to DIR; with output=OUT a report of the drive is made at its end (and
-the drive lies in OUT/drive, where no log= says otherwise). An experiment states what is driven; one with several runs
-makes several drives and compares them. With link= the two sides are joined by a link of limited rate.
+With log=DIR both sides write what they do and see to DIR. With output=OUT a report is made at the end, as by the verb
+report (models= goes there); the drive then lies in OUT/drive, where no log= says otherwise. An experiment states what
+is driven; one with several runs makes several drives and compares them. With link= a link of limited rate joins both
+sides.
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
@@ -34,6 +35,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from runner.broker import private_broker
+from runner.compose import conf_directories
 from runner.config import composed, load_experiment, load_run
 from runner.drive.log import FILES, Log, check_free
 from runner.errors import RunError, UserError
@@ -75,9 +77,11 @@ def run(arguments: Arguments) -> int:
         own = replace(arguments, overrides=[*arguments.overrides, *words])
         status = status or _drive(own, vehicles[name], drives[name], duration_s, link)
     if output := arguments.path("output"):
-        from runner.verbs.report import make_report
+        from runner.verbs.report import report
 
-        make_report([drive for drive in drives.values() if drive], output, claims=experiment.claims)
+        bases = [base / "cameras" for base in conf_directories(arguments.conf)]
+        page = report([drive for drive in drives.values() if drive], output, arguments.path("models"), bases)
+        say(f"report: {page}")
     return status
 
 

@@ -1,0 +1,13 @@
+"""What a source claims of a drive, held against what came out."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Check(NamedTuple):
+    """One claim. holds: None where the drive does not tell."""
+
+    claim: str
+    outcome: str
+    holds: bool | None

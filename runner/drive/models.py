@@ -1,0 +1,57 @@
+"""Finds the rate-quality models of a drive's cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from runner.drive.statistics import Model, rate_curves
+from runner.errors import UserError
+
+
+def find_models(
+    config: Mapping[str, Any], directory: Path | None, bases: Sequence[Path]
+) -> tuple[dict[str, Model], list[str]]:
+    """The models there are.
+
+    config     of the drive; a camera may name its model as `rate_quality.model`
+    directory  where models are looked up by the name of their camera, or by the name the configuration gives; or None
+    bases      where a model that the configuration names is looked up, first match wins
+    returns    by camera; and a line on the cameras without one
+    raises     UserError for a directory that is none, or a file that is no model
+    """
+    if directory is not None and not directory.is_dir():
+        raise UserError("command line", "models", repr(str(directory)), "no such directory")
+    found: dict[str, Model] = {}
+    cameras = config.get("cameras") or {}
+    for name, camera in cameras.items():
+        path = next((path for path in _candidates(name, camera, directory, bases) if path.is_file()), None)
+        if path:
+            found[name] = _read(path)
+    missing = [name for name in cameras if name not in found]
+    if not missing:
+        return found, []
+    which = "no camera" if not found else f"all but {', '.join(missing)}"
+    verb = "has a rate-quality model" if not found else "have one"
+    how = "`tod-runner model vehicle=NAME sequence=DIR output=MODELS` measures them, models=MODELS takes them"
+    return found, [f"estimated quality: {which} {verb}; {how}"]
+
+
+def _candidates(name: str, camera: Mapping[str, Any], directory: Path | None, bases: Sequence[Path]) -> Iterator[Path]:
+    named = (camera.get("rate_quality") or {}).get("model")
+    if directory is not None:
+        yield directory / f"{name}.model.json"
+        if named:
+            yield directory / Path(named).name
+    if named:
+        yield from (base / named for base in bases)
+
+
+def _read(path: Path) -> Model:
+    from runner.rate_quality.artefact import read_model
+
+    model = rate_curves(read_model(path))
+    if not model.curves:
+        raise UserError(str(path), "points", None, f"has none with the metric {model.metric}")
+    return model

@@ -1,0 +1,487 @@
+"""From the lines of a drive to quantities over time: one time axis for all sides, arrays for figures. Pure.
+
+The axis is s since the vehicle's log began, or the operator's where the vehicle kept none; sides are joined by the
+epoch time in their first lines, so that clocks that differ shift the sides against each other. Bitrates are kbit/s.
+`nan` stands for what is not known at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.drive.read import Drive, Side
+from runner.errors import UserError
+
+Values = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+EARTH_M = 6378137.0  # WGS-84 equatorial radius, as runner.pqos.bandwidth_map takes it
+RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
+DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
+PANEL_CAMERAS = 4  # as many curves are told apart in one panel; more are split where the mounting gives no groups
+CLOCKS_APART_MS = -1.0  # a latency below it tells of clocks that differ
+
+
+class Line(NamedTuple):
+    """A quantity over time: t s, rising; y its values."""
+
+    t: Values
+    y: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """What was decided for one camera, each entry in force until the next.
+
+    roi_share  pixels of the region of interest over those of the full image
+    scaling    nan while the camera is off
+    """
+
+    t: Values
+    on: Flags
+    sending: Flags
+    demand: Values
+    kbps: Values
+    scaling: Values
+    width: Values
+    height: Values
+    roi_share: Values
+    reason: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """What the operator got of one camera. Counters run on where the log's own began again from 0.
+
+    t                        s, of each sample
+    fps, kbps                over the second before
+    width, height            px of the picture, 0 before the first
+    latency_ms               capture to decode of the last sampled frame
+    frames, bytes            counters at each sample
+    lost, rebuilt            packets, counters at each sample
+    arrival_t, arrival_ms    when each access unit came, s, and its latency from capture to arrival
+    """
+
+    t: Values
+    fps: Values
+    kbps: Values
+    width: Values
+    height: Values
+    latency_ms: Values
+    frames: Values
+    bytes: Values
+    lost: Values
+    rebuilt: Values
+    arrival_t: Values
+    arrival_ms: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What the vehicle's encoder has put out: counters that run on, and the rate over the last second."""
+
+    t: Values
+    frames: Values
+    bytes: Values
+    kbps: Values
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSeries:
+    """One camera. received, sent: None where that side has no log."""
+
+    name: str
+    decided: Decided
+    received: Received | None
+    sent: Sent | None
+
+    @property
+    def actual(self) -> Line:
+        """The bitrate as received, or as sent where no operator logged."""
+        source = self.received or self.sent
+        return Line(source.t, source.kbps) if source else EMPTY
+
+
+@dataclass(frozen=True, slots=True)
+class Positions:
+    """Where the vehicle was: degrees, and m east and north of its first place."""
+
+    t: Values
+    lat: Values
+    lon: Values
+    east: Values
+    north: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """The limited link of an experiment: rate in force, kbit/s; wait of a packet, ms; packets dropped so far."""
+
+    t: Values
+    kbps: Values
+    queue_ms: Values
+    dropped: Values
+
+
+class Reason(NamedTuple):
+    """Why something changed for a camera at a time."""
+
+    t: float
+    cause: str
+    camera: str
+    reason: str
+
+
+class Panel(NamedTuple):
+    """Cameras that are drawn into one panel."""
+
+    title: str
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A drive over time.
+
+    label      what it is called beside others
+    began      s since 1970 at t = 0
+    end        s; the last line of the side that gives the axis
+    measured   "received" or "sent": what `actual` is; "" where neither was logged
+    predicted, allocated  each value holds until the next
+    total      the total in force before the cap at demand
+    modes      (from s, mode)
+    notes      (s, text)
+    refused    requests
+    ended      by side, whether its log was ended cleanly
+    """
+
+    label: str
+    path: str
+    vehicle: str
+    began: float
+    end: float
+    cameras: Mapping[str, CameraSeries]
+    panels: tuple[Panel, ...]
+    predicted: Line
+    allocated: Line
+    actual: Line
+    measured: str
+    link: Link | None
+    positions: Positions | None
+    modes: tuple[tuple[float, str], ...]
+    reasons: tuple[Reason, ...]
+    notes: tuple[tuple[float, str], ...]
+    refused: int
+    warnings: tuple[str, ...]
+    versions: Mapping[str, Mapping[str, str]]
+    ended: Mapping[str, bool]
+    config: Mapping[str, Any]
+
+
+EMPTY = Line(np.empty(0), np.empty(0))
+
+
+def series(drive: Drive, label: str = "") -> Series:
+    """A drive's quantities over time.
+
+    label   what it is called beside others, its name where that is enough
+    raises  UserError where nothing was logged but the beginning, nothing was decided yet, or lines are of another form
+    """
+    try:
+        return _series(drive, label or drive.name)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        rule = f"has lines of another form than this tod-runner writes ({type(error).__name__}: {error})"
+        raise UserError(str(drive.path), "", None, rule) from None
+
+
+def held(line: Line, at: Values) -> Values:
+    """What of a quantity whose values hold until the next is in force at some times; nan before the first."""
+    index = np.searchsorted(line.t, at, "right") - 1
+    return np.where(index >= 0, line.y[np.maximum(index, 0)], np.nan) if line.t.size else np.full(at.shape, np.nan)
+
+
+def spans(t: Values, begin: float, end: float) -> Values:
+    """How long each entry of something that holds until the next is in force within [begin, end], s."""
+    edges = np.clip(np.append(t, end), begin, end)
+    return np.asarray(np.diff(edges))
+
+
+def mean_held(line: Line, begin: float, end: float) -> float:
+    """Mean over time of a quantity whose values hold until the next; nan where none is known."""
+    weights = spans(line.t, begin, end)
+    known = np.isfinite(line.y) & (weights > 0)
+    return float(np.average(line.y[known], weights=weights[known])) if known.any() else float("nan")
+
+
+def sending_spans(decided: Decided, end: float) -> list[tuple[float, float]]:
+    """When a camera was to be sent: [(from s, to s), ...]."""
+    found: list[tuple[float, float]] = []
+    for (start, until), sending in zip(pairwise([*decided.t, end]), decided.sending, strict=True):
+        if not sending or until <= start:
+            continue
+        if found and found[-1][1] == start:
+            found[-1] = (found[-1][0], until)
+        else:
+            found.append((start, until))
+    return found
+
+
+# --- the whole --------------------------------------------------------------------------------------------------------
+
+
+class _Shifted(NamedTuple):
+    """The lines of a side with `t` on the drive's axis."""
+
+    lines: Sequence[Mapping[str, Any]]
+    shift: float
+
+    def of(self, log: str) -> list[tuple[float, Mapping[str, Any]]]:
+        return [(line["t"] + self.shift, line) for line in self.lines if line.get("log") == log]
+
+    def events(self, name: str) -> list[tuple[float, Mapping[str, Any]]]:
+        return [(line["t"] + self.shift, line) for line in self.lines if line.get("event") == name]
+
+
+def _series(drive: Drive, label: str) -> Series:
+    leading = drive.sides.get("vehicle") or drive.sides["operator"]
+    began, end = float(leading.began["time"]), max((float(line["t"]) for line in leading.lines), default=0.0)
+    if end <= 0:
+        raise UserError(str(drive.path), "", None, "has no length: nothing was logged but its beginning")
+    sides = {name: _Shifted(side.lines, float(side.began["time"]) - began) for name, side in drive.sides.items()}
+    vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
+    decisions = vehicle.of("decision") or [at for at in operator.of("state") if at[1].get("online")]
+    if not decisions:
+        raise UserError(str(drive.path), "", None, "has no decision yet: there is nothing to report")
+    config = leading.began.get("config") or {}
+    samples = [at for at in operator.of("sample") if 0 <= at[0] <= end]
+    telemetry = vehicle.of("telemetry")
+    names = list(config.get("cameras") or decisions[0][1]["cameras"])
+    cameras = {name: _camera(name, config, decisions, samples, telemetry) for name in names}
+    return Series(
+        label=label,
+        path=str(drive.path),
+        vehicle=str(config.get("name", "")),
+        began=began,
+        end=end,
+        cameras=cameras,
+        panels=panels(config.get("cameras") or {name: {} for name in names}),
+        predicted=_predicted(vehicle, telemetry, samples),
+        allocated=_line((t, sum(camera["kbps"] for camera in line["cameras"].values())) for t, line in decisions),
+        actual=_total(samples, cameras),
+        measured="received" if samples else "sent" if telemetry else "",
+        link=_link([at for at in link.of("link") if 0 <= at[0] <= end]),
+        positions=_positions(vehicle, samples),
+        modes=tuple(_modes(decisions)),
+        reasons=tuple(_reasons(decisions)),
+        notes=tuple(sorted((t, str(line["text"])) for side in sides.values() for t, line in side.of("note"))),
+        refused=int(max((line.get("refused", 0) for _, line in (telemetry or samples)), default=0)),
+        warnings=(*drive.warnings, *_warnings(drive.sides, samples, cameras)),
+        versions={name: dict(side.began.get("versions") or {}) for name, side in drive.sides.items()},
+        ended={name: side.ended for name, side in drive.sides.items()},
+        config=config,
+    )
+
+
+def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
+    """What looks wrong about the clocks of the two sides."""
+    if {"vehicle", "operator"} <= sides.keys() and not samples:
+        yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
+    latencies = [c.received.arrival_ms for c in cameras.values() if c.received and c.received.arrival_ms.size]
+    lowest = min((float(np.nanmin(each)) for each in latencies if np.isfinite(each).any()), default=0.0)
+    if lowest < CLOCKS_APART_MS:
+        yield f"latencies go down to {lowest:.0f} ms: the clocks of both sides differ, latencies are off by as much"
+
+
+def _line(points: Iterable[tuple[float, float | None]]) -> Line:
+    found = [(t, np.nan if y is None else float(y)) for t, y in points]
+    t, y = np.array(found, dtype=float).reshape(-1, 2).T
+    return Line(t, y)
+
+
+def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> Line:
+    """Predictions as they came, or what the samples say was in force."""
+    events = vehicle.events("bitrate_predicted")
+    if events:
+        return _line((t, line["kbps"]) for t, line in events)
+    return _line((t, line.get("predicted_kbps")) for t, line in (telemetry or samples))
+
+
+def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Line:
+    """Measured total; unknown before the first second of video, whose rate is taken over a window yet to fill."""
+    received = [camera.received for camera in cameras.values() if camera.received]
+    if received:
+        t, y = _line((t, line["actual_kbps"]) for t, line in samples)
+        return Line(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
+    sent = [camera.sent for camera in cameras.values() if camera.sent]
+    return Line(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
+
+
+def _link(lines: Sequence[Any]) -> Link | None:
+    if not lines:
+        return None
+    rows = np.array([(t, line["kbps"], line["queue_ms"], line["dropped"]) for t, line in lines], dtype=float)
+    return Link(*rows.T)
+
+
+def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
+    """As the vehicle was told them, or else as the operator saw them; None where there are none.
+
+    Metres by equirectangular projection around the first place, right for some km.
+    """
+    known = [(t, line) for t, line in vehicle.events("position_reported")]
+    known = known or [(t, line["position"]) for t, line in samples if line.get("position")]
+    if not known:
+        return None
+    t, lat, lon = np.array([(t, place["lat"], place["lon"]) for t, place in known], dtype=float).T
+    around = np.remainder(lon - lon[0] + 180, 360) - 180  # also where the drive crosses the 180th meridian
+    east = np.radians(around) * np.cos(np.radians(lat[0])) * EARTH_M
+    return Positions(t, lat, lon, east, np.radians(lat - lat[0]) * EARTH_M)
+
+
+def _modes(decisions: Sequence[Any]) -> Iterator[tuple[float, str]]:
+    last = None
+    for t, line in decisions:
+        if line["mode"] != last:
+            last = line["mode"]
+            yield t, str(last)
+
+
+def _reasons(decisions: Sequence[Any]) -> Iterator[Reason]:
+    """Each change of factor or sending, as the vehicle reports them while it drives."""
+    last: Mapping[str, Any] = {}
+    for t, line in decisions:
+        for name, now in line["cameras"].items():
+            was = last.get(name, {})
+            if (was.get("scaling"), was.get("sending")) != (now["scaling"], now["sending"]):
+                yield Reason(t, str(line.get("cause", "")), name, str(now.get("reason", "")))
+        last = line["cameras"]
+
+
+# --- cameras ----------------------------------------------------------------------------------------------------------
+
+
+def _camera(
+    name: str,
+    config: Mapping[str, Any],
+    decisions: Sequence[Any],
+    samples: Sequence[Any],
+    telemetry: Sequence[Any],
+) -> CameraSeries:
+    described = (config.get("cameras") or {}).get(name, {})
+    full = described.get("width_px", 0) * described.get("height_px", 0)
+    decided = [(t, line["cameras"][name]) for t, line in decisions if name in line["cameras"]]
+    received = [(t, t - line["t"], line["cameras"][name]) for t, line in samples if name in line["cameras"]]
+    sent = [(t, line["cameras"][name]) for t, line in telemetry if name in line["cameras"]]
+    return CameraSeries(
+        name, _decided(decided, full), _received(received) if received else None, _sent(sent) if sent else None
+    )
+
+
+def _decided(decided: Sequence[tuple[float, Mapping[str, Any]]], full: int) -> Decided:
+    def column(key: str) -> Values:
+        return np.array([camera[key] for _, camera in decided], dtype=float)  # None becomes nan
+
+    regions = [camera.get("roi") for _, camera in decided]
+    shares = [roi["width"] * roi["height"] / full if roi and full else 1.0 for roi in regions]
+    return Decided(
+        t=np.array([t for t, _ in decided], dtype=float),
+        on=np.array([camera["on"] for _, camera in decided], dtype=bool),
+        sending=np.array([camera["sending"] for _, camera in decided], dtype=bool),
+        demand=column("demand_kbps"),
+        kbps=column("kbps"),
+        scaling=column("scaling"),
+        width=column("width"),
+        height=column("height"),
+        roi_share=np.array(shares, dtype=float),
+        reason=tuple(str(camera.get("reason", "")) for _, camera in decided),
+    )
+
+
+def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Received:
+    def column(key: str) -> Values:
+        return np.array([camera[key] for *_, camera in received], dtype=float)
+
+    came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.get("arrivals") or ()]
+    arrivals = np.array(came, dtype=float).reshape(-1, 2)
+    arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
+    t = np.array([t for t, *_ in received], dtype=float)
+    frames = counted(column("frames"))
+    return Received(
+        t=t,
+        kbps=_settled(t, column("kbps"), frames),
+        **{key: column(key) for key in ("fps", "width", "height", "latency_ms")},
+        frames=frames,
+        **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
+        arrival_t=arrivals[:, 0],
+        arrival_ms=arrivals[:, 1],
+    )
+
+
+def _sent(sent: Sequence[tuple[float, Mapping[str, Any]]]) -> Sent:
+    t = np.array([t for t, _ in sent], dtype=float)
+    frames, sizes = (counted(np.array([c[key] for _, c in sent], dtype=float)) for key in ("frames", "bytes"))
+    return Sent(t, frames, sizes, rate(t, sizes))
+
+
+def _settled(t: Values, kbps: Values, frames: Values) -> Values:
+    """A rate that is nan until the window it is taken over has filled with video once."""
+    came = t[frames > 0]
+    return np.where(t >= (came[0] if came.size else np.inf) + RATE_WINDOW_S, kbps, np.nan)
+
+
+def counted(counter: Values) -> Values:
+    """A running counter that goes on where the logged one began again from 0."""
+    if not counter.size:
+        return counter
+    steps = np.diff(counter)
+    return np.asarray(np.cumsum(np.append(counter[0], np.where(steps < 0, counter[1:], steps))))
+
+
+def rate(t: Values, sizes: Values) -> Values:
+    """kbit/s at each time over the second before, from a running counter of bytes; nan before there is a second."""
+    before = np.searchsorted(t, t - RATE_WINDOW_S + 1e-6, "right") - 1
+    known = before >= 0
+    first = np.maximum(before, 0)
+    seconds = np.where(known, t - t[first], 1.0)
+    return np.where(known, (sizes - sizes[first]) * 8 / 1000 / seconds, np.nan)
+
+
+# --- panels -----------------------------------------------------------------------------------------------------------
+
+
+def panels(cameras: Mapping[str, Any]) -> tuple[Panel, ...]:
+    """Which cameras share a panel: those that look along the road, and those pitched down at the surroundings.
+
+    cameras  the configuration's, with `pose` and `place` where they are mounted
+    returns  one or two panels, cameras in the configuration's order
+
+    On the paper's vehicle these are the front- and rear-mounted ones and the top views, as in its figures. Where pitch
+    tells no difference, up to four cameras share one panel; more are split in half, in the order of their tiles.
+    """
+    down = [name for name, camera in cameras.items() if (camera.get("pose") or {}).get("pitch_deg", 0) > DOWN_DEG]
+    along = [name for name in cameras if name not in down]
+    if down and along:
+        return _panel(along), _panel(down)
+    if len(cameras) <= PANEL_CAMERAS:
+        return (_panel(cameras),)
+    tiles = sorted(cameras, key=lambda name: _tile(cameras[name]))
+    half = (len(tiles) + 1) // 2
+    return _panel(tiles[:half]), _panel(tiles[half:])
+
+
+def _tile(camera: Mapping[str, Any]) -> tuple[int, int]:
+    place = camera.get("place") or {}
+    return place.get("row", 0), place.get("column", 0)
+
+
+def _panel(names: Iterable[str]) -> Panel:
+    """Called after what the names begin with."""
+    cameras = tuple(names)
+    kinds = list(dict.fromkeys(name.partition("_")[0] for name in cameras))
+    return Panel(" and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds).capitalize(), cameras)

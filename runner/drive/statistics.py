@@ -1,0 +1,379 @@
+"""What a drive comes to in figures: bitrates, latencies, freezes, losses, estimated quality. Pure.
+
+Means over time are taken while the operator received, or while the vehicle sent where no operator logged. `nan` stands
+for what is not known; in JSON it is null.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from runner.drive.series import CameraSeries, Line, Received, Series, Values, held, mean_held, sending_spans, spans
+
+FREEZE_GAPS = 30  # gaps that the mean is taken over (W3C webrtc-stats, freezeCount)
+FREEZE_FACTOR = 3.0  # of the mean gap
+FREEZE_MORE_S = 0.15  # over the mean gap
+FREEZE_FIRST = 5  # gaps before a gap can be judged; the text leaves it open, libwebrtc waits for as many
+SECOND_S = 1.0
+NAN = float("nan")
+
+
+class Freeze(NamedTuple):
+    """A picture that stood still: from when, s, and for how long, s."""
+
+    t: float
+    seconds: float
+
+
+class Latency(NamedTuple):
+    """Percentiles of latencies, ms."""
+
+    median: float = NAN
+    p95: float = NAN
+    p99: float = NAN
+
+
+class PerSecond(NamedTuple):
+    """Latency of the frames of all cameras in each second: where it begins, s; median and 95th percentile, ms."""
+
+    t: Values
+    median: Values
+    p95: Values
+
+
+class RateCurve(NamedTuple):
+    """Quality of one factor as measured: kbit/s that came out of the encoder, rising, and the quality."""
+
+    kbps: Values
+    quality: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What a rate-quality model says of quality: a curve by factor, in units of the metric."""
+
+    metric: str
+    curves: Mapping[float, RateCurve]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Estimated quality of one camera over time.
+
+    line     in units of the metric; nan while nothing came or the factor was not measured
+    clamped  share of the known values at bitrates outside the measured ones, where the nearest one stands in
+    unknown  factors that were in force and are not in the model
+    """
+
+    metric: str
+    line: Line
+    clamped: float
+    unknown: tuple[float, ...]
+
+    @property
+    def mean(self) -> float:
+        return mean(self.line.y)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStatistics:
+    """One camera over a drive.
+
+    sending_s         time during which it was to be sent, s
+    kbps, allocated   means, kbit/s; share: the first over the second
+    factors           share of the time by factor, 0 for off or paused
+    sizes             share of the time by size of the picture, px
+    arrival, decode   latency from capture to arrival, and to decode, ms
+    freezes           None where arrivals were not logged
+    lost, rebuilt     packets; None where no operator logged
+    quality           None without a rate-quality model
+    """
+
+    name: str
+    frames: int
+    hz: float
+    sending_s: float
+    kbps: float
+    allocated: float
+    share: float
+    factors: Mapping[float, float]
+    sizes: Mapping[tuple[int, int], float]
+    arrival: Latency
+    decode: Latency
+    freezes: tuple[Freeze, ...] | None
+    lost: int | None
+    rebuilt: int | None
+    quality: Estimate | None
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """A drive: its cameras, and all of them together."""
+
+    series: Series
+    cameras: Mapping[str, CameraStatistics]
+    kbps: float
+    allocated: float
+    share: float
+    predicted_min: float
+    predicted_max: float
+    arrival: Latency
+    decode: Latency
+    freezes: int | None
+    frozen_s: float | None
+    lost: int | None
+    rebuilt: int | None
+    metric: str
+    quality: float
+    notes: tuple[str, ...]
+
+
+def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Statistics:
+    """All figures of a drive.
+
+    models  by camera, where there is one
+    """
+    models = models or {}
+    cameras = {name: camera_statistics(c, drive.end, models.get(name)) for name, c in drive.cameras.items()}
+    each = list(cameras.values())
+    received = [c.received for c in drive.cameras.values() if c.received]
+    estimates = [camera.quality for camera in each if camera.quality]
+    metrics = {estimate.metric for estimate in estimates}
+    known = drive.predicted.y[np.isfinite(drive.predicted.y)]
+    frozen = [freeze for camera in each for freeze in camera.freezes or ()]
+    watched = any(camera.freezes is not None for camera in each)
+    kbps, allocated = (sum_known(getattr(camera, key) for camera in each) for key in ("kbps", "allocated"))
+    return Statistics(
+        series=drive,
+        cameras=cameras,
+        kbps=kbps,
+        allocated=allocated,
+        share=ratio(kbps, allocated),
+        predicted_min=float(known.min()) if known.size else NAN,
+        predicted_max=float(known.max()) if known.size else NAN,
+        arrival=latency(together(got.arrival_ms for got in received)),
+        decode=latency(together(got.latency_ms for got in received)),
+        freezes=len(frozen) if watched else None,
+        frozen_s=sum(freeze.seconds for freeze in frozen) if watched else None,
+        lost=_sum(camera.lost for camera in each),
+        rebuilt=_sum(camera.rebuilt for camera in each),
+        metric=metrics.pop() if len(metrics) == 1 else "",
+        quality=mean(np.array([e.mean for e in estimates])) if len({e.metric for e in estimates}) == 1 else NAN,
+        notes=tuple(_notes(drive, cameras)),
+    )
+
+
+def camera_statistics(camera: CameraSeries, end: float, model: Model | None = None) -> CameraStatistics:
+    source, got, decided = camera.received or camera.sent, camera.received, camera.decided
+    begin, until = (float(source.t[0]), float(source.t[-1])) if source else (0.0, end)
+    sending = [(max(a, begin), min(b, until)) for a, b in sending_spans(decided, end)]
+    sending_s = sum(max(0.0, b - a) for a, b in sending)
+    frames = float(source.frames[-1] - source.frames[0]) if source else NAN
+    kbps = ratio(float(source.bytes[-1] - source.bytes[0]) * 8 / 1000, until - begin) if source else NAN
+    allocated = mean_held(Line(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
+    return CameraStatistics(
+        name=camera.name,
+        frames=int(source.frames[-1]) if source else 0,
+        hz=ratio(frames, sending_s),
+        sending_s=sending_s,
+        kbps=kbps,
+        allocated=allocated,
+        share=ratio(kbps, allocated),
+        factors=factor_shares(camera, begin, until),
+        sizes=size_shares(camera, begin, until),
+        arrival=latency(got.arrival_ms) if got else Latency(),
+        decode=latency(got.latency_ms) if got else Latency(),
+        freezes=tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None,
+        lost=int(got.lost[-1]) if got else None,
+        rebuilt=int(got.rebuilt[-1]) if got else None,
+        quality=estimate(camera, model) if model else None,
+    )
+
+
+def _arrivals_logged(got: Received) -> bool:
+    """An operator who logged frames but no arrivals kept none of them."""
+    return bool(got.arrival_t.size) or not got.frames[-1]
+
+
+def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
+    """What is missing, and what to know of the estimates of quality."""
+    if not drive.measured:
+        yield "neither what was sent nor what was received was logged: only what was decided is known"
+    if drive.positions is None:
+        yield "no positions were logged: it is not on the map"
+    estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
+    clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
+    if clamped:
+        yield f"estimated quality: bitrates not measured, where the nearest one stands in: {clamped} of the time"
+    for name, quality in estimated.items():
+        if quality.unknown:
+            factors = ", ".join(f"{factor:g}" for factor in quality.unknown)
+            yield f"{name}: its rate-quality model was not measured at the factors {factors}, no estimate for them"
+    if len({quality.metric for quality in estimated.values()}) > 1:
+        yield "the rate-quality models of the cameras are of different metrics, there is no quality of the whole drive"
+
+
+def _part(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else "<1%"
+
+
+# --- latency and freezes ----------------------------------------------------------------------------------------------
+
+
+def latency(values: Values) -> Latency:
+    """Median, 95th and 99th percentile by linear interpolation; nan of none."""
+    known = values[np.isfinite(values)]
+    return Latency(*map(float, np.percentile(known, (50, 95, 99)))) if known.size else Latency()
+
+
+def freezes(arrivals: Values, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
+    """Where the picture stood still.
+
+        gap >= max(3 * mean, mean + 150 ms)      mean: of the last 30 gaps before it    (W3C webrtc-stats, freezeCount)
+
+    arrivals  s, rising: when each access unit came; they stand for the frames that the definition counts when rendered
+    sending   when the camera was to be sent; gaps reach over none of the pauses between, and the mean starts anew
+    returns   the whole gap of each, as totalFreezesDuration takes it
+
+    The definition counts a freeze when the next frame comes. A stream that stops for good while it is to be sent is
+    counted too, up to the end of the span: else the worst case would look perfect.
+    """
+    found = []
+    for begin, until in sending:
+        inside = arrivals[np.searchsorted(arrivals, begin) : np.searchsorted(arrivals, until, "right")]
+        if not inside.size:
+            continue
+        ends = np.append(inside[1:], until)
+        gaps = ends - inside
+        sums = np.concatenate([[0.0], np.cumsum(gaps)])
+        index = np.arange(len(gaps))
+        first = np.maximum(index - FREEZE_GAPS, 0)
+        means = (sums[index] - sums[first]) / np.maximum(index - first, 1)
+        frozen = (gaps >= np.maximum(FREEZE_FACTOR * means, means + FREEZE_MORE_S) - 1e-9) & (index >= FREEZE_FIRST)
+        found += [Freeze(float(inside[i]), float(gaps[i])) for i in np.flatnonzero(frozen)]
+    return found
+
+
+def per_second(drive: Series) -> PerSecond:
+    """Latency over time across all cameras: to arrival where arrivals were logged, else to decode."""
+    times, values = latencies(drive)
+    edges = np.arange(0.0, drive.end + SECOND_S, SECOND_S)
+    order = np.argsort(times, kind="stable")
+    groups = np.split(values[order], np.searchsorted(times[order], edges[1:-1]))
+    found = [latency(group) for group in groups]
+    return PerSecond(edges[:-1], np.array([f.median for f in found]), np.array([f.p95 for f in found]))
+
+
+def latencies(drive: Series, camera: str | None = None) -> tuple[Values, Values]:
+    """When and how late, s and ms, for each frame of one or of all cameras that a latency is known of."""
+    chosen = [drive.cameras[camera]] if camera else list(drive.cameras.values())
+    received = [c.received for c in chosen if c.received]
+    if to_arrival(drive):
+        times, values = ([got.arrival_t for got in received], [got.arrival_ms for got in received])
+    else:
+        times, values = ([got.t for got in received], [got.latency_ms for got in received])
+    t, ms = together(times), together(values)
+    known = np.isfinite(ms) & (t >= 0)
+    return t[known], ms[known]
+
+
+def to_arrival(drive: Series) -> bool:
+    """Whether latencies to the arrival are known; else they are those of sampled frames to their decode."""
+    received = (c.received for c in drive.cameras.values())
+    return any(got is not None and bool(np.isfinite(got.arrival_ms).any()) for got in received)
+
+
+def together(values: Iterable[Values]) -> Values:
+    return np.concatenate([np.empty(0), *values])
+
+
+# --- shares of time ---------------------------------------------------------------------------------------------------
+
+
+def factor_shares(camera: CameraSeries, begin: float, end: float) -> dict[float, float]:
+    """Share of the time in which each factor was in force, rising; 0 stands for off or paused."""
+    decided = camera.decided
+    factors = np.where(decided.sending & np.isfinite(decided.scaling), decided.scaling, 0.0)
+    return _shares([float(factor) for factor in factors], spans(decided.t, begin, end))
+
+
+def size_shares(camera: CameraSeries, begin: float, end: float) -> dict[tuple[int, int], float]:
+    """Share of the time by size of the picture received, or of the one decided where no operator logged, px."""
+    got, decided = camera.received, camera.decided
+    t, width, height = (got.t, got.width, got.height) if got else (decided.t, decided.width, decided.height)
+    shares = _shares([(int(w), int(h)) for w, h in zip(width, height, strict=True)], spans(t, begin, end))
+    return {size: share for size, share in shares.items() if size[0]}
+
+
+def _shares(keys: Sequence[Any], weights: Values) -> dict[Any, float]:
+    total = float(weights.sum())
+    found: dict[Any, float] = {}
+    for key, weight in zip(keys, weights, strict=True):
+        if weight > 0:
+            found[key] = found.get(key, 0.0) + float(weight) / total
+    return dict(sorted(found.items()))
+
+
+# --- quality ----------------------------------------------------------------------------------------------------------
+
+
+def rate_curves(document: Mapping[str, Any]) -> Model:
+    """The curves of a model file, see schemas/rate_quality.schema.json."""
+    metric = document["metric"]
+    groups: dict[float, list[tuple[float, float]]] = {}
+    for point in document["points"]:
+        if metric in point and point["actual_kbps"] > 0:
+            groups.setdefault(round(point["scaling"], 6), []).append((point["actual_kbps"], point[metric]))
+    return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
+
+
+def estimate(camera: CameraSeries, model: Model) -> Estimate:
+    """Quality that the pictures of a camera have by its rate-quality model.
+
+    At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
+    bits per pixel (paper, left side of Eq. 4), linear between measured points in log bitrate.
+    """
+    t, kbps = camera.actual
+    decided = camera.decided
+    factors = np.round(held(Line(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
+    full = kbps / held(Line(decided.t, decided.roi_share), t)
+    quality, outside, unknown = np.full(t.shape, np.nan), np.zeros(t.shape, dtype=bool), []
+    for factor in np.unique(factors[np.isfinite(factors)]):
+        at = (factors == factor) & (full > 0)
+        if factor not in model.curves:
+            unknown.append(float(factor))
+            continue
+        curve = model.curves[factor]
+        quality[at] = np.interp(np.log(full[at]), np.log(curve.kbps), curve.quality)
+        outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
+    known = np.isfinite(quality)
+    return Estimate(model.metric, Line(t, quality), ratio(int(outside.sum()), int(known.sum())), tuple(unknown))
+
+
+# --- small things -----------------------------------------------------------------------------------------------------
+
+
+def mean(values: Values) -> float:
+    """Mean of what is known; nan of nothing."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else NAN
+
+
+def sum_known(values: Iterable[float]) -> float:
+    """Sum of what is known; nan of nothing."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) if known else NAN
+
+
+def ratio(part: float, whole: float) -> float:
+    return part / whole if whole > 0 else NAN
+
+
+def _sum(values: Iterable[int | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None

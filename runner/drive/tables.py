@@ -1,0 +1,96 @@
+"""Statistics as rows of text, the same in the terminal and on the page. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from runner.drive.statistics import CameraStatistics, Latency, Statistics
+
+Row = tuple[str, ...]
+VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
+NOTHING = "-"
+MEANING = (
+    "Arrival and decode: latency since capture. Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
+    " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer."
+)
+SIZES = 3  # as many sizes of pictures are told, those seen longest
+
+
+def camera_rows(drive: Statistics) -> tuple[Row, list[Row]]:
+    """Headings, and a row for each camera."""
+    kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
+    headings: Row = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
+    headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
+    headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind)
+    return headings, [_camera(camera) for camera in drive.cameras.values()]
+
+
+def drive_rows(drives: Sequence[Statistics]) -> tuple[Row, list[Row]]:
+    """Headings, and a row for each drive."""
+    headings = (
+        "drive",
+        "s",
+        "quality estimated",
+        "latency ms (median, p95, p99)",
+        "freezes",
+        "frozen s",
+        "lost packets",
+    )
+    return (*headings, "of allocated", "mean kbit/s"), [_drive(drive) for drive in drives]
+
+
+def _camera(camera: CameraStatistics) -> Row:
+    frozen = [freeze.seconds for freeze in camera.freezes or ()]
+    known = camera.freezes is not None
+    longest = sorted(camera.sizes.items(), key=lambda each: -each[1])[:SIZES]
+    return (
+        camera.name,
+        str(camera.frames),
+        shown(camera.hz, 1),
+        shown(camera.kbps),
+        shown(camera.allocated),
+        percent(camera.share),
+        "\n".join(f"{f:g}: {share:.0%}" if f else f"off: {share:.0%}" for f, share in camera.factors.items()),
+        "\n".join(f"{width}x{height}" for (width, height), _ in longest) or NOTHING,
+        _latency(camera.arrival),
+        _latency(camera.decode),
+        counted(len(frozen) if known else None),
+        shown(sum(frozen), 2) if known else NOTHING,
+        shown(max(frozen), 2) if frozen else NOTHING,
+        counted(camera.lost),
+        counted(camera.rebuilt),
+        shown(camera.quality.mean, 3) if camera.quality else NOTHING,
+    )
+
+
+def _drive(drive: Statistics) -> Row:
+    arrived = drive.decode if math.isnan(drive.arrival.median) else drive.arrival
+    return (
+        drive.series.label,
+        shown(drive.series.end, 1),
+        f"{shown(drive.quality, 3)} {drive.metric.upper()}" if drive.metric else NOTHING,
+        _latency(arrived),
+        counted(drive.freezes),
+        shown(drive.frozen_s, 2),
+        counted(drive.lost),
+        percent(drive.share),
+        shown(drive.kbps),
+    )
+
+
+def _latency(latency: Latency) -> str:
+    return " / ".join(shown(value) for value in latency) if not math.isnan(latency.median) else NOTHING
+
+
+def shown(value: float | None, digits: int = 0) -> str:
+    """A number; "-" for what is not known."""
+    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def percent(value: float) -> str:
+    return NOTHING if math.isnan(value) else f"{value:.0%}"
+
+
+def counted(value: int | None) -> str:
+    return NOTHING if value is None else str(value)

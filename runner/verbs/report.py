@@ -1,0 +1,139 @@
+"""usage: tod-runner report DRIVE [DRIVE ...] output=DIR [models=DIR] [conf=DIR]
+
+The figures of the paper's driving test from drives that were logged (log= of vehicle, operator and demo): a DRIVE is a
+directory with drive.jsonl, operator.jsonl or both. Several drives are compared, on the same axes.
+
+Writes DIR/index.html, one page that needs nothing else and no network; each figure as .png and .pdf in a column's
+width; and DIR/report.json with all statistics (schemas/report.schema.json), for a CI.
+
+models= is a directory with CAMERA.model.json, as `tod-runner model` writes them: quality is then estimated. Without it
+the models are taken that the drive's configuration names, where they are beside conf/cameras/.
+
+  tod-runner demo log=drive duration_s=100; tod-runner report drive output=report
+  tod-runner report drives/adaptive drives/static output=compared models=models
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from runner.compose import conf_directories
+from runner.errors import RunError, UserError
+from runner.verbs import Arguments
+from runner.verbs.screen import progress_bar
+
+if TYPE_CHECKING:
+    from runner.drive.read import Drive
+    from runner.drive.statistics import Statistics
+
+DOCUMENT = "report.json"
+
+
+def run(arguments: Arguments) -> int:
+    paths, output = _wanted(arguments)
+    _need_libraries()
+    page = report(
+        paths, output, arguments.path("models"), [base / "cameras" for base in conf_directories(arguments.conf)]
+    )
+    print(page)
+    return 0
+
+
+def report(
+    paths: Sequence[Path],
+    output: Path,
+    models: Path | None = None,
+    bases: Sequence[Path] = (),
+) -> Path:
+    """Read, measure, draw, write; show the table of the cameras. What a drive's experiment claims is held against it.
+
+    returns  the page
+    raises   UserError for a drive or model that cannot be read, RunError for a file that cannot be written
+    """
+    from runner.drive import document
+    from runner.drive.claims import claims
+    from runner.drive.figures import write_figures
+    from runner.drive.html import page
+    from runner.files import write_whole
+    from runner.rate_quality.artefact import dumps
+    from runner.verbs.report_table import show
+
+    with progress_bar() as progress:
+        drives = _measured(paths, models, bases, lambda share: progress("drives", share))
+        held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
+        figures, left_out = write_figures(drives, output, progress)
+        told = document.to_json(drives, held, figures, left_out)
+        write_whole(output / DOCUMENT, dumps(told))
+        index = output / "index.html"
+        write_whole(index, page(drives, held, figures, left_out).encode())
+    show(drives, held, left_out)
+    return index
+
+
+def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
+    if arguments.overrides:
+        rule = f"unknown argument, there is {', '.join((*_own(), 'conf'))}"
+        raise UserError("command line", "", arguments.overrides[0], rule)
+    if not arguments.words:
+        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")
+    output = arguments.path("output")
+    if output is None:
+        raise UserError("command line", "output", None, "must be given: the directory that the report is written to")
+    above = next((path for path in (output, *output.parents) if path.exists()), Path())
+    if not above.is_dir():
+        raise UserError("command line", "output", repr(str(output)), f"must be a directory, {above} is a file")
+    return [Path(word) for word in arguments.words], output
+
+
+def _own() -> tuple[str, ...]:
+    from runner.verbs import VERBS
+
+    return VERBS["report"].arguments
+
+
+def _need_libraries() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("matplotlib", "plotly", "rich") if find_spec(name) is None]
+    if missing:
+        raise RunError(f"the Python modules {', '.join(missing)} are not installed: pip install 'tod-runner[report]'")
+
+
+def _measured(
+    paths: Sequence[Path], models: Path | None, bases: Sequence[Path], progress: Callable[[float], None]
+) -> list[Statistics]:
+    from dataclasses import replace
+
+    from runner.drive.models import find_models
+    from runner.drive.read import read_drive
+    from runner.drive.series import series
+    from runner.drive.statistics import statistics
+
+    drives: list[Drive] = []
+    for number, path in enumerate(paths):
+        progress(number / len(paths))
+        drives.append(read_drive(path))
+    found = []
+    for drive, label in zip(drives, labels(drives), strict=True):
+        over_time = series(drive, label)
+        curves, notes = find_models(over_time.config, models, [*bases, drive.path, Path.cwd()])
+        measured = statistics(over_time, curves)
+        found.append(replace(measured, notes=(*measured.notes, *notes)))
+    progress(1.0)
+    return found
+
+
+def labels(drives: Sequence[Drive]) -> list[str]:
+    """Short names that tell drives apart: the directory's, more of its path where two are called the same."""
+    paths = [drive.path.resolve() for drive in drives]
+    found: list[str] = []
+    for number, path in enumerate(paths):
+        others = [other for other in paths if other != path]
+        depth = 1
+        while depth < len(path.parts) - 1 and any(other.parts[-depth:] == path.parts[-depth:] for other in others):
+            depth += 1
+        again = paths[:number].count(path)
+        found.append("/".join(path.parts[-depth:]) + (f" ({again + 1})" if again else ""))
+    return found

@@ -1,0 +1,42 @@
+"""The terminal's tables of a report."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from runner.drive.checks import Check
+from runner.drive.statistics import Statistics
+from runner.drive.tables import VERDICTS, camera_rows, drive_rows
+
+
+def show(drives: Sequence[Statistics], checks: Mapping[str, Sequence[Check]], left_out: Sequence[str]) -> None:
+    """The cameras of each drive, the drives beside each other, claims, and what to know of them."""
+    console = Console(width=None if sys.stdout.isatty() else 190)
+    for drive in drives:
+        console.print(_table(drive.series.label, *camera_rows(drive)))
+        for told in (*drive.series.warnings, *drive.notes):
+            console.print(f"{drive.series.label}: {told}", markup=False, highlight=False)
+    if len(drives) > 1:
+        console.print(_table("all drives", *drive_rows(drives)))
+    for label, held in checks.items():
+        rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
+        console.print(
+            _table(f"{label}: what the paper reports and what came out", ("claim", "came out", "holds"), rows)
+        )
+    for told in left_out:
+        console.print(told, markup=False, highlight=False)
+
+
+def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=True, overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table

@@ -1,0 +1,298 @@
+"""Drives as the two sides would have logged them: the real core decides, noise stands for encoder and network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runner.compose import compose
+from runner.config import load_run
+from runner.events import ClockAdvanced, Event, PositionReported, to_json
+from runner.model import plain
+from runner.step import Run, start, step
+
+EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
+OPERATOR_LATER_S = 1.5  # the operator begins to log later than the vehicle
+TICK_S, TELEMETRY_S, SAMPLE_S, LINK_S = 0.1, 0.2, 0.25, 0.1
+FOLLOWS_S = 0.4  # time constant of the encoder's rate control
+FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}
+VERSIONS = {"tod-runner": "0.1.0", "Python": "3.11.2", "GStreamer": "1.22.0"}
+Lines = list[dict[str, Any]]
+
+
+def write_drive(
+    directory: Path,
+    sides: Iterable[str] = FILES,
+    *,
+    seconds: float = 100.0,
+    seed: int = 1,
+    overrides: Sequence[str] = (),
+    events: Sequence[Event] = (),
+    freezes: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    congested: float = 0.0,
+    change: Callable[[str, Lines], Lines] = lambda _side, lines: lines,
+    ended: bool = True,
+) -> Path:
+    """Write a drive.
+
+    seconds    length
+    overrides  of the configuration; without any the paper's vehicle on the demo's map
+    events     of the operator, with their times
+    freezes    by camera, (from s, how long s) without arrivals
+    congested  how much the network adds to latency and loss where little was predicted; 0: a good one
+    change     what becomes of each side's lines after the first
+    """
+    config, lines = _drive(tuple(overrides), seconds, seed, tuple(events), congested, _frozen(freezes))
+    directory.mkdir(parents=True, exist_ok=True)
+    for side in sides:
+        shift = OPERATOR_LATER_S if side == "operator" else 0.0
+        began = {"t": 0.0, "log": "began", "side": side, "format": 1, "time": EPOCH + shift}
+        began |= {"versions": VERSIONS, "config": config}
+        told = [began, *change(side, json.loads(json.dumps(lines[side])))]
+        if ended:
+            told.append({"t": round(seconds - shift, 6), "log": "ended"})
+        text = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in told)
+        (directory / FILES[side]).write_text(text, encoding="utf-8")
+    return directory
+
+
+def _frozen(freezes: Mapping[str, Sequence[tuple[float, float]]] | None) -> tuple[tuple[str, float, float], ...]:
+    return tuple((name, t, t + seconds) for name, each in (freezes or {}).items() for t, seconds in each)
+
+
+@cache
+def _drive(
+    overrides: tuple[str, ...],
+    seconds: float,
+    seed: int,
+    events: tuple[Event, ...],
+    congested: float,
+    frozen: tuple[tuple[str, float, float], ...],
+) -> tuple[dict[str, Any], dict[str, Lines]]:
+    words = ["source=test", *overrides]
+    made = _Made(np.random.default_rng(seed), *load_run(words, None), seconds, congested, frozen)
+    made.drive(sorted(events, key=lambda event: event.t))
+    config = compose(words).document
+    return config, {"vehicle": made.vehicle_log, "operator": made.operator_log, "link": made.link_log}
+
+
+@dataclass
+class _Made:
+    """A drive in the making."""
+
+    random: np.random.Generator
+    vehicle: Any
+    pqos: Any
+    track: Any
+    seconds: float
+    congested: float
+    frozen: tuple[tuple[str, float, float], ...]
+    vehicle_log: Lines = field(default_factory=list)
+    operator_log: Lines = field(default_factory=list)
+    link_log: Lines = field(default_factory=list)
+    now: Run = field(init=False)
+    position: PositionReported | None = None
+    refused: int = 0
+
+    def __post_init__(self) -> None:
+        names = list(self.vehicle.cameras)
+        self.now = start(self.vehicle)
+        self.rate = dict.fromkeys(names, 0.0)  # kbit/s that comes out of each encoder
+        self.count = {
+            name: dict.fromkeys(("frames", "bytes", "got", "got_bytes", "lost", "rebuilt"), 0) for name in names
+        }
+        self.due = dict.fromkeys(names, 0.0)  # when the next frame is captured
+        self.arrivals: dict[str, list[list[float | None]]] = {name: [] for name in names}
+        self.past: list[tuple[float, dict[str, tuple[int, int]]]] = []
+        self.dropped = self.passed = self.packets = 0
+
+    def drive(self, events: Sequence[Event]) -> None:
+        waiting = list(events)
+        for tick in range(round(self.seconds / TICK_S) + 1):
+            t = round(tick * TICK_S, 6)
+            while waiting and waiting[0].t <= t:
+                self._take(replace(waiting.pop(0), t=t), "operator")
+            if self.track:
+                self.position = replace(self.track.at(t), t=t)
+                self._take(self.position, "position_reported")
+            self._take(ClockAdvanced(t=t), "clock_advanced")
+            self._encode(t)
+            self.link_log.append(self._link(t))
+            if tick % round(TELEMETRY_S / TICK_S) == 0:
+                self.vehicle_log.append(self._telemetry(t))
+            if t >= OPERATOR_LATER_S and tick % 5 in (0, 2):  # every 0.2 and 0.3 s
+                self.operator_log.append(self._sample(t))
+
+    def _take(self, event: Event, cause: str) -> None:
+        self._step(event, cause)
+        prediction = self.pqos.observe(event)
+        if prediction is not None:
+            self._step(prediction, f"bitrate_predicted kbps {plain(prediction.kbps)}")
+
+    def _step(self, event: Event, cause: str) -> None:
+        before, self.now = self.now, step(self.vehicle, self.now, event)
+        self.refused += bool(self.now.refused)
+        self.vehicle_log.append(to_json(event))
+        if not self.now.commands and self.now.decision == before.decision:
+            return
+        commands = [command.to_json() for command in self.now.commands]
+        said = {"t": event.t, "cause": cause, **self.now.decision.to_json()}
+        self.vehicle_log.append({**said, "log": "decision", "commands": commands})
+        state = json.loads(json.dumps(said))
+        for camera in state["cameras"].values():
+            camera |= {"weight": 1, "applied": {}}
+        if event.t >= OPERATOR_LATER_S or not self.operator_log:
+            shifted = max(0.0, round(event.t - OPERATOR_LATER_S + 0.02, 6))
+            self.operator_log.append(state | {"log": "state", "online": True, "t": shifted})
+
+    def _predicted(self) -> float:
+        prediction = self.now.state.prediction
+        return float(prediction.kbps) if prediction else 3000.0
+
+    def _encode(self, t: float) -> None:
+        """Frames of the last tick, and when they come."""
+        load = self.congested * max(0.0, (5500.0 - self._predicted()) / 2500.0)
+        for name, setting in self.now.decision.settings.items():
+            count = self.count[name]
+            wanted = setting.kbps * 0.97 if setting.sending else 0.0
+            self.rate[name] += (wanted - self.rate[name]) * (1 - np.exp(-TICK_S / FOLLOWS_S))
+            fps = float(self.vehicle.cameras[name].fps)
+            while self.due[name] <= t:
+                captured, self.due[name] = self.due[name], self.due[name] + 1 / fps
+                if not setting.sending:
+                    continue
+                size = int(self.rate[name] * 125 / fps * self.random.lognormal(0, 0.25))
+                count["frames"], count["bytes"] = count["frames"] + 1, count["bytes"] + size
+                self._send(name, captured, size, load)
+
+    def _send(self, name: str, captured: float, size: int, load: float) -> None:
+        count = self.count[name]
+        lost = self.random.random() < 0.0004 + 0.01 * load
+        count["lost"] += lost
+        self.dropped += lost
+        self.passed, self.packets = self.passed + size, self.packets + 1 + size // 1200
+        ms = 18 + self.random.gamma(2.0, 2.5) + 60 * load * self.random.gamma(1.5, 1.0)
+        arrived = captured + ms / 1000
+        still = any(each == name and begin < arrived < end for each, begin, end in self.frozen)
+        if lost or still or arrived < OPERATOR_LATER_S:
+            return
+        count["got"], count["got_bytes"] = count["got"] + 1, count["got_bytes"] + size
+        self.arrivals[name].append([round(arrived - OPERATOR_LATER_S, 6), round(ms, 2)])
+
+    def _telemetry(self, t: float) -> dict[str, Any]:
+        cameras = {
+            name: {"applied": {}, "frames": count["frames"], "bytes": count["bytes"]}
+            for name, count in self.count.items()
+        }
+        said = {"predicted_kbps": self._predicted(), "position": self._place(), "cameras": cameras}
+        return {"t": t, "log": "telemetry", **said, "refused": self.refused}
+
+    def _place(self) -> dict[str, Any] | None:
+        if self.position is None:
+            return None
+        return {key: value for key, value in to_json(self.position).items() if key not in ("t", "event")}
+
+    def _sample(self, t: float) -> dict[str, Any]:
+        self.past = [each for each in self.past if each[0] >= t - 1.25]
+        self.past.append((t, {name: (count["got"], count["got_bytes"]) for name, count in self.count.items()}))
+        first = next((each for each in reversed(self.past) if each[0] <= t - 1.0 + 1e-6), self.past[0])
+        seconds = max(t - first[0], 1e-6)
+        cameras = {name: self._received(name, first[1][name], seconds) for name in self.count}
+        return {
+            "t": round(t - OPERATOR_LATER_S, 6),
+            "log": "sample",
+            "predicted_kbps": self._predicted(),
+            "allocated_kbps": sum(camera["allocated_kbps"] for camera in cameras.values()),
+            "actual_kbps": round(sum(camera["kbps"] for camera in cameras.values()), 1),
+            "position": self._place(),
+            "refused": self.refused,
+            "cameras": cameras,
+        }
+
+    def _received(self, name: str, first: tuple[int, int], seconds: float) -> dict[str, Any]:
+        count, setting, arrivals = self.count[name], self.now.decision.settings[name], self.arrivals[name]
+        self.arrivals[name] = []
+        new = seconds > 0.1
+        return {
+            "fps": round((count["got"] - first[0]) / seconds, 2) if new else 0.0,
+            "kbps": round((count["got_bytes"] - first[1]) * 8 / 1000 / seconds, 1) if new else 0.0,
+            "allocated_kbps": setting.kbps,
+            "demand_kbps": plain(setting.demand),
+            "scaling": None if setting.scaling is None else plain(setting.scaling),
+            "width": setting.width if count["got"] else 0,
+            "height": setting.height if count["got"] else 0,
+            "latency_ms": round(arrivals[-1][1] + 4 + self.random.gamma(2.0, 1.0), 2) if arrivals else None,
+            "lost": count["lost"],
+            "rebuilt": count["rebuilt"],
+            "frames": count["got"],
+            "bytes": count["got_bytes"],
+            "arrivals": arrivals,
+        }
+
+    def _link(self, t: float) -> dict[str, Any]:
+        kbps = round(self._predicted() * 1.1)
+        queue = max(0.0, float(self.random.normal(4, 2)))
+        counters = {"bytes": self.passed, "packets": self.packets, "dropped": self.dropped}
+        return {"t": t, "log": "link", "kbps": kbps, "queue_ms": round(queue, 2), **counters}
+
+
+def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: float) -> Path:
+    """A rate-quality model whose curves cross as measured ones do: quality saturates earlier for smaller factors."""
+    points = []
+    for factor in factors:
+        for kbps in (50, 100, 200, 400, 800, 1600, 3200, 6400):
+            best = 0.97 - 0.16 * (1 - factor) ** 2
+            quality = best - 0.5 * factor * np.exp(-kbps / (full_kbps * 0.12 * factor + 40))
+            points.append(
+                {"scaling": factor, "target_kbps": kbps, "actual_kbps": kbps * 0.97, "encode_ms": 3.0, "mssim": quality}
+            )
+    clip = {
+        "file": "clip.mkv",
+        "sha256": "0",
+        "width": 1920,
+        "height": 1040,
+        "fps": 40,
+        "codec": "FFV1",
+        "lossless": True,
+    }
+    clip |= {"frames": 100, "si": 50.0, "ti": 20.0, "si_mean": 45.0, "ti_mean": 15.0}
+    document = {
+        "version": 1,
+        "tod_runner": "0.1.0",
+        "name": name,
+        "content": "0",
+        "sequences": {name: clip},
+        "masks": {},
+        "encoder": {"graph": "x264enc", "versions": {}},
+        "metric": "mssim",
+        "metrics": {"mssim": "MSSIM of luma (Wang 2004)"},
+        "plan": "full",
+        "metric_every": 1,
+        "points": points,
+        "scaling": list(factors),
+        "b_min_kbps": [0, 300, 950][: len(factors)],
+        "b_full_kbps": int(full_kbps),
+        "b_full_quality": 0.95,
+        "crossings": [],
+        "regret": [],
+        "dropped": [],
+        "cores": [],
+        "warnings": [],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def write_models(directory: Path, config: Mapping[str, Any]) -> Path:
+    """One for each camera of a configuration."""
+    for name, camera in config["cameras"].items():
+        ladder = camera["rate_quality"]
+        write_model(directory / f"{name}.model.json", name, ladder["scaling"], ladder["b_full_kbps"])
+    return directory

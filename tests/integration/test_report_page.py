@@ -1,0 +1,174 @@
+"""The report's page in a real browser, from its file: what is drawn, what is said when pointed at, nothing loaded."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drives import write_drive, write_models
+
+from rig import CHROMIUM_FLAGS
+from runner.compose import compose
+from runner.verbs.report import report
+
+pytestmark = pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
+pytest.importorskip("matplotlib")
+pytest.importorskip("plotly")
+sync_api = pytest.importorskip("playwright.sync_api")
+
+SINGLE = {
+    ("bitrate_on_track", 0): 6,  # way, points, arrows, start, end, where one points at
+    ("totals", 0): 4,
+    ("bitrates", 0): 4,
+    ("bitrates", 1): 4,
+    ("scaling", 0): 4,
+    ("scaling", 1): 4,
+    ("latency", 0): 3,  # two percentiles, one camera that froze
+    ("latency", 1): 9,
+    ("quality", 0): 4,
+    ("quality", 1): 4,
+}
+DRAWN = "[...document.querySelectorAll('.chart')].every(chart => chart.dataset.drawn)"
+TRACES = """[...document.querySelectorAll('.chart')].map(chart =>
+    [chart.dataset.figure, Number(chart.dataset.drive), Number(chart.dataset.part), chart.data.length])"""
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    kept = os.environ.get("TOD_SCREENSHOTS")
+    path = Path(kept) if kept else tmp_path_factory.mktemp("screenshots")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    place = tmp_path_factory.mktemp("drives")
+    adaptive = write_drive(place / "adaptive", seconds=60, freezes={"top_rear": [(6.0, 1.5)]}, congested=0.5)
+    still = write_drive(place / "static <share>", seconds=40, overrides=("pqos=constant", "pqos.kbps=6000"))
+    return [adaptive, still]
+
+
+@pytest.fixture(scope="module")
+def single(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("single")
+    models = write_models(place / "models", compose(["source=test"]).document)
+    return report(drives[:1], place / "out", models)
+
+
+@contextmanager
+def opened(chromium: Any, page_file: Path, width: int = 1280, scheme: str = "dark") -> Iterator[Any]:
+    """The page from its file, free of errors, asking for nothing but itself."""
+    with chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme) as tab:
+        page = tab.new_page()
+        wrong: list[str] = []
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda said: wrong.append(said.text) if said.type in ("error", "warning") else None)
+        own = (page_file.as_uri(), "data:", "blob:")
+        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
+        page.goto(page_file.as_uri())
+        page.wait_for_function(DRAWN)
+        yield page
+        assert wrong == []
+
+
+def hovered(page: Any, figure: str, part: int, curve: int, point: int) -> str:
+    """What plotly says when the pointer is at a point of a curve."""
+    chart = page.locator(f".chart.{figure}[data-drive='0'][data-part='{part}']")
+    chart.scroll_into_view_if_needed()
+    place = chart.evaluate(
+        """(chart, [curve, point]) => {
+            const {xaxis, yaxis} = chart._fullLayout, trace = chart.data[curve];
+            return [xaxis._offset + xaxis.d2p(trace.x[point]), yaxis._offset + yaxis.d2p(trace.y[point])];
+        }""",
+        [curve, point],
+    )
+    chart.hover(position={"x": place[0] + 1, "y": place[1]}, force=True)
+    page.wait_for_selector(".hoverlayer text", state="attached")
+    return " ".join(chart.locator(".hoverlayer text").all_text_contents())
+
+
+@pytest.mark.parametrize("width", [1280, 1920])
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, screenshots: Path, width: int, scheme: str) -> None:
+    with opened(chromium, single, width, scheme) as page:
+        traces = {(figure, part): count for figure, _, part, count in page.evaluate(TRACES)}
+        assert traces == SINGLE
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        for name in ("png", "pdf"):
+            links = page.locator(f".files a[href$='.{name}']").evaluate_all("links => links.map(a => a.href)")
+            assert len(links) == 6
+            assert all(Path(link.removeprefix("file://")).is_file() for link in links)
+        page.screenshot(path=screenshots / f"report-{width}-{scheme}.png", full_page=True)
+
+
+def test_the_theme_follows_the_system_and_is_chosen_by_a_button(chromium: Any, single: Path) -> None:
+    with opened(chromium, single, scheme="light") as page:
+        theme = "document.documentElement.dataset.theme"
+        colour = "document.querySelector('.bitrates').data[0].line.color"
+        assert (page.evaluate(theme), page.evaluate(colour)) == ("day", "#0b6fae")
+        page.locator("#theme").click()
+        page.wait_for_function(f"{colour} === '#56b4e9'")
+        assert page.evaluate(theme) == "night"
+
+
+def test_factors_say_why(chromium: Any, single: Path) -> None:
+    with opened(chromium, single) as page:
+        at = page.evaluate("document.querySelector('.scaling').data[0].x.findIndex(t => t > 12)")
+        told = hovered(page, "scaling", 0, 0, at)
+        assert "front_left from " in told
+        assert "of 6000 kbit/s, range [300, 950) -> 0.25" in told
+
+
+def test_freezes_say_when_and_how_long(chromium: Any, single: Path) -> None:
+    with opened(chromium, single) as page:
+        (told,) = page.evaluate("document.querySelector('.latency').data[2].hovertext")
+        assert told.startswith("top_rear froze at 6.0 s for 1.5")
+
+
+def test_pointing_at_a_time_marks_the_place_on_the_map(chromium: Any, single: Path) -> None:
+    with opened(chromium, single) as page:
+        here = "document.querySelector('.bitrate_on_track').data.at(-1).x"
+        assert page.evaluate(here) == []
+        hovered(page, "totals", 0, 3, 100)
+        page.wait_for_function(f"{here}.length === 1")
+
+
+def test_tables_are_reached_by_keyboard(chromium: Any, single: Path) -> None:
+    with opened(chromium, single) as page:
+        tables = page.locator("table")
+        assert tables.count() == 2
+        for table in tables.all():
+            region = table.locator("..")
+            region.focus()
+            assert region.evaluate("region => region === document.activeElement")
+            assert table.locator("caption").inner_text()
+        assert page.locator("[aria-label='Statistics by camera'] tbody tr").count() == 8
+
+
+def test_several_drives_share_their_axes(chromium: Any, drives: list[Path], tmp_path: Path, screenshots: Path) -> None:
+    with opened(chromium, report(drives, tmp_path / "out")) as page:
+        traces = [tuple(each) for each in page.evaluate(TRACES)]
+        assert len(traces) == 1 + 2 + 4 + 4 + 3
+        assert ("latency", 0, 1, 2) in traces
+        ranges = page.locator(".chart.totals").evaluate_all(
+            "charts => charts.map(c => [...c.layout.xaxis.range, ...c.layout.yaxis.range])"
+        )
+        assert ranges[0] == ranges[1]
+        assert ranges[0][1] == 60
+        assert page.locator("h1").inner_text() == "adaptive and static <share>"
+        assert page.locator("[aria-label='One row for each drive'] tbody tr").count() == 2
+        page.screenshot(path=screenshots / "report-several.png", full_page=True)

@@ -1,0 +1,283 @@
+"""The verb `report`: its files, one drive or several, sides that are missing, and every mistake with its message."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drives import Lines, write_drive, write_models
+from helpers import CONF, Command, process
+
+from runner.compose import compose
+from runner.drive.checks import Check
+from runner.drive.colours import DAY, NIGHT
+from runner.events import CameraSwitched
+from runner.schema import findings
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("plotly")
+image = pytest.importorskip("PIL.Image")
+
+FIGURES = ["bitrate_on_track", "bitrates", "scaling", "totals", "latency"]
+STATIC = Path(CONF).parent / "runner" / "page" / "static"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("drives") / "test_drive"
+    return write_drive(path, seconds=20, freezes={"top_rear": [(6.0, 1.5)]}, congested=0.5)
+
+
+def document(output: Path) -> dict[str, Any]:
+    told = json.loads((output / "report.json").read_text())
+    assert findings(told, "report") == []
+    return dict(told)
+
+
+def check_figures(output: Path, names: list[str]) -> None:
+    """Each is there, as a PNG of a column's width that shows something, and as a PDF; no half-written file is."""
+    expected = {f"{name}.{form}" for name in names for form in ("png", "pdf")} | {"index.html", "report.json"}
+    assert {path.name for path in output.iterdir()} == expected
+    for name in names:
+        data = (output / f"{name}.png").read_bytes()
+        picture = image.open(BytesIO(data))
+        assert picture.format == "PNG"
+        assert picture.width == 3.5 * 300
+        assert len(picture.convert("RGB").getcolors(1 << 24)) > 20
+        pdf = (output / f"{name}.pdf").read_bytes()
+        assert pdf.startswith(b"%PDF-")
+        assert pdf.rstrip().endswith(b"%%EOF")
+
+
+def test_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
+    output = tmp_path / "deep" / "report"
+    status, out, _ = tod("report", str(drive), f"output={output}")
+    assert status == 0
+    assert out.splitlines()[-1] == str(output / "index.html")
+    check_figures(output, FIGURES)
+    told = document(output)
+    assert told["figures"] == FIGURES
+    (one,) = told["drives"]
+    assert (one["label"], one["vehicle"], one["began"]) == ("test_drive", "tum_q7", "2026-02-02T02:40:00Z")
+    assert one["duration_s"] == 20
+    assert one["ended"] == {"vehicle": True, "operator": True, "link": True}
+    assert one["freezes"] == 1
+    assert one["link"]["dropped"] == one["lost"]
+    assert [camera["name"] for camera in one["cameras"]][:2] == ["front_left", "front_center"]
+    for camera in one["cameras"]:
+        assert re.search(rf"^ ?{camera['name']} +{camera['frames']} ", out, re.M), camera["name"]
+    (note,) = one["notes"]
+    assert note.startswith("estimated quality: no camera has a rate-quality model; `tod-runner model ")
+    assert note in out
+
+
+def test_with_models_quality_is_estimated(tod: Command, drive: Path, tmp_path: Path) -> None:
+    models = write_models(tmp_path / "models", compose(["source=test"]).document)
+    assert tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={models}").status == 0
+    check_figures(tmp_path / "out", [*FIGURES, "quality"])
+    (one,) = document(tmp_path / "out")["drives"]
+    assert one["quality"]["metric"] == "mssim"
+    assert 0.7 < one["quality"]["mean"] < 0.95
+    (models / "top_left.model.json").unlink()
+    assert tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={models}").status == 0
+    (one,) = document(tmp_path / "out")["drives"]
+    assert one["notes"][-1].startswith("estimated quality: all but top_left have one; ")
+    assert [camera["name"] for camera in one["cameras"] if camera["quality"] is None] == ["top_left"]
+
+
+def test_a_model_that_the_configuration_names(tod: Command, tmp_path: Path) -> None:
+    def named(side: str, lines: Lines) -> Lines:
+        return lines
+
+    path = write_drive(tmp_path / "drive", ["vehicle"], seconds=5, change=named)
+    log = path / "drive.jsonl"
+    began, *rest = log.read_text().splitlines(keepends=True)
+    first = json.loads(began)
+    first["config"]["cameras"]["front_center"]["rate_quality"]["model"] = "center.model.json"
+    log.write_text(json.dumps(first) + "\n" + "".join(rest))
+    own = write_models(tmp_path / "conf" / "cameras", {"cameras": {"center": first["config"]["cameras"]["top_left"]}})
+    assert own.is_dir()
+    tod("report", str(path), f"output={tmp_path / 'out'}", f"conf={tmp_path / 'conf'}")
+    (one,) = document(tmp_path / "out")["drives"]
+    assert one["notes"][-1].startswith("estimated quality: all but front_left, front_right, ")
+
+
+def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
+    still = ("pqos=constant", "pqos.kbps=6000")
+    other = write_drive(tmp_path / "other" / "test_drive", seconds=10, overrides=still)
+    status, out, _ = tod("report", str(drive), str(other), f"output={tmp_path / 'out'}")
+    assert status == 0
+    check_figures(tmp_path / "out", FIGURES)
+    told = document(tmp_path / "out")["drives"]
+    assert [one["label"] for one in told] == [f"{drive.parent.name}/test_drive", "other/test_drive"]
+    assert told[1]["notes"][0] == "no positions were logged: it is not on the map"
+    assert "all drives" in out
+    taller, single = (image.open(tmp_path / "out" / f"{name}.png").height for name in ("totals", "bitrate_on_track"))
+    assert taller > single
+
+
+@pytest.mark.parametrize(
+    "sides, figures",
+    [
+        (["vehicle"], ["bitrate_on_track", "bitrates", "scaling", "totals"]),
+        (["operator"], FIGURES),
+        (["vehicle", "operator"], FIGURES),
+    ],
+)
+def test_sides_that_are_missing(tod: Command, tmp_path: Path, sides: list[str], figures: list[str]) -> None:
+    path = write_drive(tmp_path / "drive", sides, seconds=5)
+    status, out, _ = tod("report", str(path), f"output={tmp_path / 'out'}")
+    assert status == 0
+    check_figures(tmp_path / "out", figures)
+    told = document(tmp_path / "out")
+    assert told["drives"][0]["link"] is None
+    if "operator" not in sides:
+        left_out = "latency: left out, no latency was logged: that takes an operator's log"
+        assert left_out in told["left_out"]
+        assert left_out in out
+
+
+def test_one_camera_and_no_positions(tod: Command, tmp_path: Path) -> None:
+    others = ("front_center", "front_right", "rear_center", "top_front", "top_left", "top_right", "top_rear")
+    overrides = ("pqos=constant", "pqos.kbps=2000", *(f"~cameras.{name}" for name in others))
+    path = write_drive(tmp_path / "drive", seconds=5, overrides=overrides)
+    assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
+    check_figures(tmp_path / "out", [name for name in FIGURES if name != "bitrate_on_track"])
+    assert "bitrate_on_track: left out, no positions were logged" in document(tmp_path / "out")["left_out"]
+
+
+def test_a_camera_that_is_off_all_the_time(tod: Command, tmp_path: Path) -> None:
+    off = CameraSwitched(t=0.0, camera="rear_center", on=False)
+    path = write_drive(tmp_path / "drive", seconds=5, events=(off,))
+    assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
+    (one,) = document(tmp_path / "out")["drives"]
+    rear = one["cameras"][3]
+    assert (rear["frames"], rear["hz"], rear["share"], rear["sizes"]) == (0, None, None, [])
+    assert rear["freezes"]["count"] == 0
+    assert rear["factors"][0]["scaling"] == 0
+
+
+def test_claims_are_held_against_the_drive(drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    from runner.verbs.report import report
+
+    claims = [Check("the total varies", "3000 to 7310 kbit/s", True), Check("<b>", "&", False), Check("c", "d", None)]
+    report([drive], tmp_path / "out", checks=lambda series: claims)
+    (one,) = document(tmp_path / "out")["drives"]
+    assert one["checks"][0] == {"claim": "the total varies", "outcome": "3000 to 7310 kbit/s", "holds": True}
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert '<th scope="row">&lt;b&gt;</th><td>&amp;</td><td>no</td>' in page
+    assert "the total varies" in capfd.readouterr().out
+
+
+def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
+    evil = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{data}}"
+
+    def change(side: str, lines: Lines) -> Lines:
+        for told in lines:
+            for camera in told.get("cameras", {}).values():
+                camera["reason"] = evil
+        return [*lines, {"t": 1.0, "log": "note", "text": evil}]
+
+    path = write_drive(tmp_path / f"<b>{'x' * 20}", seconds=3, change=change)
+    assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
+    page = (tmp_path / "out" / "index.html").read_text()
+    tags: list[str] = []
+
+    class Tags(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: Any) -> None:
+            tags.append(tag)
+
+    Tags().feed(page)
+    assert tags.count("script") == 3
+    assert "img" not in tags
+    assert "b" not in tags
+
+
+def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        tod("report", str(drive), f"output={tmp_path / name}")
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
+
+
+def test_colours_are_those_of_the_operators_page() -> None:
+    script = (STATIC / "colours.js").read_text()
+    assert tuple(re.findall("#[0-9a-f]{6}", script)) == (*NIGHT, *DAY)
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    out = f"output={tmp_path / 'out'}"
+    wrong = [
+        ([out], "command line: DRIVE: must be given: a directory that log= was given to"),
+        ([str(drive)], "command line: output: must be given: the directory that the report is written to"),
+        (["/nowhere", out], "/nowhere: no such directory"),
+        ([str(drive), f"output={file}"], f"command line: output: '{file}': must be a directory, {file} is a file"),
+        (
+            [str(drive), f"output={file}/deep"],
+            f"command line: output: '{file}/deep': must be a directory, {file} is a file",
+        ),
+        ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
+        ([str(drive), out, "vehicle=x"], "command line: vehicle=x: unknown argument, there is output, models, conf"),
+        ([str(drive), "--output"], "command line: --output: there are no flags; write NAME=VALUE, or --help"),
+        ([str(tmp_path), out], f"{tmp_path}: holds no drive: neither drive.jsonl nor operator.jsonl is there"),
+    ]
+    for words, told in wrong:
+        status, printed, err = tod("report", *words)
+        assert (status, printed, err.splitlines()[-1]) == (2, "", told)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_is_none(tod: Command, drive: Path, tmp_path: Path) -> None:
+    (tmp_path / "front_left.model.json").write_text("{")
+    status, _, err = tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={tmp_path}")
+    assert status == 2
+    assert err.splitlines()[-1].startswith(f"{tmp_path}/front_left.model.json: is no model file: ")
+
+
+def test_a_path_may_hold_an_equals_sign(tod: Command, tmp_path: Path) -> None:
+    path = write_drive(tmp_path / "rate=6000", ["vehicle"], seconds=3)
+    assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
+
+
+def test_no_verb_that_takes_none_gets_words(tod: Command) -> None:
+    assert tod("print", "drive").err == "command line: drive: must be NAME=VALUE\n"
+
+
+def test_without_its_libraries(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch, tod: Command) -> None:
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "matplotlib" else real(name))
+    status, out, err = tod("report", str(drive), f"output={tmp_path / 'out'}")
+    assert (status, out) == (1, "")
+    assert err == "the Python modules matplotlib are not installed: pip install 'tod-runner[report]'\n"
+
+
+def test_it_needs_neither_gstreamer_nor_opencv(drive: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(('gi', 'cv2', 'numba', 'scipy', 'aiohttp', 'paho')))\n"
+        "from runner.__main__ import main\n"
+        f"sys.exit(main(['report', {str(drive)!r}, 'output={tmp_path / 'out'}', 'models={tmp_path / 'models'}']))"
+    )
+    import subprocess
+    import sys
+
+    write_models(tmp_path / "models", compose(["source=test"]).document)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_progress_is_shown_on_standard_error(drive: Path, tmp_path: Path) -> None:
+    result = process("report", str(drive), f"output={tmp_path / 'out'}")
+    assert "figures: 100%" in result.err

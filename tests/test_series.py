@@ -1,0 +1,171 @@
+"""A drive on one time axis: clocks joined, counters that begin again, what holds until the next, panels."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drives import EPOCH, OPERATOR_LATER_S, Lines, write_drive
+from helpers import vehicle
+
+from runner.compose import compose
+from runner.drive.read import read_drive
+from runner.drive.series import Line, counted, held, mean_held, panels, rate, sending_spans, series, spans
+from runner.errors import UserError
+from runner.events import CameraSwitched
+
+NAN = float("nan")
+
+
+def line(*points: tuple[float, float]) -> Line:
+    t, y = np.array(points, dtype=float).reshape(-1, 2).T
+    return Line(t, y)
+
+
+def test_what_holds_until_the_next() -> None:
+    steps = line((1, 10), (3, 20), (3, 30))
+    np.testing.assert_array_equal(held(steps, np.array([0.0, 1.0, 2.9, 3.0, 9.0])), [NAN, 10, 10, 30, 30])
+    np.testing.assert_array_equal(held(line(), np.array([0.0, 1.0])), [NAN, NAN])
+
+
+@pytest.mark.parametrize(
+    "begin, end, told",
+    [(0, 5, (2 * 10 + 2 * 30) / 4), (2, 4, 20), (1, 2, 10), (4, 5, 30), (0, 1, NAN), (5, 5, NAN)],
+)
+def test_the_mean_over_time(begin: float, end: float, told: float) -> None:
+    assert mean_held(line((1, 10), (3, 30)), begin, end) == pytest.approx(told, nan_ok=True)
+
+
+def test_spans_share_a_stretch_of_time() -> None:
+    np.testing.assert_allclose(spans(np.array([0.0, 2.0, 6.0]), 1, 8), [1, 4, 2])
+
+
+def test_a_counter_that_begins_again_runs_on() -> None:
+    np.testing.assert_array_equal(counted(np.array([5.0, 9.0, 2.0, 4.0, 0.0, 1.0])), [5, 9, 11, 13, 13, 14])
+    assert counted(np.empty(0)).size == 0
+
+
+def test_a_rate_is_taken_over_a_second_and_is_unknown_before() -> None:
+    t = np.arange(6) * 0.5
+    np.testing.assert_allclose(rate(t, t * 1000), [NAN, NAN, 8, 8, 8, 8])
+
+
+# --- panels -----------------------------------------------------------------------------------------------------------
+
+
+def test_panels_of_the_papers_vehicle() -> None:
+    front, top = panels(compose(["source=test"]).document["cameras"])
+    assert front == ("Front and rear", ("front_left", "front_center", "front_right", "rear_center"))
+    assert top == ("Top", ("top_front", "top_left", "top_right", "top_rear"))
+
+
+def test_panels_of_other_vehicles() -> None:
+    robot = panels(compose(["source=test", "vehicle=delivery_robot"]).document["cameras"])
+    assert robot == (("Front and rear", ("front", "rear")), ("Mast", ("mast",)))
+    assert panels({"a_1": {}, "b_1": {}}) == (("A and b", ("a_1", "b_1")),)
+    many = {f"side_{n}": {"place": {"row": 5 - n, "column": 0}} for n in range(5)}
+    assert [panel.cameras for panel in panels(many)] == [("side_4", "side_3", "side_2"), ("side_1", "side_0")]
+
+
+# --- whole drives -----------------------------------------------------------------------------------------------------
+
+
+def test_sides_are_joined_by_the_time_they_began(tmp_path: Path) -> None:
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=20)))
+    assert (drive.began, drive.end, drive.measured) == (EPOCH, 20, "received")
+    received = drive.cameras["front_left"].received
+    assert received is not None
+    assert received.t[0] == OPERATOR_LATER_S
+    assert OPERATOR_LATER_S <= received.arrival_t[0] < OPERATOR_LATER_S + 0.1
+    assert np.isnan(received.kbps[received.t < OPERATOR_LATER_S + 0.9]).all()
+    assert np.isfinite(received.kbps[received.t > OPERATOR_LATER_S + 1.5]).all()
+    decided = drive.cameras["front_left"].decided
+    at_5 = held(Line(decided.t, decided.kbps), np.array([5.0]))
+    assert np.interp(5.0, *drive.cameras["front_left"].actual) == pytest.approx(at_5[0], rel=0.2)
+
+
+def test_the_vehicle_alone(tmp_path: Path) -> None:
+    drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20)))
+    assert (drive.measured, drive.link) == ("sent", None)
+    camera = drive.cameras["top_left"]
+    assert camera.received is None
+    assert camera.sent is not None
+    total = drive.actual.y[-1]
+    assert total == pytest.approx(sum(c.actual.y[-1] for c in drive.cameras.values()))
+    assert drive.positions is not None
+    assert (drive.positions.east[0], drive.positions.north[0]) == (0, 0)
+    moved = np.hypot(np.diff(drive.positions.east), np.diff(drive.positions.north)).sum()
+    assert moved == pytest.approx(20 * 8, rel=0.01)
+
+
+def test_the_operator_alone(tmp_path: Path) -> None:
+    drive = series(read_drive(write_drive(tmp_path / "drive", ["operator"], seconds=20)))
+    assert drive.began == EPOCH + OPERATOR_LATER_S
+    assert drive.end == pytest.approx(20 - OPERATOR_LATER_S)
+    assert list(drive.cameras) == list(vehicle().cameras)
+    assert drive.measured == "received"
+    assert drive.positions is not None
+    assert drive.predicted.t.size > 0
+    assert drive.reasons
+
+
+def test_when_a_camera_was_to_be_sent(tmp_path: Path) -> None:
+    off = CameraSwitched(t=5.0, camera="rear_center", on=False)
+    on = CameraSwitched(t=9.0, camera="rear_center", on=True)
+    drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20, events=(off, on))))
+    assert sending_spans(drive.cameras["rear_center"].decided, drive.end) == [(0.0, 5.0), (9.0, 20.0)]
+    assert sending_spans(drive.cameras["front_left"].decided, drive.end) == [(0.0, 20.0)]
+    switched = [(each.t, each.reason) for each in drive.reasons if each.camera == "rear_center"]
+    assert (5.0, "switched off") in switched
+
+
+def test_clocks_that_differ_are_told(tmp_path: Path) -> None:
+    def early(side: str, lines: Lines) -> Lines:
+        for told in lines:
+            for camera in told.get("cameras", {}).values():
+                camera["arrivals"] = [[t, ms - 50] for t, ms in camera.get("arrivals", ())]
+        return lines
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=5, change=early)))
+    (warning,) = drive.warnings
+    assert warning.startswith("latencies go down to -")
+    assert warning.endswith(" ms: the clocks of both sides differ, latencies are off by as much")
+
+
+# --- what cannot be reported ------------------------------------------------------------------------------------------
+
+
+def without(**keys: Any) -> Any:
+    def change(side: str, lines: Lines) -> Lines:
+        return [told for told in lines if not any(told.get(key) == value for key, value in keys.items())]
+
+    return change
+
+
+def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
+    def problem(name: str) -> str:
+        with pytest.raises(UserError) as told:
+            series(read_drive(tmp_path / name))
+        return str(told.value).removeprefix(f"{tmp_path}/")
+
+    write_drive(tmp_path / "empty", seconds=5, change=lambda _side, _lines: [])
+    assert problem("empty") == "empty: has no length: nothing was logged but its beginning"
+    write_drive(tmp_path / "undecided", seconds=5, change=without(log="decision"), sides=["vehicle"])
+    assert problem("undecided") == "undecided: has no decision yet: there is nothing to report"
+    write_drive(tmp_path / "foreign", seconds=5, change=lambda _side, lines: [*lines, {"t": 1, "log": "decision"}])
+    assert problem("foreign") == (
+        "foreign: has lines of another form than this tod-runner writes (KeyError: 'cameras')"
+    )
+    assert problem("nowhere") == "nowhere: no such directory"
+
+
+def test_a_drive_that_was_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
+    path = write_drive(tmp_path / "drive", seconds=5, ended=False)
+    log = path / "drive.jsonl"
+    log.write_text(log.read_text()[:-20])
+    drive = series(read_drive(path))
+    assert drive.ended == {"vehicle": False, "operator": False, "link": False}
+    assert json.loads(json.dumps(drive.warnings))

@@ -1,0 +1,188 @@
+"""Freezes by hand-made arrivals, percentiles, shares of time, quality between measured points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import write_drive, write_model
+
+from runner.drive.read import read_drive
+from runner.drive.series import CameraSeries, Decided, Sent, series
+from runner.drive.statistics import (
+    Freeze,
+    Latency,
+    Model,
+    RateCurve,
+    estimate,
+    freezes,
+    latency,
+    per_second,
+    rate_curves,
+    statistics,
+)
+from runner.rate_quality.artefact import read_model
+
+NAN = float("nan")
+ALWAYS = [(0.0, 1000.0)]
+
+
+def arrivals(*gaps: float, first: float = 0.0) -> np.ndarray:
+    return first + np.concatenate([[0.0], np.cumsum(gaps)])
+
+
+# --- freezes ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "gap_s, long_s, frozen",
+    [
+        (0.025, 0.174, False),  # 40 Hz: mean + 150 ms = 175 ms is the larger
+        (0.025, 0.175, True),
+        (0.025, 0.080, False),  # 3 * mean alone is not enough
+        (0.1, 0.299, False),  # 10 Hz: 3 * mean = 300 ms is the larger
+        (0.1, 0.301, True),
+    ],
+)
+def test_a_gap_freezes_from_the_larger_of_both_bounds_on(gap_s: float, long_s: float, frozen: bool) -> None:
+    came = arrivals(*[gap_s] * 40, long_s, *[gap_s] * 5)
+    found = freezes(came, [(0.0, float(came[-1]))])
+    assert found == ([(pytest.approx(40 * gap_s), pytest.approx(long_s))] if frozen else [])
+
+
+def test_the_mean_is_of_the_last_30_gaps() -> None:
+    # After 30 gaps of 25 ms, the 200 ms before them are forgotten: 175 ms freeze again; after 29 they are not.
+    for since, frozen in ((30, True), (29, False)):
+        came = arrivals(*[0.2] * 40, *[0.025] * since, 0.176, 0.025)
+        assert bool(freezes(came, [(0.0, float(came[-1]))])) is frozen
+
+
+def test_a_freeze_is_part_of_later_means() -> None:
+    came = arrivals(*[0.025] * 40, 6.0, 0.3, 0.025)
+    # The mean is then (29 * 25 + 6000) / 30 = 224 ms: 300 ms are no freeze, though they were before.
+    assert freezes(came, [(0.0, float(came[-1]))]) == [(pytest.approx(1.0), pytest.approx(6.0))]
+
+
+def test_nothing_is_judged_by_less_than_five_gaps() -> None:
+    assert freezes(arrivals(*[0.025] * 4, 1.0, 0.025), [(0.0, 1.125)]) == []
+    assert len(freezes(arrivals(*[0.025] * 5, 1.0, 0.025), [(0.0, 1.15)])) == 1
+    assert freezes(np.empty(0), ALWAYS) == []
+
+
+def test_a_camera_that_is_not_sent_does_not_freeze() -> None:
+    came = np.concatenate([arrivals(*[0.025] * 40), arrivals(*[0.025] * 40, first=11.0)])
+    assert freezes(came, [(0.0, 12.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(10.0))]
+    assert freezes(came, [(0.0, 1.01), (11.0, 12.0)]) == []
+
+
+def test_a_stream_that_stops_for_good_is_frozen_to_the_end_of_the_span() -> None:
+    came = arrivals(*[0.025] * 40)
+    assert freezes(came, [(0.0, 5.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(4.0))]
+    assert freezes(came, [(0.0, 1.1)]) == []
+
+
+def test_freezes_of_a_drive(tmp_path: Path) -> None:
+    path = write_drive(tmp_path / "drive", seconds=20, freezes={"top_rear": [(6.0, 1.5)], "front_left": [(9, 0.5)]})
+    found = statistics(series(read_drive(path)))
+    by_camera = {name: camera.freezes for name, camera in found.cameras.items()}
+    for name, at, seconds in (("top_rear", 6.0, 1.5), ("front_left", 9.0, 0.5)):
+        frozen = by_camera.pop(name)
+        assert frozen == (Freeze(pytest.approx(at, abs=0.1), pytest.approx(seconds, abs=0.15)),)
+    assert set(by_camera.values()) == {()}
+    assert found.freezes == 2
+    assert found.frozen_s == pytest.approx(2.0, abs=0.3)
+
+
+# --- latency ----------------------------------------------------------------------------------------------------------
+
+
+def test_percentiles_interpolate_and_leave_out_what_is_unknown() -> None:
+    assert latency(np.array([NAN, *range(101)])) == Latency(50, 95, 99)
+    assert latency(np.array([10.0, 20.0])) == Latency(15, 19.5, pytest.approx(19.9))
+    assert all(np.isnan(latency(np.array([NAN]))))
+
+
+def test_latency_of_each_second_is_over_all_cameras(tmp_path: Path) -> None:
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=10)))
+    seconds = per_second(drive)
+    np.testing.assert_array_equal(seconds.t, np.arange(10))
+    received = [c.received for c in drive.cameras.values() if c.received]
+    third = np.concatenate([r.arrival_ms[(r.arrival_t >= 3) & (r.arrival_t < 4)] for r in received])
+    assert seconds.median[3] == pytest.approx(np.median(third))
+    assert seconds.p95[3] == pytest.approx(np.percentile(third, 95))
+
+
+# --- means and shares -------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_with_both_sides(tmp_path: Path) -> None:
+    found = statistics(series(read_drive(write_drive(tmp_path / "drive", seconds=30))))
+    assert found.share == pytest.approx(1.0, abs=0.05)
+    assert found.lost == sum(camera.lost or 0 for camera in found.cameras.values())
+    front, top = found.cameras["front_left"], found.cameras["top_left"]
+    assert front.hz == pytest.approx(40, rel=0.02)
+    assert top.hz == pytest.approx(30, rel=0.02)
+    for camera in (front, top):
+        assert sum(camera.factors.values()) == pytest.approx(1)
+        assert sum(camera.sizes.values()) == pytest.approx(1, abs=0.02)
+    assert set(front.factors) == {0.25, 0.5}
+    assert front.arrival.median < front.decode.median
+
+
+def test_a_vehicle_alone_has_no_latency_and_no_losses(tmp_path: Path) -> None:
+    found = statistics(series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20))))
+    assert (found.freezes, found.lost, found.frozen_s) == (None, None, None)
+    assert np.isnan(found.arrival.median)
+    assert np.isnan(found.decode.median)
+    assert found.share == pytest.approx(1.0, abs=0.05)
+    assert found.cameras["front_left"].hz == pytest.approx(40, rel=0.02)
+
+
+# --- quality ----------------------------------------------------------------------------------------------------------
+
+MODEL = Model("mssim", {0.5: RateCurve(np.array([100.0, 400.0]), np.array([0.6, 0.8]))})
+
+
+def camera(kbps: float, scaling: float, *, sending: bool = True, share: float = 1.0) -> CameraSeries:
+    def column(value: float) -> np.ndarray:
+        return np.array([value], dtype=float)
+
+    flag, t = np.array([sending]), np.array([1.0])
+    decided = Decided(
+        column(0), flag, flag, column(1), column(kbps), column(scaling), column(2), column(2), column(share), ("",)
+    )
+    return CameraSeries("one", decided, None, Sent(t, column(1), column(1), column(kbps)))
+
+
+@pytest.mark.parametrize(
+    "kbps, scaling, share, quality, clamped",
+    [
+        (100, 0.5, 1, 0.6, 0),
+        (200, 0.5, 1, 0.7, 0),  # half way in log bitrate
+        (400, 0.5, 1, 0.8, 0),
+        (100, 0.5, 0.5, 0.7, 0),  # of half the picture: as 200 of all of it
+        (50, 0.5, 1, 0.6, 1),
+        (900, 0.5, 1, 0.8, 1),
+    ],
+)
+def test_quality_between_measured_points(
+    kbps: float, scaling: float, share: float, quality: float, clamped: float
+) -> None:
+    found = estimate(camera(kbps, scaling, share=share), MODEL)
+    assert (found.mean, found.clamped) == (pytest.approx(quality), clamped)
+
+
+def test_no_quality_without_a_picture_or_a_curve() -> None:
+    assert np.isnan(estimate(camera(0, 0.5), MODEL).mean)
+    assert np.isnan(estimate(camera(200, 0.5, sending=False), MODEL).mean)
+    other = estimate(camera(200, 0.25), MODEL)
+    assert np.isnan(other.mean)
+    assert other.unknown == (0.25,)
+
+
+def test_curves_of_a_model_file_are_over_what_came_out_of_the_encoder(tmp_path: Path) -> None:
+    model = rate_curves(read_model(write_model(tmp_path / "one.model.json", "one", [0.25, 0.5], 3000)))
+    assert (model.metric, list(model.curves)) == ("mssim", [0.25, 0.5])
+    assert model.curves[0.5].kbps[0] == pytest.approx(50 * 0.97)
+    assert (np.diff(model.curves[0.5].quality) > 0).all()
