@@ -9,6 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from drives import Lines, write_drive, write_models
 from helpers import CONF, Command, process
@@ -16,6 +17,9 @@ from helpers import CONF, Command, process
 from runner.compose import compose
 from runner.drive.checks import Check
 from runner.drive.colours import DAY, NIGHT
+from runner.drive.read import read_drive
+from runner.drive.series import series
+from runner.drive.statistics import statistics
 from runner.events import CameraSwitched
 from runner.schema import findings
 
@@ -196,6 +200,22 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
     assert tags.count("script") == 3
     assert "img" not in tags
     assert "b" not in tags
+
+
+@pytest.mark.parametrize("congested, scale", [(0.0, "linear"), (3.0, "log")])
+def test_the_axis_of_latencies_holds_them_all(tmp_path: Path, congested: float, scale: str) -> None:
+    from runner.drive.figures import latency
+
+    path = write_drive(tmp_path / "drive", seconds=20, congested=congested)
+    drive = statistics(series(read_drive(path)))
+    figure = latency([drive])
+    assert not isinstance(figure, str)
+    axes = figure.axes[0]
+    shown = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
+    low, high = axes.get_ylim()
+    assert axes.get_yscale() == scale
+    assert low <= np.nanmin(shown)
+    assert high >= np.nanmax(shown)
 
 
 def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path) -> None:
