@@ -9,6 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from drives import Lines, write_drive, write_models
 from helpers import CONF, Command, process
@@ -16,6 +17,9 @@ from helpers import CONF, Command, process
 from runner.compose import compose
 from runner.drive.checks import Check
 from runner.drive.colours import DAY, NIGHT
+from runner.drive.read import read_drive
+from runner.drive.series import series
+from runner.drive.statistics import statistics
 from runner.events import CameraSwitched
 from runner.schema import findings
 
@@ -162,11 +166,15 @@ def test_a_camera_that_is_off_all_the_time(tod: Command, tmp_path: Path) -> None
     assert rear["factors"][0]["scaling"] == 0
 
 
-def test_claims_are_held_against_the_drive(drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_claims_are_held_against_the_drive(
+    drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from runner.drive import claims as module
     from runner.verbs.report import report
 
     claims = [Check("the total varies", "3000 to 7310 kbit/s", True), Check("<b>", "&", False), Check("c", "d", None)]
-    report([drive], tmp_path / "out", checks=lambda series: claims)
+    monkeypatch.setattr(module, "claims", lambda series: claims)
+    report([drive], tmp_path / "out")
     (one,) = document(tmp_path / "out")["drives"]
     assert one["checks"][0] == {"claim": "the total varies", "outcome": "3000 to 7310 kbit/s", "holds": True}
     page = (tmp_path / "out" / "index.html").read_text()
@@ -179,7 +187,7 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
 
     def change(side: str, lines: Lines) -> Lines:
         for told in lines:
-            for camera in told.get("cameras", {}).values():
+            for camera in told["cameras"].values() if told.get("log") in ("decision", "state") else ():
                 camera["reason"] = evil
         return [*lines, {"t": 1.0, "log": "note", "text": evil}]
 
@@ -196,6 +204,22 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
     assert tags.count("script") == 3
     assert "img" not in tags
     assert "b" not in tags
+
+
+@pytest.mark.parametrize("congested, scale", [(0.0, "linear"), (3.0, "log")])
+def test_the_axis_of_latencies_holds_them_all(tmp_path: Path, congested: float, scale: str) -> None:
+    from runner.drive.figures import latency
+
+    path = write_drive(tmp_path / "drive", seconds=20, congested=congested)
+    drive = statistics(series(read_drive(path)))
+    figure = latency([drive])
+    assert not isinstance(figure, str)
+    axes = figure.axes[0]
+    shown = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
+    low, high = axes.get_ylim()
+    assert axes.get_yscale() == scale
+    assert low <= np.nanmin(shown)
+    assert high >= np.nanmax(shown)
 
 
 def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path) -> None:
@@ -229,7 +253,7 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
         ([str(drive), out, "vehicle=x"], "command line: vehicle=x: unknown argument, there is output, models, conf"),
         ([str(drive), "--output"], "command line: --output: there are no flags; write NAME=VALUE, or --help"),
-        ([str(tmp_path), out], f"{tmp_path}: holds no drive: neither drive.jsonl nor operator.jsonl is there"),
+        ([str(tmp_path), out], f"{tmp_path}: holds no drive: neither drive.jsonl nor operator.jsonl"),
     ]
     for words, told in wrong:
         status, printed, err = tod("report", *words)

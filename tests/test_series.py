@@ -125,8 +125,8 @@ def test_when_a_camera_was_to_be_sent(tmp_path: Path) -> None:
 def test_clocks_that_differ_are_told(tmp_path: Path) -> None:
     def early(side: str, lines: Lines) -> Lines:
         for told in lines:
-            for camera in told.get("cameras", {}).values():
-                camera["arrivals"] = [[t, ms - 50] for t, ms in camera.get("arrivals", ())]
+            for camera in told["cameras"].values() if told.get("log") == "sample" else ():
+                camera["arrivals"] = [[t, ms - 50] for t, ms in camera["arrivals"]]
         return lines
 
     drive = series(read_drive(write_drive(tmp_path / "drive", seconds=5, change=early)))
@@ -156,9 +156,7 @@ def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
     write_drive(tmp_path / "undecided", seconds=5, change=without(log="decision"), sides=["vehicle"])
     assert problem("undecided") == "undecided: has no decision yet: there is nothing to report"
     write_drive(tmp_path / "foreign", seconds=5, change=lambda _side, lines: [*lines, {"t": 1, "log": "decision"}])
-    assert problem("foreign") == (
-        "foreign: has lines of another form than this tod-runner writes (KeyError: 'cameras')"
-    )
+    assert problem("foreign").startswith("foreign/drive.jsonl: line 187: cause: missing: must be given; mode: missing")
     assert problem("nowhere") == "nowhere: no such directory"
 
 

@@ -25,7 +25,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from runner.drive.colours import ACTUAL, ALLOCATED, DAY, LINK, PREDICTED, colours
 from runner.drive.series import Line, Panel, Positions, Series, Values, held
-from runner.drive.statistics import PerSecond, Statistics, latencies, per_second, to_arrival
+from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
 from runner.files import write_whole
 
 if TYPE_CHECKING:
@@ -67,10 +67,12 @@ LEGEND_IN = 0.38  # under the panel: below the numbers and the label of the time
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.2)), (0, (1.4, 0.9)), (0, (5, 1, 1.2, 1)))  # by place in a panel
 APART = 0.014  # of the axis, between steps that would lie on one another
 MINUTES_FROM_S = 900.0
+DECADES = 50.0  # over more than this ratio fewer latencies are numbered
 WIDE = 8.0  # latencies that spread over more than this ratio are drawn on a logarithmic axis
 SEEN = 0.006  # of the axis: the least width of a freeze that is seen
 ARROWS = 7  # that show the direction of the drive
 METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
+FLATTEST = 0.4  # shorter side of a map over the longer
 SMALLEST_TRACK_M = 20.0  # around a vehicle that stands
 
 Rows = Sequence[Statistics]
@@ -211,7 +213,7 @@ def latency(drives: Rows) -> Figure | str:
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(heights) + 1, height_ratios=[*heights, 1.45])
     seconds = [per_second(drive.series) for drive in drives]
-    wide = _is_wide(seconds)
+    everything = np.concatenate([np.concatenate([each.median, each.p95]) for each in seconds])
     for number, (drive, each) in enumerate(zip(drives, seconds, strict=True)):
         axes, strip = grid[2 * number], grid[2 * number + 1]
         axes.sharex(grid[0])
@@ -219,17 +221,12 @@ def latency(drives: Rows) -> Figure | str:
         axes.sharey(grid[0])
         axes.plot(each.t / unit, each.p95, color=DAY[5], label="95th percentile")
         axes.plot(each.t / unit, each.median, color=ALLOCATED, label="median")
-        _latency_axis(axes.yaxis, wide=wide)
-        if wide:
-            axes.set_yscale("log")
-            _latency_axis(axes.yaxis, wide=wide)
+        _latency_axis(axes.set_yscale, axes.set_ylim, axes.yaxis, everything[np.isfinite(everything)])
         axes.set_ylabel("latency in ms")
         axes.tick_params(labelbottom=False)
         axes.set_title(drive.series.label if len(drives) > 1 else "(a) Over time")
         _draw_freezes(strip, drive, unit)
     grid[0].set_xlim(0, max(drive.series.end for drive in drives) / unit)
-    if not wide:
-        grid[0].set_ylim(bottom=min(0.0, *(float(np.nanmin(each.median, initial=0.0)) for each in seconds)))
     grid[0].legend(loc="lower right", bbox_to_anchor=(1, 1.03), ncols=2)
     grid[-2].set_xlabel(label)
     _draw_distribution(grid[-1], drives)
@@ -372,8 +369,20 @@ def _viridis() -> ListedColormap:
 def _height(places: Positions | None) -> float:
     """Of a map that fills the column's width, in."""
     assert places is not None
-    wide, high = (max(float(np.ptp(each)), SMALLEST_TRACK_M) for each in (places.east, places.north))
-    return float(np.clip(2.4 * high / wide, 0.9, 3.2)) + 0.55
+    (left, right), (bottom, top) = _limits(places)
+    return 2.4 * (top - bottom) / (right - left) + 0.6
+
+
+def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Of the map, m east and north: room around the track, and no side too short for the colour bar."""
+    spans = [float(np.ptp(each)) for each in (places.east, places.north)]
+    least = max(FLATTEST * max(spans), SMALLEST_TRACK_M)
+    room = 0.06 * max(*spans, SMALLEST_TRACK_M)
+    found = []
+    for values, span in zip((places.east, places.north), spans, strict=True):
+        middle, half = float(values.min() + values.max()) / 2, max(span, least) / 2 + room
+        found.append((middle - half, middle + half))
+    return found[0], found[1]
 
 
 def _mark_way(axes: Axes, drive: Series) -> None:
@@ -396,12 +405,9 @@ def _mark_way(axes: Axes, drive: Series) -> None:
 
 def _dress_map(axes: Axes, drive: Series, *, titled: bool) -> None:
     axes.set_aspect("equal")
-    axes.margins(0.06)
-    places = drive.positions
-    assert places is not None
-    for limit, values in ((axes.set_xlim, places.east), (axes.set_ylim, places.north)):
-        middle, half = float(values.min() + values.max()) / 2, max(float(np.ptp(values)), SMALLEST_TRACK_M) * 0.56
-        limit(middle - half, middle + half)
+    assert drive.positions is not None
+    xlim, ylim = _limits(drive.positions)
+    axes.set(xlim=xlim, ylim=ylim)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes.set_xlabel("m east of the start")
@@ -412,7 +418,8 @@ def _dress_map(axes: Axes, drive: Series, *, titled: bool) -> None:
 
 
 def _colour_bar(figure: Figure, axes: Axes, points: PathCollection, drive: Series) -> None:
-    bar = figure.colorbar(points, ax=axes, fraction=0.05, pad=0.02)
+    # Inside the axes' own box, which the equal aspect shrinks.
+    bar = figure.colorbar(points, cax=axes.inset_axes((1.02, 0, 0.035, 1)))
     bar.set_label(f"total {drive.measured or 'allocated'} in kbit/s")
     bar.outline.set_linewidth(0.5)
 
@@ -420,17 +427,16 @@ def _colour_bar(figure: Figure, axes: Axes, points: PathCollection, drive: Serie
 # --- latency ----------------------------------------------------------------------------------------------------------
 
 
-def _is_wide(seconds: Sequence[PerSecond]) -> bool:
-    """Whether latencies need a logarithmic axis; one that is below 0, because clocks differ, cannot have it."""
-    values = np.concatenate([np.concatenate([each.median, each.p95]) for each in seconds])
-    known = values[np.isfinite(values)]
-    return bool(known.size and known.min() > 0 and known.max() / known.min() > WIDE)
-
-
-def _latency_axis(axis: Any, *, wide: bool) -> None:
-    if wide:
-        axis.set_major_locator(LogLocator(10, (1, 2, 5)))
+def _latency_axis(set_scale: Callable[[str], None], set_limits: Callable[..., Any], axis: Any, shown: Values) -> None:
+    """An axis that holds some latencies: logarithmic where they spread and none is below 0."""
+    low, high = float(shown.min()), float(shown.max())
+    if low > 0 and high / low > WIDE:
+        set_scale("log")
+        set_limits(low * 0.95, high * 1.05)
+        axis.set_major_locator(LogLocator(10, (1, 3) if high > DECADES * low else (1, 2, 5)))
         axis.set_minor_formatter(NullFormatter())
+    else:
+        set_limits(min(0.0, low), high * 1.05)
     axis.set_major_formatter(FuncFormatter(lambda ms, _: f"{ms:g}"))
 
 
@@ -474,11 +480,8 @@ def _draw_distribution(axes: Axes, drives: Rows) -> None:
     for name, values, style in known:
         axes.plot(values, np.arange(1, len(values) + 1) / len(values), label=name, **style)
     everything = np.concatenate([values for _, values, _ in known])
-    low, high = np.percentile(everything, (0, 99.9))
-    if low > 0 and high / low > WIDE:
-        axes.set_xscale("log")
-        _latency_axis(axes.xaxis, wide=True)
-    axes.set_xlim(low if low > 0 else min(0.0, low), high)
+    # The last thousandth would squeeze all others.
+    _latency_axis(axes.set_xscale, axes.set_xlim, axes.xaxis, np.percentile(everything, (0, 99.9)))
     axes.set_ylim(0, 1.01)
     for share in (0.5, 0.95):
         axes.axhline(share, color="#8b949e", lw=0.5, ls=":", zorder=1)

@@ -21,7 +21,7 @@ class Side:
     """What one side wrote.
 
     began  its first line: time (s since 1970), versions, config
-    lines  all others, in their order
+    lines  all others but the end, in their order
     ended  whether it came to a clean end
     """
 
@@ -73,7 +73,7 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
     ended = lines[-1].get("log") == "ended"
     if not ended:
         warnings.append(f"{path}: has no end; the process was killed, or still runs")
-    return Side(began, lines[1:], ended)
+    return Side(began, lines[1 : -1 if ended else None], ended)
 
 
 def check_began(line: Line | None, name: str) -> Line:
