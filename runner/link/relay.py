@@ -209,7 +209,6 @@ class Ports:
             sock.close()
 
     def _read(self, index: int, sock: socket.socket) -> None:
-        now = time.monotonic()
         host, first = self._operator
         operator = (host, first + index)
         for _ in range(AT_ONCE):
@@ -221,7 +220,7 @@ class Ports:
                 continue  # too early for anybody
             if source[1] - self.server_port in (0, 1):
                 deliver = _sender(sock, data, operator)
-                self._loop.bucket.put(len(data) + UDP_HEADERS, deliver, now)
+                self._loop.bucket.put(len(data) + UDP_HEADERS, deliver, time.monotonic())
             else:
                 _sender(sock, data, (self._server, self.server_port + index))()
 
