@@ -95,7 +95,10 @@ SETUP = (
     b"SETUP rtsp://h/c/stream=0 RTSP/1.0\r\nCSeq: 4\r\n"
     b"Transport: RTP/AVPF;unicast;client_port=50002-50003,RTP/AVP;unicast;client_port=50002-50003\r\n\r\n"
 )
-REPLY = b"RTSP/1.0 200 OK\r\ntransport: RTP/AVPF;unicast;client_port=6-7;server_port=8-9;mode=PLAY\r\nX: client_port=6\r\n\r\n"
+REPLY = (
+    b"RTSP/1.0 200 OK\r\n"
+    b"transport: RTP/AVPF;unicast;client_port=6-7;server_port=8-9;mode=PLAY\r\nX: client_port=6\r\n\r\n"
+)
 SDP = b"RTSP/1.0 200 OK\r\nContent-length: 28\r\n\r\nTransport: client_port=1-2\r\n"
 PACKET = b"$\x00\x00\x06\r\n\r\nab"
 

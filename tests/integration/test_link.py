@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rig import CHECKOUT, Client, free_port, process, streaming, until
+from rig import CHECKOUT, free_port, process, streaming, until, watching
 from runner.broker import private_broker
 from runner.commands import Command
 from runner.config import load
@@ -112,7 +112,7 @@ def _ends():
 def _names():
     """Of every namespace and network device."""
     said = [subprocess.check_output(["ip", *words], text=True) for words in (("netns",), ("-br", "link"))]
-    return {line.split()[0].partition("@")[0] for line in "\n".join(said).splitlines()}
+    return {line.split()[0].partition("@")[0] for lines in said for line in lines.splitlines()}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -171,9 +171,7 @@ def test_a_delay_is_added_to_the_wait():
 
 
 def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
-    from gi.repository import GstRtsp
-
-    from runner.gst.server import CameraServer
+    from runner.gst.server import CameraServer, GstRtsp
 
     factory = CameraServer._factory
 
@@ -186,15 +184,14 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
     # A queue that takes most of a frame and not all of it: the rest comes as soon as it is asked for.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
-    with streaming(*SOURCE, "vehicle=delivery_robot", "fps_max=15", cameras=("rear",)) as (side, vehicle, plans, _):
-        with limited_link("relay", limit, vehicle.media, Endpoint("127.0.0.1", free_port()), lambda line: None) as link:
-            side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
-            client = Client(_at(plans[0], link.operator_overrides))
-            try:
-                assert until(lambda: _sent_again(client) > 5, seconds=30)
-                assert len(client.sizes) > 5
-            finally:
-                client.close()
+    overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15")
+    with (
+        streaming(*overrides, cameras=("rear",)) as (side, vehicle, plans, _),
+        limited_link("relay", limit, vehicle.media, _ends()[0], print) as link,
+    ):
+        side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
+        with watching(_at(plans[0], link.operator_overrides)) as client:
+            until(lambda: _sent_again(client) > 5 and len(client.sizes) > 5, seconds=30)
 
 
 def _at(plan, overrides):
@@ -234,7 +231,7 @@ def test_the_next_run_removes_what_a_killed_one_left():
         "import os, signal, subprocess; from runner.link import *; from runner.model import Endpoint\n"
         "limit, end = Limit(lambda t: 100, 200, 0), Endpoint('127.0.0.1', 1)\n"
         "with limited_link('netns', limit, end, end, print) as link:\n"
-        "    left = subprocess.Popen([*link.vehicle_command, 'sleep', '1000'], stdout=subprocess.DEVNULL)\n"
+        "    left = subprocess.Popen([*link.vehicle_command, 'sleep', '1000'], stdout=-3, stderr=-3)\n"
         "    print(link.vehicle_command[-1], left.pid, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
