@@ -81,7 +81,7 @@ class Bucket(Generic[T]):
             self._tokens -= size
             self._backlog -= size
             self._passed += size
-            self._packets += 1
+            self._packets += size > 0  # the end of a connection waits its turn, too
             self._left.append((when, item))
 
     def _fill(self, now: float) -> None:

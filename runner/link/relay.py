@@ -293,8 +293,11 @@ def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
 
 
 def listen(loop: Loop, host: str, accept: Callable[[socket.socket, Address], None]) -> int:
-    """Take connections on a port of the system's choice, which is returned."""
-    server = socket.create_server((host, 0))
+    """Take connections on a port of the system's choice, which is returned; ends the relay where it cannot."""
+    try:
+        server = socket.create_server((host, 0))
+    except OSError as error:
+        sys.exit(f"cannot listen on {host}: {error.strerror}; with link=relay both sides and the broker are here")
     loop.readers[server] = lambda: accept(*server.accept())
     port: int = server.getsockname()[1]
     return port

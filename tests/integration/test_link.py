@@ -314,6 +314,12 @@ def test_a_delay_needs_netem():
     assert _names() <= before
 
 
+def test_a_relay_stays_on_this_machine():
+    said = "relay: cannot listen on 192.0.2.77: .*with link=relay both sides and the broker are here"
+    with pytest.raises(RunError, match=said):
+        limited_link("relay", WIDE, Endpoint("192.0.2.77", 8554), *_ends()[:1], print).__enter__()
+
+
 def test_an_unknown_kind_is_refused():
     with pytest.raises(RunError, match="link=rely: unknown kind, did you mean relay"):
         limited_link("rely", WIDE, *_ends(), print).__enter__()
