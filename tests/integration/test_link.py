@@ -211,11 +211,31 @@ def _sent_again(client):
 
 
 @needs_root
+def test_what_waits_does_not_hold_up_who_sent_it():
+    """A socket's buffer holds some 90 packets; the queue is behind it."""
+    code = (
+        "import socket, sys\n"
+        "out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
+        "out.setblocking(False)\n"
+        "print(sum(out.sendto(bytes(1200), (sys.argv[1], 9)) for _ in range(300)))\n"
+    )
+    slow = Limit(lambda t: 1000, queue_ms=8000, delay_ms=0)
+    with limited_link("netns", slow, *_ends(), print) as link:
+        command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
+        said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        waits = link._shaper.limit(1000)
+    assert said.stdout.strip() == str(300 * 1200)
+    assert waits.dropped == 0
+    assert waits.queue_ms > 1000
+
+
+@needs_root
 def test_nothing_of_a_namespace_stays_behind():
     before = _names()
     with limited_link("netns", WIDE, *_ends(), print) as one, limited_link("netns", WIDE, *_ends(), print) as two:
         names = [link.vehicle_command[-1] for link in (one, two)]
         assert len({*names, one.broker.host, two.broker.host}) == 4  # they do not collide
+        names += [f"{name}-router" for name in names]
         assert set(names) <= _names()
         stays = subprocess.Popen([*two.vehicle_command, "sleep", "1000"])
     assert stays.wait(timeout=15) < 0
