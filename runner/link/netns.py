@@ -32,6 +32,7 @@ from runner.model import Endpoint
 
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
 LINK, IN, OUT = "link0", "in0", "out0"  # devices of vehicle and router
+RUN = Path("/run/netns")  # where ip keeps them by name
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
 DELAYED_PACKETS = 100_000  # netem drops what is more; the queue that may drop is tbf's
 OTHERWISE = "or choose link=relay"
@@ -137,13 +138,26 @@ def _join(one: _End, other: _End) -> None:
 
 def _remove(ip: str, name: str) -> None:
     """Remove a link and whatever still runs in it; what is not there need not be removed."""
-    namespaces = (name, _router(name))
-    for pid in (pid for namespace in namespaces for pid in _said(ip, "netns", "pids", namespace).split()):
-        with suppress(ProcessLookupError):
-            os.kill(int(pid), signal.SIGKILL)
     _said(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
-    for namespace in namespaces:
-        _said(ip, "netns", "delete", namespace)
+    for namespace in (name, _router(name)):
+        try:
+            identity = (RUN / namespace).stat().st_ino
+        except FileNotFoundError:
+            continue
+        _said(ip, "netns", "delete", namespace)  # first: from now on nobody enters
+        for pid in _inside(identity):
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def _inside(identity: int) -> Iterator[int]:
+    """Processes in a network namespace, known by its inode; none where that is this process's own."""
+    if identity == Path("/proc/self/ns/net").stat().st_ino:
+        return
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended meanwhile
+            if (process / "ns" / "net").stat().st_ino == identity:
+                yield int(process.name)
 
 
 def _router(name: str) -> str:

@@ -238,6 +238,7 @@ def test_nothing_of_a_namespace_stays_behind():
         names += [f"{name}-router" for name in names]
         assert set(names) <= _names()
         stays = subprocess.Popen([*two.vehicle_command, "sleep", "1000"])
+        until(lambda: str(stays.pid) in subprocess.check_output(["ip", "netns", "pids", names[1]], text=True).split())
     assert stays.wait(timeout=15) < 0
     assert not set(names) & _names()
     with pytest.raises(ZeroDivisionError), limited_link("netns", WIDE, *_ends(), print):
