@@ -29,6 +29,7 @@ __all__ = ["KINDS", "Limit", "LimitedLink", "limited_link"]
 KINDS = {"netns": namespaced, "relay": relayed}
 LOG_S = 0.1  # between two lines of the log
 LOOK_S = 0.02  # how late a change of the rate may be
+STOP_S = 2.0
 
 Write = Callable[[Mapping[str, Any]], None]
 
@@ -70,7 +71,7 @@ class LimitedLink:
         """Write the last line of the log; the rate stays."""
         self._stopped.set()
         if self._thread:
-            self._thread.join()
+            self._thread.join(STOP_S)  # who waits for an answer that never comes ends with who should give it
 
     def _run(self, zero: float) -> None:
         try:

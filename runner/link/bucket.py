@@ -21,6 +21,7 @@ class Bucket(Generic[T]):
     def __init__(self, kbps: float, queue_ms: float, now: float) -> None:
         self._queue_ms = queue_ms
         self._items: deque[tuple[int, T]] = deque()
+        self._left: deque[tuple[float, T]] = deque()  # and when
         self._backlog = 0  # bytes
         self._at = now  # when `_tokens` was right
         self._passed = self._packets = self._dropped = 0
@@ -32,7 +33,8 @@ class Bucket(Generic[T]):
         self._burst, self._limit = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
 
     def set_rate(self, kbps: float, now: float) -> None:
-        """From now on; take what is due before. What waits stays, even if it now waits longer than queue_ms."""
+        """From now on. What waits stays, even if it now waits longer than queue_ms."""
+        self._advance(now)
         self._fill(now)
         self._set(kbps)
 
@@ -41,6 +43,7 @@ class Bucket(Generic[T]):
 
     def put(self, size: int, item: T, now: float, *, keep: bool = False) -> None:
         """A packet comes; it is dropped where the queue has no room, unless it is to be kept."""
+        self._advance(now)
         if not (keep or self.has_room(size)):
             self._dropped += 1
             return
@@ -50,26 +53,36 @@ class Bucket(Generic[T]):
         self._backlog += size
 
     def due(self) -> float | None:
-        """When the next packet leaves; None: nothing waits."""
+        """When the next packet leaves, or has left; None: nothing waits."""
+        return self._left[0][0] if self._left else self._next()
+
+    def take(self, now: float) -> Iterator[tuple[float, T]]:
+        """Packets that have left by now, each with the time when it did."""
+        self._advance(now)
+        while self._left:
+            yield self._left.popleft()
+
+    def counters(self, now: float) -> Counters:
+        self._advance(now)
+        tokens = self._tokens + max(0.0, now - self._at) * self._rate
+        wait_ms = 1000 * max(0.0, self._backlog - tokens) / self._rate
+        return Counters(wait_ms, self._passed, self._packets, self._dropped)
+
+    def _next(self) -> float | None:
         if not self._items:
             return None
         return self._at + max(0.0, self._items[0][0] - self._tokens) / self._rate
 
-    def take(self, now: float) -> Iterator[tuple[float, T]]:
-        """Packets that have left by now, each with the time when it did."""
-        while (when := self.due()) is not None and when <= now:
+    def _advance(self, now: float) -> None:
+        """Let go of what leaves by now."""
+        while (when := self._next()) is not None and when <= now:
             self._fill(when)
             size, item = self._items.popleft()
             self._tokens -= size
             self._backlog -= size
             self._passed += size
-            self._packets += 1
-            yield when, item
-
-    def counters(self, now: float) -> Counters:
-        tokens = self._tokens + max(0.0, now - self._at) * self._rate
-        wait_ms = 1000 * max(0.0, self._backlog - tokens) / self._rate
-        return Counters(wait_ms, self._passed, self._packets, self._dropped)
+            self._packets += size > 0  # the end of a connection waits its turn, too
+            self._left.append((when, item))
 
     def _fill(self, now: float) -> None:
         # A packet longer than the bucket gets the tokens that it needs, too.

@@ -57,6 +57,8 @@ class Child:
                 return json.loads(line)
             complaints.append(line.strip())
         else:
+            # Of a traceback the last line says it all.
+            complaints = complaints[-1:] if complaints[:1] == ["Traceback (most recent call last):"] else complaints
             complaints.append(f"it ended with status {self._process.wait()}")
         raise RunError(f"{self._name}: {'; '.join(complaints)}")
 

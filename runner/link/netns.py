@@ -1,8 +1,13 @@
-"""A link in the kernel: the vehicle in a network namespace of its own, its end of a veth pair limited by tbf.
+"""A link in the kernel: the vehicle in a network namespace of its own, behind a router whose way out is limited by tbf.
+
+    vehicle's namespace link0 ---- in0 router's namespace out0 (tbf) ---- tod-N this machine's namespace
 
 The operator, its page and the broker stay in this machine's namespace. Everything that the vehicle sends shares the
 limit: RTP, retransmissions, RTCP, RTSP, MQTT; the other way is free. tbf counts Ethernet frames, which is the IP packet
 and 14 bytes. Each change of the rate fills tbf's bucket again: up to two frames more pass than the rate allows.
+
+Without the router a packet that waits would count against the buffer of the socket that sent it: once that is full
+(some 90 packets) the camera's pipeline would stand still, where behind a modem packets are lost.
 """
 
 from __future__ import annotations
@@ -25,8 +30,9 @@ from runner.link.ends import Ends, overrides
 from runner.link.limit import Counters, Limit, burst_bytes, queue_bytes
 from runner.model import Endpoint
 
-NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into pairs of addresses, one per link
-DEVICE = "link0"  # the vehicle's end, in its namespace
+NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
+LINK, IN, OUT = "link0", "in0", "out0"  # devices of vehicle and router
+RUN = Path("/run/netns")  # where ip keeps them by name
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
 DELAYED_PACKETS = 100_000  # netem drops what is more; the queue that may drop is tbf's
 OTHERWISE = "or choose link=relay"
@@ -41,13 +47,14 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
     """
     ip, tc = _find("ip"), _find("tc")
     _check_allowed()
-    with _claimed(ip) as (name, operator, vehicle):
+    with _claimed(ip) as (name, network):
         try:
-            _connect(ip, name, operator, vehicle)
-            shaper = _Tbf(tc, name, limit)
+            machine, vehicle = _connect(ip, name, network)
+            shaper = _Tbf(tc, _router(name), limit)
             try:
-                both = overrides(Endpoint(vehicle, media.port), Endpoint(operator, control.port))
-                yield Ends((ip, "netns", "exec", name), both, both, Endpoint(operator, control.port), shaper)
+                broker = Endpoint(machine, control.port)
+                both = overrides(Endpoint(vehicle, media.port), broker)
+                yield Ends((ip, "netns", "exec", name), both, both, broker, shaper)
             finally:
                 shaper.end()
         finally:
@@ -55,7 +62,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
 
 
 class _Tbf:
-    """tbf on the vehicle's end, behind netem where there is a delay. One tc runs all the time."""
+    """tbf on the router's way out, behind netem where there is a delay. One tc runs all the time."""
 
     def __init__(self, tc: str, name: str, limit: Limit) -> None:
         self._queue_ms, self._kbps = limit.queue_ms, 0.0
@@ -76,11 +83,11 @@ class _Tbf:
         self._tc.end()
 
     def _set(self, verb: str, kbps: float) -> Counters:
-        lines = [f"qdisc show dev {DEVICE}"]
+        lines = [f"qdisc show dev {OUT}"]
         if kbps != self._kbps:
             size, most = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
             tbf = f"tbf rate {round(1000 * kbps)}bit burst {size} limit {most}"
-            lines.insert(0, f"qdisc {verb} dev {DEVICE} {self._parent} handle 2: {tbf}")
+            lines.insert(0, f"qdisc {verb} dev {OUT} {self._parent} handle 2: {tbf}")
             self._kbps = kbps
         said = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
         return Counters(8 * said["backlog"] / kbps, said["bytes"], said["packets"], said["drops"])
@@ -89,46 +96,83 @@ class _Tbf:
 def _delay(tc: str, name: str, delay_ms: float) -> None:
     netem = ("root", "handle", "1:", "netem", "delay", f"{delay_ms}ms", "limit", str(DELAYED_PACKETS))
     try:
-        _run(tc, "-netns", name, "qdisc", "add", "dev", DEVICE, *netem)
+        _run(tc, "-netns", name, "qdisc", "add", "dev", OUT, *netem)
     except RunError:
         rule = "which the kernel of this machine has not (module sch_netem): set it to 0"
         raise RunError(f"link=netns with delay_ms={delay_ms:g} needs netem, {rule}, {OTHERWISE}") from None
 
 
-def _connect(ip: str, name: str, operator: str, vehicle: str) -> None:
-    """Make the namespace and the pair; afterwards both ends reach each other."""
-    inside = (ip, "-netns", name)
-    _run(ip, "netns", "add", name)
-    _run(ip, "link", "add", name, "type", "veth", "peer", "name", DEVICE, "netns", name)
-    _run(*inside, "link", "set", "dev", "lo", "up")
-    for command, device, address in (((ip,), name, operator), (inside, DEVICE, vehicle)):
+def _connect(ip: str, name: str, network: ipaddress.IPv4Network) -> tuple[str, str]:
+    """Make both namespaces and what joins them; the addresses of this machine's end and of the vehicle's."""
+    near, far = network.subnets(prefixlen_diff=1)
+    (machine, out), (into, vehicle) = (map(str, pair.hosts()) for pair in (near, far))
+    router = _router(name)
+    at_machine, at_router, at_vehicle = (ip,), (ip, "-netns", router), (ip, "-netns", name)
+    for namespace in (name, router):
+        _run(ip, "netns", "add", namespace)
+        _run(ip, "-netns", namespace, "link", "set", "dev", "lo", "up")
+    _run(*at_machine, "link", "add", name, "type", "veth", "peer", "name", OUT, "netns", router)
+    _run(*at_router, "link", "add", IN, "type", "veth", "peer", "name", LINK, "netns", name)
+    _join((at_machine, name, machine), (at_router, OUT, out))
+    _join((at_router, IN, into), (at_vehicle, LINK, vehicle))
+    _run(ip, "netns", "exec", router, "sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
+    _run(*at_machine, "route", "add", str(far), "via", out)
+    _run(*at_vehicle, "route", "add", str(near), "via", into)
+    return machine, vehicle
+
+
+_End = tuple[tuple[str, ...], str, str]  # ip in the right namespace, device, address
+
+
+def _join(one: _End, other: _End) -> None:
+    """Let two ends of a pair reach each other."""
+    for command, device, address in (one, other):
         with suppress(RunError):  # a kernel without IPv6 has no such setting, and nothing to say unasked
             _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
         _run(*command, "link", "set", "dev", device, "address", _mac(address), "up")
         _run(*command, "addr", "add", f"{address}/30", "dev", device)
     # Nobody has to ask for addresses: an answer that is dropped would stop everything for a second.
-    for command, device, other in (((ip,), name, vehicle), (inside, DEVICE, operator)):
-        _run(*command, "neigh", "replace", other, "lladdr", _mac(other), "dev", device, "nud", "permanent")
+    for (command, device, _), (_, _, peer) in ((one, other), (other, one)):
+        _run(*command, "neigh", "replace", peer, "lladdr", _mac(peer), "dev", device, "nud", "permanent")
 
 
 def _remove(ip: str, name: str) -> None:
     """Remove a link and whatever still runs in it; what is not there need not be removed."""
-    for pid in _said(ip, "netns", "pids", name).split():
-        with suppress(ProcessLookupError):
-            os.kill(int(pid), signal.SIGKILL)
     _said(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
-    _said(ip, "netns", "delete", name)
+    for namespace in (name, _router(name)):
+        try:
+            identity = (RUN / namespace).stat().st_ino
+        except FileNotFoundError:
+            continue
+        _said(ip, "netns", "delete", namespace)  # first: from now on nobody enters
+        for pid in _inside(identity):
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def _inside(identity: int) -> Iterator[int]:
+    """Processes in a network namespace, known by its inode; none where that is this process's own."""
+    if identity == Path("/proc/self/ns/net").stat().st_ino:
+        return
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended meanwhile
+            if (process / "ns" / "net").stat().st_ino == identity:
+                yield int(process.name)
+
+
+def _router(name: str) -> str:
+    """The router's namespace."""
+    return f"{name}-router"
 
 
 @contextmanager
-def _claimed(ip: str) -> Iterator[tuple[str, str, str]]:
-    """A name and two addresses that nobody else uses: operator's end, vehicle's end.
+def _claimed(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
+    """A name and addresses that nobody else uses.
 
     The claim is a bound abstract socket: the kernel lets go of it with the process, so whatever still bears a claimed
     name was left behind by a run that was killed, and is removed.
     """
-    for number, network in enumerate(NETWORK.subnets(new_prefix=30)):
-        operator, vehicle = map(str, network.hosts())
+    for number, network in enumerate(NETWORK.subnets(new_prefix=29)):
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
             try:
                 claim.bind(f"\0tod-runner/{network}")
@@ -137,16 +181,17 @@ def _claimed(ip: str) -> Iterator[tuple[str, str, str]]:
                     raise
                 continue
             _remove(ip, f"tod-{number}")
-            if not {operator, vehicle} & _addresses(ip):
-                yield f"tod-{number}", operator, vehicle
+            if not any(address in network for address in _addresses(ip)):
+                yield f"tod-{number}", network
                 return
     raise RunError(f"link=netns: every address of {NETWORK} is in use; end other runs, {OTHERWISE}")
 
 
-def _addresses(ip: str) -> set[str]:
+def _addresses(ip: str) -> list[ipaddress.IPv4Address]:
     """IPv4 addresses of this machine."""
     devices = json.loads(_run(ip, "-json", "-4", "addr", "show"))
-    return {address["local"] for device in devices for address in device.get("addr_info", ())}
+    addresses = (address["local"] for device in devices for address in device.get("addr_info", ()))
+    return [ipaddress.IPv4Address(address) for address in addresses]
 
 
 def _mac(address: str) -> str:

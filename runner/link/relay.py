@@ -209,7 +209,6 @@ class Ports:
             sock.close()
 
     def _read(self, index: int, sock: socket.socket) -> None:
-        now = time.monotonic()
         host, first = self._operator
         operator = (host, first + index)
         for _ in range(AT_ONCE):
@@ -221,7 +220,7 @@ class Ports:
                 continue  # too early for anybody
             if source[1] - self.server_port in (0, 1):
                 deliver = _sender(sock, data, operator)
-                self._loop.bucket.put(len(data) + UDP_HEADERS, deliver, now)
+                self._loop.bucket.put(len(data) + UDP_HEADERS, deliver, time.monotonic())
             else:
                 _sender(sock, data, (self._server, self.server_port + index))()
 
@@ -294,8 +293,11 @@ def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
 
 
 def listen(loop: Loop, host: str, accept: Callable[[socket.socket, Address], None]) -> int:
-    """Take connections on a port of the system's choice, which is returned."""
-    server = socket.create_server((host, 0))
+    """Take connections on a port of the system's choice, which is returned; ends the relay where it cannot."""
+    try:
+        server = socket.create_server((host, 0))
+    except OSError as error:
+        sys.exit(f"cannot listen on {host}: {error.strerror}; with link=relay both sides and the broker are here")
     loop.readers[server] = lambda: accept(*server.accept())
     port: int = server.getsockname()[1]
     return port

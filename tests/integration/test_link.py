@@ -1,0 +1,346 @@
+"""Limited links between real sides: what comes through, what does not, and that nothing stays behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rig import CHECKOUT, free_port, process, streaming, until, watching
+from runner.broker import private_broker
+from runner.commands import Command
+from runner.config import load
+from runner.errors import RunError
+from runner.link import Limit, limited_link
+from runner.link.netns import _check_allowed
+from runner.model import Endpoint
+from runner.sources import compile_plans
+
+NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
+RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
+ROBOT = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "fps_max=15", "page.serve=false", "pqos=constant")
+SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs what it is allowed
+SETTLE_S, MEASURE_S = 2.0, 4.0
+
+
+def _may_not() -> str:
+    try:
+        _check_allowed()
+    except RunError as error:
+        return str(error)
+    return "" if shutil.which("ip") else "iproute2 is not installed"
+
+
+needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
+KINDS = [pytest.param("netns", marks=needs_root), "relay"]
+WIDE = Limit(lambda t: 5000, queue_ms=200, delay_ms=0)
+
+
+class Drive:
+    """Both sides with a link between them; `lines` is its log."""
+
+    def __init__(self, link, lines, side, vehicle):
+        self.link, self.lines, self.side, self.vehicle = link, lines, side, vehicle
+
+    def received(self):
+        return self.side.sample({})["rear"]
+
+    def measure(self, seconds=MEASURE_S):
+        """First and last line of the log, and frames that came, of a stretch of the drive."""
+        begun, first = self.received().frames, len(self.lines) - 1
+        until(lambda: self.lines[-1]["t"] >= self.lines[first]["t"] + seconds)
+        return self.lines[first], self.lines[-1], self.received().frames - begun
+
+    def kbps(self, seconds=MEASURE_S):
+        """What the link passed on."""
+        first, last, _ = self.measure(seconds)
+        return rate(first, last)
+
+    def settle(self):
+        """Until the queue is as the rate makes it."""
+        self.measure(SETTLE_S)
+
+
+def rate(first, last):
+    """kbit/s that the link passed on between two lines of its log."""
+    return 8 * (last["bytes"] - first["bytes"]) / 1000 / (last["t"] - first["t"])
+
+
+@contextmanager
+def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
+    """One camera that sends as much as it is let, through a link, to a receiver."""
+    from runner.apply import OperatorSide
+
+    lines = []
+    limit = Limit(kbps_at, queue_ms, delay_ms)
+    media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
+    words = (*ROBOT, *SOURCE, f"pqos.kbps={sent_kbps}")
+    with (
+        limited_link(kind, limit, media, control, lines.append) as link,
+        private_broker(link.broker),
+        process("vehicle", *words, *link.vehicle_overrides, before=link.vehicle_command) as vehicle,
+    ):
+        plans = compile_plans(load([*words, *link.operator_overrides]))
+        side = OperatorSide([_over_tcp(plan) if tcp else plan for plan in plans], lambda *_: None)
+        try:
+            drive = Drive(link, lines, side, vehicle)
+            until(lambda: drive.received().decoded > 5, seconds=30)
+            link.start(time.time())
+            until(lambda: lines)
+            yield drive
+            link.check()
+        finally:
+            side.stop()
+
+
+def _over_tcp(plan):
+    client, *rest = plan.operator
+    return replace(plan, operator=(replace(client, properties={**client.properties, "protocols": "tcp"}), *rest))
+
+
+def _ends():
+    return [Endpoint("127.0.0.1", free_port()) for _ in range(2)]
+
+
+def _names():
+    """Of every namespace and network device."""
+    said = [subprocess.check_output(["ip", *words], text=True) for words in (("netns",), ("-br", "link"))]
+    return {line.split()[0].partition("@")[0] for lines in said for line in lines.splitlines()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wide_link_passes_everything(kind):
+    with driving(kind, lambda t: 5000, sent_kbps=1000) as drive:
+        drive.settle()
+        first, last, frames = drive.measure()
+        lost = drive.received().lost
+    assert frames > 2 * MEASURE_S  # of 15 a second
+    assert last["packets"] > first["packets"]
+    assert (last["dropped"], lost) == (0, 0)
+    assert {line["kbps"] for line in drive.lines} == {5000}
+    assert [line["t"] for line in drive.lines] == sorted(line["t"] for line in drive.lines)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
+    def kbps_at(t):
+        return 5000 if t < 1 else 1000 if t < 8 else 1500
+
+    with driving(kind, kbps_at, sent_kbps=2000) as drive:
+        until(lambda: drive.lines[-1]["t"] > 1)
+        drive.settle()
+        first, last, _ = drive.measure()
+        until(lambda: drive.lines[-1]["t"] > 8)
+        drive.settle()
+        later = drive.kbps()
+        lost = drive.received().lost
+    assert rate(first, last) == pytest.approx(1000, rel=0.1)
+    assert later == pytest.approx(1500, rel=0.1)
+    assert last["dropped"] > first["dropped"]
+    assert lost > 0
+    waits = [line["queue_ms"] for line in drive.lines if first["t"] <= line["t"] <= last["t"]]
+    assert 150 < max(waits) <= 200
+    for line in drive.lines:
+        if min(abs(line["t"] - step) for step in (1, 8)) > 0.01:
+            assert line["kbps"] == kbps_at(line["t"])
+
+
+def test_rtsp_over_tcp_waits_where_udp_is_dropped():
+    with driving("relay", lambda t: 5000 if t < 1 else 1000, sent_kbps=2000, tcp=True) as drive:
+        until(lambda: drive.lines[-1]["t"] > 1)
+        drive.settle()
+        first, last, frames = drive.measure()
+        received = drive.received()
+    assert rate(first, last) == pytest.approx(1000, rel=0.1)
+    assert (last["dropped"], received.lost) == (0, 0)
+    assert frames > MEASURE_S
+
+
+def test_a_delay_is_added_to_the_wait():
+    with driving("relay", lambda t: 5000, sent_kbps=1000, delay_ms=300) as drive:
+        drive.settle()
+        assert until(lambda: drive.received().latency_ms) >= 300
+        assert drive.lines[-1]["dropped"] == 0
+
+
+def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
+    from runner.gst.server import CameraServer, GstRtsp
+
+    factory = CameraServer._factory
+
+    def with_feedback_only(self, plan):
+        # Offered both, rtspsrc takes AVP, which has no retransmission.
+        made = factory(self, plan)
+        made.set_profiles(GstRtsp.RTSPProfile.AVPF)
+        return made
+
+    monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
+    # A queue that takes most of a frame and not all of it: the rest comes as soon as it is asked for.
+    limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
+    overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15")
+    with (
+        streaming(*overrides, cameras=("rear",)) as (side, vehicle, plans, _),
+        limited_link("relay", limit, vehicle.media, _ends()[0], print) as link,
+    ):
+        side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
+        with watching(_at(plans[0], link.operator_overrides)) as client:
+            until(lambda: _sent_again(client) > 5 and len(client.sizes) > 5, seconds=30)
+
+
+def _at(plan, overrides):
+    """The plan for an operator who finds the server elsewhere."""
+    port = dict(word.split("=") for word in overrides)["media.port"]
+    client, *rest = plan.operator
+    properties = {**client.properties, "location": f"rtsp://127.0.0.1:{port}/{plan.camera.name}", "latency": 100}
+    return replace(plan, operator=(replace(client, properties=properties), *rest))
+
+
+def _sent_again(client):
+    """Lost packets that came after all."""
+    iterator, found = client.pipeline.iterate_recurse(), []
+    iterator.foreach(lambda element: found.append(element) if element.get_factory() else None)
+    buffers = [element for element in found if element.get_factory().get_name() == "rtpjitterbuffer"]
+    return sum(buffer.get_property("stats").get_value("rtx-success-count") for buffer in buffers)
+
+
+@needs_root
+def test_what_waits_does_not_hold_up_who_sent_it():
+    """A socket's buffer holds some 90 packets; the queue is behind it."""
+    code = (
+        "import socket, sys\n"
+        "out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
+        "out.setblocking(False)\n"
+        "print(sum(out.sendto(bytes(1200), (sys.argv[1], 9)) for _ in range(300)))\n"
+    )
+    slow = Limit(lambda t: 1000, queue_ms=8000, delay_ms=0)
+    with limited_link("netns", slow, *_ends(), print) as link:
+        command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
+        said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        waits = link._shaper.limit(1000)
+    assert said.stdout.strip() == str(300 * 1200)
+    assert waits.dropped == 0
+    assert waits.queue_ms > 1000
+
+
+@needs_root
+def test_nothing_of_a_namespace_stays_behind():
+    before = _names()
+    with limited_link("netns", WIDE, *_ends(), print) as one, limited_link("netns", WIDE, *_ends(), print) as two:
+        names = [link.vehicle_command[-1] for link in (one, two)]
+        assert len({*names, one.broker.host, two.broker.host}) == 4  # they do not collide
+        names += [f"{name}-router" for name in names]
+        assert set(names) <= _names()
+        stays = subprocess.Popen([*two.vehicle_command, "sleep", "1000"])
+        until(lambda: str(stays.pid) in subprocess.check_output(["ip", "netns", "pids", names[1]], text=True).split())
+    assert stays.wait(timeout=15) < 0
+    assert not set(names) & _names()
+    with pytest.raises(ZeroDivisionError), limited_link("netns", WIDE, *_ends(), print):
+        1 / 0  # noqa: B018
+    assert _names() <= before | {"lo"}
+
+
+@needs_root
+def test_the_next_run_removes_what_a_killed_one_left():
+    code = (
+        "import os, signal, subprocess; from runner.link import *; from runner.model import Endpoint\n"
+        "limit, end = Limit(lambda t: 100, 200, 0), Endpoint('127.0.0.1', 1)\n"
+        "with limited_link('netns', limit, end, end, print) as link:\n"
+        "    left = subprocess.Popen([*link.vehicle_command, 'sleep', '1000'], stdout=-3, stderr=-3)\n"
+        "    print(link.vehicle_command[-1], left.pid, flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    name, pid = _python(code).stdout.split()
+    assert name in _names()
+    with limited_link("netns", WIDE, *_ends(), print):
+        until(lambda: not _runs(int(pid)))
+    assert name not in _names()
+
+
+def _runs(pid):
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()  # the dead may lack somebody to bury them
+    except OSError:
+        return False
+
+
+def _python(code):
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_link_that_fails_says_so(kind):
+    lines = []
+    with (
+        pytest.raises(RunError, match="it ended with status -9"),
+        limited_link(kind, WIDE, *_ends(), lines.append) as link,
+    ):
+        link.start(time.time())
+        until(lambda: lines)
+        link.check()
+        shaper = link._shaper
+        child = shaper._tc if kind == "netns" else shaper._child
+        child._process.kill()
+        until(lambda: link._failure)
+    assert child._process.poll() is not None
+
+
+def test_the_relay_ends_with_its_link():
+    with pytest.raises(ZeroDivisionError), limited_link("relay", WIDE, *_ends(), print) as link:
+        relay = link._shaper._child._process
+        assert relay.poll() is None
+        1 / 0  # noqa: B018
+    assert relay.poll() == 0
+
+
+def test_without_root_the_relay_is_recommended():
+    code = (
+        "import os; from runner.link import *; from runner.model import Endpoint\n"
+        "os.geteuid() or os.seteuid(65534)\n"
+        "end = Endpoint('127.0.0.1', 1)\n"
+        "try:\n"
+        "    limited_link('netns', Limit(lambda t: 100, 200, 0), end, end, print).__enter__()\n"
+        "except Exception as error:\n"
+        "    print(error)\n"
+    )
+    rule = "run as root (CAP_NET_ADMIN and CAP_SYS_ADMIN), or choose link=relay"
+    assert _python(code).stdout.strip() == f"link=netns may not make a network namespace: {rule}"
+
+
+def test_without_iproute2_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    with pytest.raises(RunError) as raised, limited_link("netns", WIDE, *_ends(), print):
+        pass
+    rule = "on Debian: apt-get install iproute2, or choose link=relay"
+    assert str(raised.value) == f"link=netns needs ip; {rule}"
+
+
+@needs_root
+def test_a_delay_needs_netem():
+    before = _names()
+    try:
+        with limited_link("netns", replace(WIDE, delay_ms=20), *_ends(), print):
+            pytest.skip("this kernel has netem")
+    except RunError as error:
+        rule = "which the kernel of this machine has not (module sch_netem): set it to 0, or choose link=relay"
+        assert str(error) == f"link=netns with delay_ms=20 needs netem, {rule}"
+    assert _names() <= before
+
+
+def test_a_relay_stays_on_this_machine():
+    said = "relay: cannot listen on 192.0.2.77: .*with link=relay both sides and the broker are here"
+    with pytest.raises(RunError, match=said):
+        limited_link("relay", WIDE, Endpoint("192.0.2.77", 8554), *_ends()[:1], print).__enter__()
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(RunError, match="link=rely: unknown kind, did you mean relay"):
+        limited_link("rely", WIDE, *_ends(), print).__enter__()

@@ -1,0 +1,126 @@
+"""The parts of a limited link that need no process: the bucket, and RTSP as the relay reads it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runner.link import Limit
+from runner.link.bucket import Bucket
+from runner.link.limit import burst_bytes, queue_bytes
+from runner.link.rtsp import Units, ports, with_ports
+
+KBPS, QUEUE_MS = 800, 100  # 100 bytes in a ms
+arrivals = st.lists(st.tuples(st.floats(0, 0.05), st.integers(28, 1500)), min_size=1, max_size=60)  # gap s, bytes
+
+
+def passed(packets, looks=()):
+    """What a bucket does with packets (time, size), looked at in between: (time, index) of each, and the bucket."""
+    bucket = Bucket(KBPS, QUEUE_MS, 0.0)
+    left = []
+    for index, (t, size) in enumerate(packets):
+        for look in looks:
+            left += bucket.take(min(look, t)) if look <= t else ()
+        bucket.put(size, index, t)
+    left += bucket.take(1e9)
+    return left, bucket
+
+
+def timed(gaps):
+    t, packets = 0.0, []
+    for gap, size in gaps:
+        t += gap
+        packets.append((t, size))
+    return packets
+
+
+@given(arrivals)
+def test_no_stretch_of_time_sees_more_than_the_rate_and_one_bucket(gaps):
+    packets = timed(gaps)
+    left, _ = passed(packets)
+    for first, (begin, _) in enumerate(left):
+        size = 0
+        for end, index in left[first:]:
+            size += packets[index][1]
+            assert size <= burst_bytes(KBPS) + (end - begin) * KBPS * 1000 / 8 + 1e-3
+
+
+@given(arrivals)
+def test_packets_pass_in_order_and_none_waits_longer_than_the_queue(gaps):
+    packets = timed(gaps)
+    left, bucket = passed(packets)
+    assert [index for _, index in left] == sorted(index for _, index in left)
+    assert all(-1e-9 <= when - packets[index][0] <= QUEUE_MS / 1000 + 1e-9 for when, index in left)
+    counters = bucket.counters(1e9)
+    assert counters.packets + counters.dropped == len(packets)
+    assert counters.bytes == sum(packets[index][1] for _, index in left)
+
+
+@given(arrivals, st.lists(st.floats(0, 2), max_size=20))
+def test_who_looks_late_finds_the_same(gaps, looks):
+    assert passed(timed(gaps), sorted(looks))[0] == passed(timed(gaps))[0]
+
+
+def test_a_full_queue_drops_and_says_how_long_it_is():
+    bucket = Bucket(KBPS, QUEUE_MS, 0.0)
+    for index in range(20):
+        bucket.put(1000, index, 0.0)
+    counters = bucket.counters(0.0)
+    assert (counters.packets, counters.dropped) == (3, 7)  # 3028 bytes at once, 10 000 wait
+    assert counters.queue_ms == pytest.approx(99.72)  # 28 bytes of the bucket are left
+    bucket.put(1000, 20, 0.0, keep=True)
+    assert bucket.counters(0.0).dropped == 7
+
+
+def test_a_new_rate_holds_for_what_waits():
+    bucket = Bucket(KBPS, QUEUE_MS, 0.0)
+    for index in range(5):
+        bucket.put(1000, index, 0.0)
+    assert [when for when, _ in bucket.take(0.001)] == [0, 0, 0]
+    bucket.set_rate(KBPS / 10, 0.001)
+    assert bucket.due() == pytest.approx(0.001 + (1000 - 28 - 100) / 10_000)
+    bucket.set_rate(KBPS, 0.002)
+    assert bucket.due() == pytest.approx(0.002 + (1000 - 28 - 110) / 100_000)
+
+
+def test_a_slow_link_has_room_for_a_packet_and_never_stands_still():
+    limit = Limit(lambda t: 0.0, queue_ms=10, delay_ms=0)
+    assert limit.kbps(5) == 1
+    assert queue_bytes(1, 10) == burst_bytes(1) == 3028
+    assert (burst_bytes(40_000), queue_bytes(8000, 200)) == (10_000, 200_000)
+
+
+SETUP = (
+    b"SETUP rtsp://h/c/stream=0 RTSP/1.0\r\nCSeq: 4\r\n"
+    b"Transport: RTP/AVPF;unicast;client_port=50002-50003,RTP/AVP;unicast;client_port=50002-50003\r\n\r\n"
+)
+REPLY = (
+    b"RTSP/1.0 200 OK\r\n"
+    b"transport: RTP/AVPF;unicast;client_port=6-7;server_port=8-9;mode=PLAY\r\nX: client_port=6\r\n\r\n"
+)
+SDP = b"RTSP/1.0 200 OK\r\nContent-length: 28\r\n\r\nTransport: client_port=1-2\r\n"
+PACKET = b"$\x00\x00\x06\r\n\r\nab"
+
+
+@given(st.lists(st.sampled_from([SETUP, REPLY, SDP, PACKET]), max_size=6), st.integers(1, 90))
+def test_rtsp_is_cut_into_the_same_units_however_it_comes(sent, chunk):
+    data, units = b"".join(sent), Units()
+    pieces = (data[start : start + chunk] for start in range(0, len(data), chunk))
+    assert [unit for piece in pieces for unit in units.feed(piece)] == sent
+
+
+def test_what_never_ends_is_not_rtsp():
+    with pytest.raises(ValueError, match="no end of an RTSP header"):
+        list(Units().feed(b"x" * 70_000))
+
+
+def test_ports_are_read_and_replaced_in_the_transport_header_alone():
+    assert ports(SETUP, "client_port") == [50002, 50002]
+    assert ports(SETUP, "server_port") == []
+    assert with_ports(SETUP, "client_port", lambda port: port + 100) == SETUP.replace(b"50002-50003", b"50102-50103")
+    changed = with_ports(with_ports(REPLY, "client_port", lambda _: 60), "server_port", lambda _: 80)
+    assert changed == REPLY.replace(b"client_port=6-7;server_port=8-9", b"client_port=60-61;server_port=80-81")
+    for other in (SDP, PACKET):
+        assert ports(other, "client_port") == []
+        assert with_ports(other, "client_port", lambda _: 1) == other
