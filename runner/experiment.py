@@ -70,11 +70,12 @@ def _known(source: Pqos, track: Track | None) -> Callable[[float], Kbps]:
     rates: list[Kbps] = []
 
     def kbps_at(t: float) -> Kbps:
-        while len(rates) * STEP_S <= t:
+        step = int(t / STEP_S + 1e-6)
+        while len(rates) <= step:
             now = len(rates) * STEP_S
             event: Event = ClockAdvanced(t=now) if track is None else track.at(now)
             prediction = source.observe(event)
             rates.append(prediction.kbps if prediction else rates[-1] if rates else exact(0))
-        return rates[int(t / STEP_S)]
+        return rates[step]
 
     return kbps_at

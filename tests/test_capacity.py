@@ -1,0 +1,94 @@
+"""Bandwidth maps from drives: only where the link was the limit, a percentile per square, exact messages."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drives import Lines, write_drive
+from helpers import Command
+
+from runner.drive.capacity import Sample, cells, limited_samples
+from runner.drive.read import read_drive
+from runner.drive.series import series
+
+
+def test_a_square_holds_the_percentile_of_its_samples() -> None:
+    here = [Sample(52.0, 11.0, kbps) for kbps in range(1000, 1100)]
+    there = [Sample(52.0, 11.001, 5000.0)]  # 68 m further east
+    first, second = cells([*here, *there], 10, 10)
+    assert (first.kbps, first.samples) == (1009, 100)
+    assert (second.kbps, second.samples) == (5000, 1)
+    assert (second.lat, second.lon) == pytest.approx((52.0, 11.001))
+    assert [cell.samples for cell in cells([*here, *there], 10, 200)] == [101]
+    assert cells([*here], 0, 10)[0].kbps == 1000 and cells([*here], 100, 10)[0].kbps == 1099
+
+
+def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() -> None:
+    for lat in (0.0, 60.0, -75.0):
+        east = np.degrees(100 / 6378137.0) / np.cos(np.radians(lat))
+        row = [Sample(lat, float(np.remainder(179.9995 + 180 + n * east / 10, 360) - 180), 1.0) for n in range(31)]
+        assert 3 <= len(cells(row, 50, 100)) <= 4
+
+
+def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None:
+    """Frames that wait from 4 to 6 s, packets that are lost from 8 s to 9 s; else there was room."""
+
+    def change(side: str, lines: Lines) -> Lines:
+        for line in lines:
+            for camera in line["cameras"].values() if line.get("log") == "sample" else ():
+                camera["arrivals"] = [[t, 100.0 if 4 <= t < 6 else 10.0] for t, _ in camera["arrivals"]]
+                camera["lost"] = round(np.interp(line["t"], [8, 9], [0, 20]))
+        return lines
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=14, change=change)))
+    samples = limited_samples(drive)
+    at = [drive.positions.t[np.argmin(np.abs(drive.positions.lon - s.lon))] for s in samples]  # type: ignore[union-attr]
+    operator = (
+        np.array(at) - 1.5 + 0.5
+    )  # from the middle of the window, on the vehicle's clock, to the operator's end of it
+    assert len(samples) > 10
+    assert all(4.4 <= t <= 6.8 or 7.9 <= t <= 10.1 for t in operator)
+    assert any(t < 6 for t in operator) and any(t > 8.5 for t in operator)
+    assert all(0 < sample.kbps < 9000 for sample in samples)
+
+
+def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> None:
+    drives = [
+        str(write_drive(tmp_path / name, seconds=100, seed=seed, congested=3.0)) for name, seed in (("a", 1), ("b", 2))
+    ]
+    output = tmp_path / "map.csv"
+    result = tod("map", *drives, f"output={output}", "percentile=20", "cell_m=20")
+    assert result.status == 0, result.err
+    rows: list[dict[str, Any]] = list(csv.DictReader(output.open()))
+    counted = sum(int(row["samples"]) for row in rows)
+    assert result.out.startswith(f"{output}: {len(rows)} squares of 20 m from {counted} of ")
+    replayed = tod("replay", "pqos=map", f"pqos.file={output}", f"input={drives[0]}")
+    assert replayed.status == 0, replayed.err
+    assert '"source": "pqos"' in replayed.out
+
+
+def test_what_cannot_give_a_map_is_told(tod: Command, tmp_path: Path) -> None:
+    def roomy(side: str, lines: Lines) -> Lines:
+        for line in lines:
+            for camera in line["cameras"].values() if line.get("log") == "sample" else ():
+                camera |= {"arrivals": [[t, 10.0] for t, _ in camera["arrivals"]], "lost": 0}
+        return lines
+
+    good = write_drive(tmp_path / "good", seconds=5, change=roomy)
+    output = f"output={tmp_path / 'map.csv'}"
+    for words, status, told in (
+        ((output,), 2, "command line: must name a drive: a directory that log= wrote"),
+        ((str(good),), 2, "command line: output: must be given, the map's file"),
+        ((str(good), output, "percentile=101"), 2, "command line: percentile: 101: must be at most 100"),
+        ((str(good), output, "cell_m=0"), 2, "command line: cell_m: 0: must be at least 1"),
+        ((str(tmp_path / "no"), output), 2, f"{tmp_path / 'no'}: no such directory"),
+        ((str(good), output), 1, "no map: in none of "),
+    ):
+        result = tod("map", *words)
+        assert result.status == status, result.err
+        assert result.err.startswith(told) and result.err.count("\n") == 1
+    assert not (tmp_path / "map.csv").exists()

@@ -1,0 +1,83 @@
+"""Experiments and limited links as configuration: what they choose, what is wrong with them, what the link carries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers import Command, UserConf
+
+from runner.compose import compose, options
+from runner.config import load_experiment, load_run
+from runner.resources import directory
+
+HEAD = "# @package _global_\n"
+NARROW = ("vehicle=delivery_robot", "graph=h264_rtsp", "source=test")  # few combinations are enough
+TAIL = "experiment: {about: x, duration_s: 5}\n"
+
+
+@pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
+def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
+    experiment, link = load_experiment([f"experiment={name}"], None)
+    assert (link is not None) == (name == "bottleneck")
+    for words in ((), *experiment.runs.values()):
+        load_run([f"experiment={name}", *words], None, runnable=False)
+
+
+def test_the_command_line_has_the_last_word() -> None:
+    chosen = compose(["experiment=driving_test"]).document
+    assert chosen["modes"] == compose(["modes=paper"]).document["modes"]
+    assert chosen["pqos"]["file"] == "maps/driving_test.csv"
+    other = compose(
+        ["experiment=driving_test", "modes=safe", "pqos.file=maps/demo_loop.csv", "experiment.duration_s=7"]
+    )
+    assert other.document["modes"] == compose(["modes=safe"]).document["modes"]
+    assert (other.document["pqos"]["file"], other.document["experiment"]["duration_s"]) == ("maps/demo_loop.csv", 7)
+
+
+def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_path: Path) -> None:
+    _, link = load_experiment(["experiment=driving_test", "link=relay", "link.share=2"], None)
+    assert link is not None and link.kind == "relay"
+    rates = [link.limit.kbps_at(t / 10) / 2 for t in range(1000)]
+    assert min(rates) == 3030 and max(rates) < 8000
+    assert rates[120] > 4000  # where the prediction, which looks ahead, is in the dip already
+    trace = tmp_path / "uplink.csv"
+    trace.write_text("t_s,uplink_kbps\n0,1000\n1,2000\n")
+    _, link = load_experiment(["link=netns", f"link.file={trace}", "link.share=1.5"], None)
+    assert link is not None
+    assert [link.limit.kbps_at(t) for t in (0, 0.9, 1, 2.5)] == [1500, 1500, 3000, 1500]
+    _, link = load_experiment(["link=relay", "pqos=constant", "pqos.kbps=700", "link.share=1"], None)
+    assert link is not None and [link.limit.kbps_at(t) for t in (0, 0.3, 50)] == [700, 700, 700]
+
+
+@pytest.mark.parametrize(
+    "text, told",
+    [
+        (
+            HEAD + "defaults: [_self_]\n" + TAIL + "pqos: {file: nowhere.csv}\n",
+            "pqos.file: nowhere.csv: no such file in",
+        ),
+        (
+            HEAD + "defaults: [{override /modes: papr}, _self_]\n" + TAIL,
+            "defaults: 'modes/papr': no such file, did you",
+        ),
+        ("defaults: [{override /modes: paper}, _self_]\n" + TAIL, "must begin with the line # @package _global_"),
+        (HEAD + "defaults: [_self_]\nexperiment: {about: x}\n", "experiment.duration_s: missing: must be given"),
+        (HEAD + "defaults: [_self_]\nfsp_max: 3\n" + TAIL, "fsp_max: unknown key, did you mean fps_max?"),
+    ],
+)
+def test_what_is_wrong_with_an_experiment_is_told_of_its_file(
+    tod: Command, conf: UserConf, text: str, told: str
+) -> None:
+    path = conf.write("experiment/mine.yaml", text).path / "experiment/mine.yaml"
+    result = tod("validate", conf.word, *NARROW)
+    assert result.status == 2
+    assert result.err.startswith(f"{path}: {told}"), result.err
+
+
+def test_a_run_that_cannot_be_composed_is_told(tod: Command, conf: UserConf) -> None:
+    runs = "experiment: {about: x, duration_s: 5, runs: {a: [modes=papr]}}\n"
+    conf.write("experiment/mine.yaml", HEAD + "defaults: [_self_]\n" + runs)
+    result = tod("validate", conf.word, *NARROW)
+    assert result.status == 2
+    assert "modes: papr: no such file in conf/modes/, did you mean paper?" in result.err
