@@ -140,9 +140,7 @@ class VehicleSide:
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(
-        self, plans: Sequence[Plan], media: Endpoint, report: Report, video: VideoFiles | None = None
-    ) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report, video: VideoFiles | None = None) -> None:
         self._report, self._video = report, video
         plans = _kept(plans, video)
         self._lock = threading.Lock()
@@ -250,9 +248,7 @@ class OperatorSide:
     ) -> None:
         plans = _kept(plans, video)
         self._glib = _Glib()
-        self._receivers = {
-            p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals, video) for p in plans
-        }
+        self._receivers = {p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals, video) for p in plans}
 
         def start() -> None:
             for receiver in self._receivers.values():

@@ -68,7 +68,8 @@ def decoded(path):
 
     Whatever is wrong with the stream is said on standard error.
     """
-    raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000", "-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
+    raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000"]
+    raw += ["-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
     command = ["ffmpeg", "-v", "error", "-xerror", "-i", path, *raw]
     checked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert checked.stderr == ""
