@@ -55,7 +55,7 @@ def write_mcap(
     warn        told what is left out
     progress    told now and then which share is done
     returns     number of messages
-    raises      RunError where the file cannot be written, OSError where a video cannot
+    raises      RunError where the file cannot be written
     """
     import foxglove
     from foxglove.mcap import MCAPCompression, MCAPWriteOptions
@@ -86,7 +86,7 @@ class _Out:
         self._file = file
         self._failed: OSError | None = None
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes | bytearray) -> int:
         try:
             if self._failed is None:
                 self._file.write(data)
@@ -126,17 +126,18 @@ class _Channels:
         from foxglove.channels import LocationFixChannel
         from foxglove.messages import LocationFix, Vector3
 
-        heading, speed = position.get("heading_deg"), position.get("speed_mps")
-        angle = None if heading is None else math.radians(heading)
-        known = angle is not None and speed is not None
-        velocity = Vector3(x=speed * math.sin(angle), y=speed * math.cos(angle), z=0.0) if known else None  # type: ignore[arg-type,operator]
+        velocity, angle = None, None
+        if "heading_deg" in position:
+            angle = math.radians(position["heading_deg"])
+            speed = position.get("speed_mps", 0.0)
+            velocity = Vector3(x=speed * math.sin(angle), y=speed * math.cos(angle), z=0.0)
         fix = LocationFix(
             timestamp=_timestamp(ns),
             frame_id="gps",
             latitude=position["lat"],
             longitude=position["lon"],
             heading=angle,
-            velocity=velocity,
+            velocity=velocity if "speed_mps" in position else None,
         )
         self._typed("/position", LocationFixChannel).log(fix, log_time=ns)
 

@@ -97,7 +97,7 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
         assert found[-4:] == sizes  # who dials out sends before anybody has turned a knob
         assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames go on while both sides stop
         # On a busy machine packets get lost on loopback, too; what came is kept as it came.
-        whole = came[name].decoded >= came[name].frames - 1
+        whole = came[name].decoded >= came[name].frames - 1 and came[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # Who comes into a stream that runs begins with the next parameter sets.
         assert found == sizes or (not whole and found == sizes[1:])
@@ -272,6 +272,6 @@ def test_h265_is_kept_as_it_is(tmp_path):
     until(lambda: "front: pipeline gone" in sides.reported)
     sides.stop()
     for side in ("vehicle", "operator"):
-        sizes, count = decoded(tmp_path / f"video/front.{side}.0.ts")
+        sizes, count = decoded(tmp_path / f"video/front.{side}.0.ts", whole=side == "vehicle")
         assert sizes == [(320, 180)]
         assert count > 35
