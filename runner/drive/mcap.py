@@ -5,7 +5,8 @@ from __future__ import annotations
 import heapq
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from runner.gst.video_reader import Unit
 
 SECOND_NS = 1_000_000_000
+SAME_NS = (
+    20_000_000  # a frame of the file and one of the log, further apart, are not the same; less than most cameras' gap
+)
 TELL_EVERY = 500  # messages between two tellings of progress
 # By kind of line, its topic. Notes become foxglove.Log, positions also foxglove.LocationFix, videos their pictures.
 TOPICS = {
@@ -193,7 +197,8 @@ def _streams(
         # Where the vehicle did not log, the operator knows where it was.
         yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
         for camera, files in _files(side).items():
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, channels, read_video, warn)
+            known = _captures(side, camera)
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, warn)
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[Message]:
@@ -234,11 +239,15 @@ def _pictures(
     topic: str,
     camera: str,
     files: list[Line],
+    known: Sequence[int],
     channels: _Channels,
     read_video: ReadVideo,
     warn: Callable[[str], None],
 ) -> Iterator[Message]:
-    """The frames of one camera on one side, at the times of their capture."""
+    """The frames of one camera on one side, at the times of their capture.
+
+    known  capture times that the log tells, ns since 1970, rising
+    """
     topic = topic.format(camera=camera)
     last = -1
     for line in files:
@@ -247,12 +256,40 @@ def _pictures(
             warn(f"{line['file']}: lies outside the drive and was left out")
             continue
         try:
+            offset = 0
             for unit in read_video(directory / line["file"]):
+                offset = follow(known, first + unit.after_ns, offset)
                 # A pipeline that was built anew begins after the one before has ended, but clocks may be set.
-                last = max(first + unit.after_ns, last + 1)
+                last = max(first + unit.after_ns + offset, last + 1)
                 yield Message(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
             warn(f"{error}; the export goes on without {'the rest of it' if last >= first else 'it'}")
+
+
+def _captures(side: Side, camera: str) -> list[int]:
+    """When the frames that came of a camera were captured, ns since 1970, rising; nothing where the log has no word."""
+    samples = (line["cameras"].get(camera, {}) for line in side.lines if line.get("log") == "sample")
+    arrivals = (arrival for sample in samples for arrival in sample.get("arrivals", ()))
+    began = side.began["time"]
+    return sorted(
+        round((began + t - latency_ms / 1000) * SECOND_NS) for t, latency_ms in arrivals if latency_ms is not None
+    )
+
+
+def follow(known: Sequence[int], ns: int, offset: int) -> int:
+    """What is to be added to a frame's time in a file, ns, so that it is when the frame was captured.
+
+    known   capture times from the log, rising, ns
+    ns      the frame's time by the file alone
+    offset  what the frame before needed
+
+    A receiver smooths times, and takes away slowly by how much the first frame was late: 0.1 s and more. What is
+    missing in file or log does not lead to the wrong frame, as each is looked for near where the one before was found.
+    """
+    wanted = ns + offset
+    at = bisect_left(known, wanted)
+    nearest = min(known[max(0, at - 1) : at + 1], key=lambda capture: abs(capture - wanted), default=None)
+    return offset if nearest is None or abs(nearest - wanted) > SAME_NS else nearest - ns
 
 
 def _cameras(drive: Drive) -> list[str]:

@@ -19,6 +19,7 @@ from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan
 from runner.commands import Command
 from runner.config import load
 from runner.drive.log import FORMAT
+from runner.drive.mcap import follow
 from runner.sources import compile_plans
 
 pytest.importorskip("foxglove")
@@ -129,7 +130,7 @@ def stamp(field):
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
     """Two cameras that were really streamed and received, in a drive on both sides; the frames of each file."""
-    drive, told = tmp_path_factory.mktemp("filmed"), []
+    drive, told, arrived = tmp_path_factory.mktemp("filmed"), [], []
     vehicle = load(["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"], check=check_plan)
     vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in CAMERAS})
     plans, files = compile_plans(vehicle), VideoFiles(drive, lambda *first: told.append(first))
@@ -138,7 +139,7 @@ def filmed(tmp_path_factory):
     try:
         sending.turn(Command(name, "size", (320, 180)) for name in CAMERAS)
         for _ in range(2):
-            receiving = OperatorSide(plans, lambda camera, what: None, video=files)
+            receiving = OperatorSide(plans, lambda camera, what: None, lambda *came: arrived.append(came), video=files)
             try:
                 until(lambda r=receiving: all(c.decoded > 20 for c in r.sample({}).values()))
                 sending.turn(Command(name, "size", (160, 90)) for name in CAMERAS)
@@ -156,8 +157,20 @@ def filmed(tmp_path_factory):
             if f".{side}." in file
         ]
         assert len(lines) == 4
+        if side == "operator":
+            lines.append({**SAMPLE, "t": 90.0, "position": None, "cameras": _came(arrived, start)})
         write(drive, name, began(side, start), *lines)
     return drive, told
+
+
+def _came(units, start):
+    """What a sample says of access units."""
+    arrivals = {name: [] for name in CAMERAS}
+    for camera, unit in units:
+        arrivals[camera].append((round(unit.arrived - start, 4), round(1000 * (unit.arrived - unit.captured), 2)))
+    zeros = dict.fromkeys(("fps", "kbps", "allocated_kbps", "demand_kbps", "width", "height"), 0)
+    zeros |= dict.fromkeys(("lost", "rebuilt", "frames", "bytes"), 0) | {"scaling": None, "latency_ms": None}
+    return {name: {**zeros, "arrivals": arrivals[name]} for name in CAMERAS}
 
 
 def counted(path):
@@ -185,8 +198,8 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
             times = [picture.log_time for picture in pictures]
             assert all(a < b for a, b in pairwise(times))
             firsts = sorted(captured for camera, file, captured in told if camera == name and f".{side}." in file)
-            assert abs(times[0] / 1e9 - firsts[0]) < 1e-6
-            assert any(abs(time / 1e9 - firsts[1]) < 1e-6 for time in times)
+            assert abs(times[0] / 1e9 - firsts[0]) < 2e-4
+            assert any(abs(time / 1e9 - firsts[1]) < 2e-4 for time in times)
             written = tmp_path / f"{name}.{side}.h264"
             written.write_bytes(b"".join(unit[3] for unit in units))
             kept = [counted(drive / f"video/{name}.{side}.{n}.ts") for n in range(2)]
@@ -194,6 +207,20 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
             # On a busy machine packets get lost on loopback, too; what was sent is whole.
             if side == "vehicle" or all(units == pictures for units, pictures in kept):
                 assert counted(written) == (len(units), len(units))
+
+
+def test_what_was_received_has_the_times_at_which_it_was_sent(filmed, tmp_path):
+    drive, _ = filmed
+    run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
+    topics = messages(tmp_path / "out.mcap")
+    for name in CAMERAS:
+        sent, came = (
+            {fields(picture.data)[3][-40:]: picture.log_time for picture in topics[topic][2]}
+            for topic in (f"/{name}/video", f"/{name}/video_received")
+        )
+        same = sent.keys() & came.keys()
+        assert len(same) > 30
+        assert max(abs(sent[end] - came[end]) for end in same) < 1_000_000  # 1 ms: clocks are read, numbers rounded
 
 
 def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed, tmp_path):
@@ -296,6 +323,21 @@ def test_an_operator_alone_knows_the_position_too(tmp_path):
     run("export", str(drive))
     (fix,) = messages(drive / "drive.mcap")["/position"][2]
     assert number(fields(fix.data)[1]) == 48.5
+
+
+def test_frames_are_found_in_the_log_though_times_were_smoothed_and_frames_are_missing():
+    ms = 1_000_000
+    captured = [n * 50 * ms for n in range(100)]
+    known = [captured[n] for n in range(100) if n % 7]  # of the others the log says nothing
+    offset, found = 0, []
+    for n in range(100):
+        if n % 11 != 10:  # these are not in the file
+            smoothed = captured[n] - min(n, 15) * 8 * ms
+            offset = follow(known, smoothed, offset)
+            found.append((n, (smoothed + offset - captured[n]) / ms))
+    assert {n: error for n, error in found if error and n % 7} == {}
+    assert max(abs(error) for _, error in found) < 20
+    assert follow([], 5, 0) == 0
 
 
 def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
