@@ -6,7 +6,8 @@ Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from runner.commands import Command, KnobValue
@@ -19,6 +20,7 @@ from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
+from runner.gst.video_files import VideoFile, VideoFiles, born
 from runner.model import Endpoint
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
     from runner.gst.sequence import Form
+    from runner.gst.video_reader import Unit
     from runner.rate_quality.lanes import LaneSet
 
 __all__ = [
@@ -35,12 +38,14 @@ __all__ = [
     "RecordingSide",
     "Stage",
     "VehicleSide",
+    "VideoFiles",
     "check_machine",
     "check_plan",
     "check_recorders",
     "discover",
     "missing_plugins",
     "missing_recorders",
+    "read_video",
     "run_lanes",
     "versions",
 ]
@@ -114,16 +119,32 @@ class _Glib:
         self._thread.join(timeout=5)
 
 
+def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
+    """The plans as they are built: with a file each, where video is kept.
+
+    raises  RunError that says what to install
+    """
+    if video is None:
+        return plans
+    plans = [replace(plan, video=True) for plan in plans]
+    if missing := dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan)):
+        raise RunError("\n".join(missing))
+    return plans
+
+
 class VehicleSide:
     """All cameras of the vehicle, streaming. Keeps where each knob is wanted, and writes it all again after a rebuild.
 
     report  told, from another thread, when a camera's pipeline comes, goes or fails
-    raises  RunError where the port is in use
+    video   where what is sent is kept; None: nowhere
+    raises  RunError where the port is in use, or what `video` needs is not installed
 
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report, video: VideoFiles | None = None) -> None:
+        self._report, self._video = report, video
+        plans = _kept(plans, video)
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
@@ -189,6 +210,8 @@ class VehicleSide:
 
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
         """A pipeline that was just built, with every knob where it is wanted."""
+        if self._video:
+            VideoFile(self._video, plan.camera.name, "vehicle", born, self._report).follow(pipeline)
         return CameraPipeline(pipeline, plan, self._wanted_of(plan.camera.name), self._turned)
 
     def _turned(self) -> None:
@@ -211,7 +234,9 @@ class OperatorSide:
     on_unit     told, from the camera's streaming thread, each access unit that comes
     on_picture  told, from the camera's streaming thread, each decoded picture
     arrivals    keep when each access unit came, for the samples
-    Without these no Python runs per frame.
+    video       where what is received is kept; None: nowhere
+    raises      RunError where what `video` needs is not installed
+    Without `on_unit`, `on_picture` and `arrivals` no Python runs per frame.
     """
 
     def __init__(
@@ -221,9 +246,11 @@ class OperatorSide:
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
+        video: VideoFiles | None = None,
     ) -> None:
+        plans = _kept(plans, video)
         self._glib = _Glib()
-        self._receivers = {p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals) for p in plans}
+        self._receivers = {p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals, video) for p in plans}
 
         def start() -> None:
             for receiver in self._receivers.values():
@@ -302,6 +329,13 @@ def discover(path: Path, where: str) -> Form:
     from runner.gst import sequence
 
     return sequence.discover(path, where)
+
+
+def read_video(path: Path) -> Iterator[Unit]:
+    """Access units of a video file of a drive, see `runner.gst.video_reader.read_video`."""
+    from runner.gst import video_reader
+
+    return video_reader.read_video(path)
 
 
 def run_lanes(

@@ -12,7 +12,7 @@ from runner import rules, schema, sources
 from runner.commands import KnobValue
 from runner.compose import Composed, compose, conf_directories, recompose
 from runner.errors import ConfigError, Problem
-from runner.graph import Plan, assignments, compile_graph
+from runner.graph import Plan, assignments, check_video, compile_graph
 from runner.model import (
     Camera,
     Element,
@@ -160,7 +160,7 @@ class _Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not (self.fine("media") and self.fine("control") and self.fine("page")):
+        if not all(map(self.fine, ("media", "control", "page", "log"))):
             return None
         media, control = (Endpoint(**document[key]) for key in ("media", "control"))
         built = {name: camera for name, camera in cameras.items() if camera}
@@ -186,6 +186,7 @@ class _Builder:
             page=page,
             pqos=document["pqos"],
             recording=recording,
+            log_video=document["log"]["video"],
         )
 
     def finished(self, built: T | None) -> T:
@@ -298,6 +299,8 @@ class _Builder:
             plan = compile_graph(replace(camera, mount=anything), media, index, recording=recording)
             for knob, value in SAMPLE_KNOBS.items():
                 assignments(camera, knob, value)
+            if self.composed.document["log"]["video"]:
+                check_video(camera.graph)
             errors = list(self.check(plan)) if self.check else []
         except ModelError as broken:
             errors = [broken]

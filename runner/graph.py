@@ -43,6 +43,25 @@ _RECORDED = (
     Element("recorded", "identity", {"single-segment": True}),
 )
 _WRITER = Element("writer", "filesink", {})
+# The video of a side, as it is sent or received, also into a file: what follows the tee. Its names have a hyphen, which
+# those of a graph cannot have. Here what waits longest is lost, so that a slow disk never holds up the stream: 8 MB are
+# 10 s at 6 Mbit/s. The gate is closed when nothing can be written any more, runner/gst/video_files.py. Each frame is
+# written as it comes, for a process that is killed.
+_TEE = Element("video-tee", "tee", {})
+_FILE_GATE = Element("video-gate", "valve", {})
+_FILE_QUEUE = Element(
+    "video-queue",
+    "queue",
+    {"leaky": "downstream", "max-size-bytes": 8_000_000, "max-size-buffers": 0, "max-size-time": 0},
+)
+_FILE_MUXER = Element("video-muxer", "mpegtsmux", {})
+_FILE_SINK = Element(
+    "video-file",
+    "filesink",
+    {"sync": False, "async": False, "enable-last-sample": False, "buffer-mode": "unbuffered"},
+)
+_COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
+_KEPT_CODECS = ("h264", "h265")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +76,7 @@ class Plan:
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
     recorder   elements that follow the source where it is recorded, but for the file; nothing where nobody records
+    video      whether each side also writes what it sends or receives into a file
     """
 
     camera: Camera
@@ -69,6 +89,7 @@ class Plan:
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
     recorder: tuple[Element, ...] = ()
+    video: bool = False
 
     @property
     def serves(self) -> bool:
@@ -78,7 +99,7 @@ class Plan:
     @property
     def pipeline(self) -> str:
         """The vehicle's side as GStreamer parses it, knobs not yet turned."""
-        return launch((*self.source, *self.vehicle))
+        return launch((*self.source, *self._teed("vehicle", self.vehicle))) + self._file_branch
 
     @property
     def server(self) -> str | None:
@@ -88,12 +109,37 @@ class Plan:
     @property
     def receiver(self) -> str:
         """The operator's side as GStreamer parses it."""
-        return launch(self.operator)
+        return launch(self._teed("operator", self.operator)) + self._file_branch
+
+    def receiver_into(self, sink: str) -> str:
+        """The same with another sink, given as text."""
+        return f"{launch(self._teed('operator', self.operator[:-1]))} ! {sink}{self._file_branch}"
 
     @property
     def decoder(self) -> str:
-        """The same without its sink."""
+        """The same without its sink, and without a file."""
         return launch(self.operator[:-1])
+
+    @property
+    def video_elements(self) -> tuple[Element, ...]:
+        """Elements between the stream and its file; none where there is no file."""
+        if not self.video:
+            return ()
+        codec = _kept_codec(self.camera.graph)
+        # Whoever opens the file has to find the parameter sets at each keyframe.
+        parser = Element("video-parser", f"{codec}parse", {"config-interval": -1})
+        return (_FILE_GATE, _FILE_QUEUE, parser, _FILE_MUXER, _FILE_SINK)
+
+    @property
+    def _file_branch(self) -> str:
+        return f" {_TEE.name}. ! {launch(self.video_elements)}" if self.video else ""
+
+    def _teed(self, side: str, elements: tuple[Element, ...]) -> tuple[Element, ...]:
+        """With a tee after the element that counts, where there is a file."""
+        if not self.video:
+            return elements
+        after = [element.name for element in elements].index(_COUNTERS[side]) + 1
+        return (*elements[:after], _TEE, *elements[after:])
 
     def recording(self, path: str) -> str:
         """The pipeline that records the source into a file, as GStreamer parses it."""
@@ -151,6 +197,19 @@ def compile_graph(
     )
 
 
+def check_video(graph: Graph) -> None:
+    """Whether both sides can write their video into a file.
+
+    raises  ModelError
+    """
+    for side, elements in (("vehicle", graph.vehicle), ("operator", graph.operator)):
+        if _COUNTERS[side] not in (element.name for element in elements):
+            rule = f"log.video needs an identity named {_COUNTERS[side]} where the stream is encoded"
+            raise ModelError(f"graph.{side}", None, rule)
+    if not _kept_codec(graph):
+        raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(_KEPT_CODECS)}")
+
+
 def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
     """What turning a knob to a value sets on which elements, in the order of the graph.
 
@@ -190,6 +249,12 @@ def shell(elements: Iterable[Element]) -> str:
 
 def rtsp_url(media: Endpoint, camera: str) -> str:
     return f"rtsp://{media.host}:{media.port}/{camera}"
+
+
+def _kept_codec(graph: Graph) -> str:
+    """Codec of a graph as its elements name it (x264enc and rtph264pay, ...), or "" where no file can hold it."""
+    factories = [element.factory for element in (*graph.vehicle, *graph.operator)]
+    return next((codec for codec in _KEPT_CODECS if any(codec in factory for factory in factories)), "")
 
 
 def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:

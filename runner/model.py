@@ -314,6 +314,7 @@ class Vehicle:
     modes      the rule list of each mode
     pqos       the prediction source as the YAML states it, read by `pqos.py`
     recording  how `record` keeps the frames of every camera
+    log_video  whether the log of a drive holds the video of every camera
     """
 
     name: str
@@ -325,6 +326,7 @@ class Vehicle:
     page: Page
     pqos: Mapping[str, Any]
     recording: Recording
+    log_video: bool = False
 
 
 Progress = Callable[[str, float], None]  # what is being done, share done in [0, 1]

@@ -13,7 +13,7 @@ from runner.config import load
 from runner.errors import ConfigError, Problem
 from runner.model import Mode
 
-TOP_KEYS = "mode, fps_max, media, control, page, name, cameras, modes, graph, source, pqos, recording, study"
+TOP_KEYS = "mode, fps_max, media, control, page, log, name, cameras, modes, graph, source, pqos, recording, ..."
 CAMERA_KEYS = (
     "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
 )

@@ -57,6 +57,23 @@ def test_the_receiver_of_front_left() -> None:
     )
 
 
+def test_a_file_follows_a_tee_on_both_sides_and_is_never_printed() -> None:
+    bare, kept = plan(), replace(plan(), video=True)
+    branch = (
+        " video-tee. ! valve name=video-gate ! queue name=video-queue leaky=downstream max-size-bytes=8000000 "
+        "max-size-buffers=0 max-size-time=0 ! h264parse name=video-parser config-interval=-1 ! "
+        "mpegtsmux name=video-muxer ! filesink name=video-file sync=false async=false enable-last-sample=false "
+        "buffer-mode=unbuffered"
+    )
+    tee = " ! tee name=video-tee"
+    for side, counter in (("pipeline", "identity name=sent"), ("receiver", "identity name=received")):
+        assert getattr(kept, side) == getattr(bare, side).replace(counter, counter + tee) + branch
+    assert kept.receiver_into("fakesink").endswith(f" ! fakesink{branch}")
+    assert bare.receiver_into("fakesink") == f"{bare.decoder} ! fakesink"
+    assert kept.vehicle_line(KNOBS) == bare.vehicle_line(KNOBS)
+    assert kept.operator_line() == bare.operator_line()
+
+
 def test_the_printed_lines_of_front_left() -> None:
     assert plan().vehicle_line(KNOBS) == (
         f"{SOURCE} ! valve name=gate drop-mode=forward-sticky-events drop=false ! "

@@ -12,6 +12,7 @@ from gi.repository import Gst
 from runner.graph import Plan
 from runner.gst.pipeline import counted
 from runner.gst.supervised import SupervisedPipeline
+from runner.gst.video_files import VideoFile, VideoFiles
 from runner.units import AccessUnit, read_unit
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
@@ -58,6 +59,7 @@ class Receiver:
     on_unit     told each access unit from the streaming thread
     on_picture  told each decoded picture from the streaming thread
     arrivals    keep when each access unit came
+    video       where what comes is kept; the plan has `video` then
     Without these no Python runs per frame.
     """
 
@@ -68,12 +70,14 @@ class Receiver:
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
+        video: VideoFiles | None = None,
     ) -> None:
+        self._report, self._video = report, video
         self._sink_name = plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
-        launch = f"{plan.decoder} ! {PICTURES.format(name=self._sink_name)}" if on_picture else plan.receiver
+        launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
         self._before = Received()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
@@ -108,6 +112,8 @@ class Receiver:
         self._begun = False
         self._jitter_buffers: list[Gst.Element] = []
         pipeline.connect("deep-element-added", self._on_element)
+        if self._video:
+            VideoFile(self._video, self._name, "operator", _came, self._report).follow(pipeline)
         if self._on_unit:
             self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_access_unit)
         if self._arrivals is not None:
@@ -167,6 +173,12 @@ class Receiver:
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder uses its memory again
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
+
+
+def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:
+    """When a frame was captured, s since 1970; when it came, where the line does not carry that."""
+    captured = capture_time(buffer)
+    return time.time() if captured is None else captured
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:

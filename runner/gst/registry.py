@@ -15,7 +15,8 @@ PACKAGES = {  # Debian package that brings an element; `doctor` and missing plug
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
     " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux matroskamux",
-    "gstreamer1.0-plugins-bad": "h264parse openh264enc x265enc srtsrc srtsink vah264enc nvh264enc",
+    "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink"
+    " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
     "gstreamer1.0-libav": "avdec_h264 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
@@ -27,7 +28,7 @@ PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for ele
 
 def missing_plugins(plan: Plan) -> list[str]:
     """A sentence for each element that streaming needs, this project knows and this machine lacks."""
-    return _missing((*plan.source, *plan.vehicle, *plan.operator))
+    return _missing((*plan.source, *plan.vehicle, *plan.operator, *plan.video_elements))
 
 
 def missing_recorders(plan: Plan) -> list[str]:

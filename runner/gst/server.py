@@ -9,6 +9,7 @@ from gi.repository import Gst, GstRtsp, GstRtspServer
 from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.pipeline import Build, CameraPipeline
+from runner.gst.video_files import concerns_file
 from runner.model import Endpoint
 from runner.ports import check_port_free
 
@@ -62,10 +63,14 @@ class CameraServer:
         element.get_parent().connect("deep-element-added", _on_element)
         bus = element.get_parent().get_bus()
         bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
-        bus.connect("sync-message::error", lambda _bus, message: self._report(name, message.parse_error()[0].message))
+        bus.connect("sync-message::error", self._on_error, name)
         self.pipelines[name] = self._build(element, plan)
         media.connect("unprepared", self._on_unprepared, name, self.pipelines[name])
         self._report(name, "pipeline built")
+
+    def _on_error(self, _bus: Gst.Bus, message: Gst.Message, name: str) -> None:
+        if not concerns_file(message):  # that ends the file, and not the stream
+            self._report(name, message.parse_error()[0].message)
 
     def _on_unprepared(self, _media: object, name: str, pipeline: CameraPipeline) -> None:
         if self.pipelines.get(name) is pipeline:

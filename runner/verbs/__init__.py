@@ -34,6 +34,7 @@ VERBS = {
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), "DRIVE"),
     "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), "DRIVE"),
+    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), "DRIVE"),
     "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", ()),
 }
 
@@ -50,6 +51,7 @@ EXTRAS = {
     "matplotlib": "model",
     "imageio_ffmpeg": "vmaf",
     "distributed": "cluster",
+    "foxglove": "mcap",
 }
 
 

@@ -1,0 +1,315 @@
+"""A drive as MCAP (https://mcap.dev) for Foxglove: what was logged and what was seen on one clock."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+
+from runner.drive.read import Drive, Line, Side
+from runner.errors import RunError
+from runner.schema import schema_document
+
+if TYPE_CHECKING:
+    from runner.gst.video_reader import Unit
+
+SECOND_NS = 1_000_000_000
+SAME_NS = (
+    20_000_000  # a frame of the file and one of the log, further apart, are not the same; less than most cameras' gap
+)
+TELL_EVERY = 500  # messages between two tellings of progress
+# By kind of line, its topic. Notes become foxglove.Log, positions also foxglove.LocationFix, videos their pictures.
+TOPICS = {
+    "decision": "/decision",
+    "telemetry": "/telemetry",
+    "state": "/operator/state",
+    "sample": "/operator/sample",
+    "link": "/link",
+}
+VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_received"}
+
+ReadVideo = Callable[[Path], Iterator["Unit"]]
+
+
+class Message(NamedTuple):
+    """What is to be written, and for when.
+
+    ns  since 1970
+    """
+
+    ns: int
+    write: Callable[[], None]
+
+
+def write_mcap(
+    drive: Drive,
+    file: BinaryIO,
+    read_video: ReadVideo,
+    warn: Callable[[str], None],
+    progress: Callable[[float], None] = lambda done: None,
+) -> int:
+    """All of a drive in the order of time, in compressed chunks with checksums.
+
+    file        takes the bytes
+    read_video  gives the pictures of a file
+    warn        told what is left out
+    progress    told now and then which share is done
+    returns     number of messages
+    raises      RunError where the file cannot be written
+    """
+    import foxglove
+    from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+
+    context, out = foxglove.Context(), _Out(file)
+    options = MCAPWriteOptions(compression=MCAPCompression.Zstd, profile="tod-runner")
+    count = 0
+    with foxglove.open_mcap(out, context=context, writer_options=options) as writer:
+        channels = _Channels(context, _cameras(drive))
+        for name, side in drive.sides.items():
+            writer.write_metadata(f"{name} began", _texts(side.began))
+        first, last = _span(drive)
+        for message in heapq.merge(*_streams(drive, channels, read_video, warn), key=lambda m: m.ns):
+            message.write()
+            out.check()
+            count += 1
+            if count % TELL_EVERY == 0:
+                progress(min(1.0, (message.ns - first) / max(1, last - first)))
+    out.check()
+    progress(1.0)
+    return count
+
+
+class _Out:
+    """The file as the writer sees it: always in good health. What failed is raised where somebody hears it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._failed: OSError | None = None
+
+    def write(self, data: bytes | bytearray) -> int:
+        try:
+            if self._failed is None:
+                self._file.write(data)
+        except OSError as error:
+            self._failed = error
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._file.seek(offset, whence)
+
+    def flush(self) -> None:
+        try:
+            if self._failed is None:
+                self._file.flush()
+        except OSError as error:
+            self._failed = error
+
+    def check(self) -> None:
+        if self._failed:
+            raise RunError(f"the MCAP file cannot be written: {self._failed.strerror or self._failed}")
+
+
+class _Channels:
+    """The topics, each made when its first message comes."""
+
+    def __init__(self, context: Any, cameras: Iterable[str]) -> None:
+        self._context, self._cameras = context, list(cameras)
+        self._made: dict[str, Any] = {}
+
+    def tell(self, topic: str, schema: str, definition: str, line: Line, ns: int) -> None:
+        """A line of JSON, with the definition that it keeps to."""
+        if topic not in self._made:
+            self._made[topic] = self._json_channel(topic, schema, definition)
+        self._made[topic].log(json.dumps(line, ensure_ascii=False).encode(), log_time=ns)
+
+    def fix(self, position: Mapping[str, Any], ns: int) -> None:
+        from foxglove.channels import LocationFixChannel
+        from foxglove.messages import LocationFix, Vector3
+
+        velocity, angle = None, None
+        if "heading_deg" in position:
+            angle = math.radians(position["heading_deg"])
+            speed = position.get("speed_mps", 0.0)
+            velocity = Vector3(x=speed * math.sin(angle), y=speed * math.cos(angle), z=0.0)
+        fix = LocationFix(
+            timestamp=_timestamp(ns),
+            frame_id="gps",
+            latitude=position["lat"],
+            longitude=position["lon"],
+            heading=angle,
+            velocity=velocity if "speed_mps" in position else None,
+        )
+        self._typed("/position", LocationFixChannel).log(fix, log_time=ns)
+
+    def note(self, side: str, text: str, ns: int) -> None:
+        from foxglove.channels import LogChannel
+        from foxglove.messages import Log, LogLevel
+
+        log = Log(timestamp=_timestamp(ns), level=LogLevel.Info, name=side, message=text)
+        self._typed("/notes", LogChannel).log(log, log_time=ns)
+
+    def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
+        from foxglove.channels import CompressedVideoChannel
+        from foxglove.messages import CompressedVideo
+
+        video = CompressedVideo(timestamp=_timestamp(ns), frame_id=camera, data=unit.data, format=unit.codec)
+        self._typed(topic, CompressedVideoChannel).log(video, log_time=ns)
+
+    def _typed(self, topic: str, kind: Any) -> Any:
+        if topic not in self._made:
+            self._made[topic] = kind(topic, context=self._context)
+        return self._made[topic]
+
+    def _json_channel(self, topic: str, schema: str, definition: str) -> Any:
+        import foxglove
+
+        document = schema_document(schema)
+        text = json.dumps(standalone(document["$defs"][definition], document["$defs"], self._cameras))
+        known = foxglove.Schema(name=f"tod_runner.{definition}", encoding="jsonschema", data=text.encode())
+        return foxglove.Channel(topic, schema=known, message_encoding="json", context=self._context)
+
+
+def standalone(schema: Any, definitions: Mapping[str, Any], cameras: Iterable[str]) -> Any:
+    """A schema without references, and with the cameras by name: Foxglove then offers each number for plots."""
+    if isinstance(schema, list):
+        return [standalone(part, definitions, cameras) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if "$ref" in schema:
+        return standalone(definitions[schema["$ref"].removeprefix("#/$defs/")], definitions, cameras)
+    whole = {key: standalone(part, definitions, cameras) for key, part in schema.items()}
+    by_camera = whole.get("properties", {}).get("cameras")
+    if by_camera and isinstance(by_camera.get("additionalProperties"), dict):
+        each = by_camera["additionalProperties"]
+        by_camera |= {"properties": dict.fromkeys(cameras, each), "additionalProperties": False}
+    return whole
+
+
+def _streams(
+    drive: Drive, channels: _Channels, read_video: ReadVideo, warn: Callable[[str], None]
+) -> Iterator[Iterator[Message]]:
+    """Messages by where they come from, each in the order of time."""
+    for name, side in drive.sides.items():
+        # Where the vehicle did not log, the operator knows where it was.
+        yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
+        for camera, files in _files(side).items():
+            known = _captures(side, camera)
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, warn)
+
+
+def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[Message]:
+    began = round(side.began["time"] * SECOND_NS)
+    for line in side.lines:
+        ns = began + round(line["t"] * SECOND_NS)
+        for write in _writers(name, line, channels, positions, ns):
+            yield Message(ns, write)
+
+
+def _writers(name: str, line: Line, channels: _Channels, positions: bool, ns: int) -> Iterator[Callable[[], None]]:
+    """What becomes of one line."""
+    if "event" in line:
+        event = line["event"]
+        yield lambda: channels.tell(f"/events/{event}", "event", event, line, ns)
+        if event == "position_reported":
+            yield lambda: channels.fix(line, ns)
+        return
+    kind = line["log"]
+    if kind == "note":
+        yield lambda: channels.note(name, line["text"], ns)
+    elif kind in TOPICS:
+        yield lambda: channels.tell(TOPICS[kind], "drive", kind, line, ns)
+    if kind == "sample" and positions and line["position"] is not None:
+        yield lambda: channels.fix(line["position"], ns)
+
+
+def _files(side: Side) -> dict[str, list[Line]]:
+    """By camera, the lines that tell of its video files, by the time of their first frames."""
+    files: dict[str, list[Line]] = {}
+    for line in sorted((line for line in side.lines if line.get("log") == "video"), key=lambda line: line["captured"]):
+        files.setdefault(line["camera"], []).append(line)
+    return files
+
+
+def _pictures(
+    directory: Path,
+    topic: str,
+    camera: str,
+    files: list[Line],
+    known: Sequence[int],
+    channels: _Channels,
+    read_video: ReadVideo,
+    warn: Callable[[str], None],
+) -> Iterator[Message]:
+    """The frames of one camera on one side, at the times of their capture.
+
+    known  capture times that the log tells, ns since 1970, rising
+    """
+    topic = topic.format(camera=camera)
+    last = -1
+    for line in files:
+        first = round(line["captured"] * SECOND_NS)
+        if Path(line["file"]).is_absolute() or ".." in Path(line["file"]).parts:
+            warn(f"{line['file']}: lies outside the drive and was left out")
+            continue
+        try:
+            offset = 0
+            for unit in read_video(directory / line["file"]):
+                offset = follow(known, first + unit.after_ns, offset)
+                # A pipeline that was built anew begins after the one before has ended, but clocks may be set.
+                last = max(first + unit.after_ns + offset, last + 1)
+                yield Message(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
+        except RunError as error:
+            warn(f"{error}; the export goes on without {'the rest of it' if last >= first else 'it'}")
+
+
+def _captures(side: Side, camera: str) -> list[int]:
+    """When the frames that came of a camera were captured, ns since 1970, rising; nothing where the log has no word."""
+    samples = (line["cameras"].get(camera, {}) for line in side.lines if line.get("log") == "sample")
+    arrivals = (arrival for sample in samples for arrival in sample.get("arrivals", ()))
+    began = side.began["time"]
+    return sorted(
+        round((began + t - latency_ms / 1000) * SECOND_NS) for t, latency_ms in arrivals if latency_ms is not None
+    )
+
+
+def follow(known: Sequence[int], ns: int, offset: int) -> int:
+    """What is to be added to a frame's time in a file, ns, so that it is when the frame was captured.
+
+    known   capture times from the log, rising, ns
+    ns      the frame's time by the file alone
+    offset  what the frame before needed
+
+    A receiver smooths times, and takes away slowly by how much the first frame was late: 0.1 s and more. What is
+    missing in file or log does not lead to the wrong frame, as each is looked for near where the one before was found.
+    """
+    wanted = ns + offset
+    at = bisect_left(known, wanted)
+    nearest = min(known[max(0, at - 1) : at + 1], key=lambda capture: abs(capture - wanted), default=None)
+    return offset if nearest is None or abs(nearest - wanted) > SAME_NS else nearest - ns
+
+
+def _cameras(drive: Drive) -> list[str]:
+    named = (camera for side in drive.sides.values() for camera in side.began["config"].get("cameras", {}))
+    return list(dict.fromkeys(named))
+
+
+def _span(drive: Drive) -> tuple[int, int]:
+    """From when to when the drive was, ns since 1970."""
+    began = [side.began["time"] for side in drive.sides.values()]
+    ended = [side.began["time"] + line["t"] for side in drive.sides.values() for line in side.lines[-1:]]
+    return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)
+
+
+def _texts(began: Line) -> dict[str, str]:
+    """Metadata holds texts only."""
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in began.items()}
+
+
+def _timestamp(ns: int) -> Any:
+    from foxglove.messages import Timestamp
+
+    return Timestamp(sec=ns // SECOND_NS, nsec=ns % SECOND_NS)

@@ -1,0 +1,161 @@
+"""One camera's stream on one side, as it is, into a file: MPEG-TS, which can be read up to wherever it ends."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from gi.repository import Gst
+
+DIRECTORY = "video"  # below that of the drive
+_MARK = "video-"  # how the names of the elements in front of the file begin, see runner/graph.py
+
+Captured = Callable[[Gst.Pad, Gst.Buffer], float]  # when a frame was captured, s since 1970
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFiles:
+    """Where the video of the cameras is kept.
+
+    directory  that of the drive; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counting the pipelines with a frame
+    on_video   told when the first frame of a file is there, from another thread: camera, name of the file from the
+               directory on, capture time of that frame in s since 1970
+    """
+
+    directory: Path
+    on_video: Callable[[str, str, float], None]
+
+
+class VideoFile:
+    """The file of one pipeline. It begins with the first frame: a pipeline without frames leaves none.
+
+    Whatever fails here ends the file, is reported once, and leaves the stream alone. After the first frame no Python
+    runs. Elements are looked up when they are needed: whom a probe keeps alive must not keep alive the pipeline.
+
+    side      vehicle or operator
+    captured  when a frame was captured; asked between queue and parser
+    report    told: camera, what failed
+    """
+
+    def __init__(
+        self, files: VideoFiles, camera: str, side: str, captured: Captured, report: Callable[[str, str], None]
+    ) -> None:
+        self._files, self._camera, self._side = files, camera, side
+        self._captured, self._report = captured, report
+        self._came: dict[int, float] = {}  # by time in the stream, ns: when it was captured
+        self._begun = self._failed = self._late = False
+
+    def follow(self, pipeline: Gst.Bin) -> None:
+        """Watch a pipeline that was just built from a plan with `video`."""
+        elements = {name: pipeline.get_by_name(f"{_MARK}{name}") for name in ("gate", "queue", "parser", "file")}
+        elements["file"].set_locked_state(True)  # not opened with the pipeline, and no reason for it to fail
+        queries = Gst.PadProbeType.QUERY_DOWNSTREAM | Gst.PadProbeType.QUERY_UPSTREAM
+        elements["gate"].get_static_pad("sink").add_probe(queries, _on_query)
+        elements["queue"].connect("overrun", self._on_overrun)
+        elements["queue"].get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_unit)
+        elements["parser"].get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_first_parsed)
+        _outermost(pipeline).get_bus().set_sync_handler(self._on_message)
+
+    def _on_unit(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """From the queue's thread, until the file has begun: the parser passes on nothing before parameter sets."""
+        if self._begun:
+            return Gst.PadProbeReturn.REMOVE
+        buffer = info.get_buffer()
+        self._came[buffer.pts] = self._captured(pad, buffer)
+        return Gst.PadProbeReturn.OK
+
+    def _on_first_parsed(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """From the queue's thread: open the file, in front of its first frame."""
+        self._begun = True
+        captured = self._came.get(info.get_buffer().pts) or max(self._came.values(), default=time.time())
+        self._came.clear()
+        parts = pad.get_parent_element().get_parent()
+        try:
+            path = _new_file(self._files.directory / DIRECTORY, self._camera, self._side)
+        except OSError as error:
+            self._fail(parts, str(error))
+            return Gst.PadProbeReturn.REMOVE
+        sink = parts.get_by_name(f"{_MARK}file")
+        sink.set_property("location", str(path))
+        sink.set_locked_state(False)
+        if sink.sync_state_with_parent():  # else the message has come
+            self._files.on_video(self._camera, str(path.relative_to(self._files.directory)), captured)
+        return Gst.PadProbeReturn.REMOVE
+
+    def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:
+        """From any thread, before the pipeline hears of it."""
+        if message.type != Gst.MessageType.ERROR or not concerns_file(message):
+            return Gst.BusSyncReply.PASS
+        self._fail(message.src.get_parent(), message.parse_error()[0].message)
+        return Gst.BusSyncReply.DROP
+
+    def _fail(self, parts: Gst.Bin, why: str) -> None:
+        """Shut the gate. It takes what comes from then on, and also forgives the failure of the frame on its way."""
+        parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
+        if not self._failed:
+            self._failed = True
+            self._report(self._camera, f"no video is kept: {why}")
+
+    def _on_overrun(self, queue: Gst.Element) -> None:
+        """From the stream's thread, when the queue is full for the first time."""
+        queue.set_property("silent", True)  # it need not say so again
+        if not (self._late or self._failed):
+            self._late = True
+            self._report(self._camera, "the disk is too slow: frames are missing in the video file")
+
+
+def concerns_file(message: Gst.Message) -> bool:
+    """Whether a message comes from an element that only serves the file."""
+    return bool(message.src) and message.src.get_name().startswith(_MARK)
+
+
+def born(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
+    """When a frame was captured on this machine, s since 1970, by its place in the stream's running time."""
+    element = pad.get_parent_element()
+    segment, clock = pad.get_sticky_event(Gst.EventType.SEGMENT, 0), element.get_clock()
+    if segment is None or clock is None:
+        return time.time()
+    running = segment.parse_segment().to_running_time(Gst.Format.TIME, buffer.pts)
+    age = clock.get_time() - element.get_base_time() - running
+    return time.time() - float(age / Gst.SECOND)
+
+
+def _new_file(directory: Path, camera: str, side: str) -> Path:
+    """An empty file that was not there before.
+
+    raises  OSError
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    for number in count():
+        path = directory / f"{camera}.{side}.{number}.ts"
+        try:
+            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError("numbers never end")
+
+
+def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    """The file takes whatever the stream is, and has no say in its form and its latency.
+
+    Else an encoder would choose the form that the file likes, and the sink of the stream would hold packets back until
+    the slowest branch is ready.
+    """
+    query = info.get_query()
+    if query.type == Gst.QueryType.CAPS:
+        return Gst.PadProbeReturn.DROP  # who hears no answer takes it that anything goes
+    if query.type == Gst.QueryType.LATENCY:
+        query.set_latency(False, 0, Gst.CLOCK_TIME_NONE)
+        return Gst.PadProbeReturn.HANDLED
+    return Gst.PadProbeReturn.OK
+
+
+def _outermost(element: Gst.Element) -> Gst.Element:
+    while (parent := element.get_parent()) is not None:
+        element = parent
+    return element

@@ -1,0 +1,83 @@
+"""The access units of a video file of a drive, one by one. Offline work, so Python per frame is fine here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from gi.repository import Gst
+
+from runner.errors import RunError
+
+WAIT_NS = 100 * Gst.MSECOND
+SILENT = 100  # waits without a unit, an end or an error, after which the file is given up
+_PARSED = {  # by codec, how its units become whole pictures as Annex B, parameter sets with each keyframe
+    codec: f"{codec}parse config-interval=-1 ! capsfilter caps=video/x-{codec},stream-format=byte-stream,alignment=au"
+    for codec in ("h264", "h265")
+}
+
+
+class Unit(NamedTuple):
+    """One access unit.
+
+    after_ns  its time since the first unit of the file, ns
+    codec     h264 or h265
+    data      Annex B
+    """
+
+    after_ns: int
+    codec: str
+    data: bytes
+
+
+def read_video(path: Path) -> Iterator[Unit]:
+    """All that can be read, in order.
+
+    raises  RunError where the file is none or is damaged; what was read before stays good
+    """
+    if not path.is_file():
+        raise RunError(f"{path}: no such file")
+    pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")
+    pipeline.get_by_name("file").set_property("location", str(path))
+    pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
+    try:
+        pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
+        yield from _pulled(pipeline, path)
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
+    """The file's stream is found: put what its codec needs in front of the end. Nothing runs per frame here."""
+    codec = pad.get_current_caps().get_structure(0).get_name().removeprefix("video/x-")
+    if codec not in _PARSED or out.get_static_pad("sink").is_linked():
+        return  # whoever waits for units hears that there are none
+    parse = Gst.parse_bin_from_description(_PARSED[codec], True)
+    out.get_parent().add(parse)
+    parse.link(out)
+    pad.link(parse.get_static_pad("sink"))
+    parse.sync_state_with_parent()
+
+
+def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
+    out, bus = pipeline.get_by_name("out"), pipeline.get_bus()
+    first, silent = 0, 0
+    codec = ""
+    while silent < SILENT:
+        sample = out.emit("try-pull-sample", WAIT_NS)
+        if sample is None:
+            if out.get_property("eos") and codec:
+                return
+            message = bus.pop_filtered(Gst.MessageType.ERROR)
+            if message is not None or out.get_property("eos"):
+                break
+            silent += 1
+            continue
+        silent, buffer = 0, sample.get_buffer()
+        if not codec:
+            codec, first = sample.get_caps().get_structure(0).get_name().removeprefix("video/x-"), buffer.pts
+        if buffer.pts == Gst.CLOCK_TIME_NONE:
+            continue  # a unit that is damaged at its head
+        yield Unit(buffer.pts - first, codec, buffer.extract_dup(0, buffer.get_size()))
+    raise RunError(f"{path}: is damaged" if codec else f"{path}: holds no video that can be read")

@@ -1,0 +1,91 @@
+"""usage: tod-runner export DRIVE [output=FILE.mcap]
+
+A drive as MCAP, for Foxglove and every other reader of MCAP. DRIVE is a directory that log=DIR wrote; whatever of it is
+there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= says otherwise.
+
+  /position               foxglove.LocationFix
+  /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)
+  /CAMERA/video_received  the same as received
+  /notes                  foxglove.Log
+  /events/..., /decision, /telemetry, /operator/state, /operator/sample, /link    JSON with its schema
+
+  tod-runner demo log=monday log.video=true
+  tod-runner export monday
+  tod-runner export monday output=monday.mcap
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from runner.drive.read import read_drive
+from runner.errors import RunError, UserError
+from runner.verbs import Arguments
+from runner.verbs.screen import progress_bar, streaming
+
+QUIET_S = 2.0  # a shorter export shows no progress
+
+
+def run(arguments: Arguments) -> int:
+    from runner.drive.mcap import write_mcap
+
+    if len(arguments.words) != 1:
+        found = " ".join(arguments.words) or None
+        raise UserError("command line", "", found, "must name one drive: a directory that log= wrote")
+    directory = Path(arguments.words[0])
+    output = arguments.path("output") or directory / "drive.mcap"
+    if os.path.lexists(output):
+        rule = "is there already; remove it, or name another file by output="
+        raise UserError("command line", "output", repr(str(output)), rule)
+    if arguments.overrides:
+        raise UserError("command line", "", arguments.overrides[0], "an export has no configuration, only output=")
+    drive = read_drive(directory)
+    for warning in drive.warnings:
+        print(warning, file=sys.stderr)
+    filmed = any(line.get("log") == "video" for side in drive.sides.values() for line in side.lines)
+    read_video = streaming().read_video if filmed else _nothing
+    with _whole(output) as file, _later(f"{output}") as progress:
+        count = write_mcap(drive, file, read_video, lambda what: print(what, file=sys.stderr), progress)
+    print(f"{output}: {count} messages, {output.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def _nothing(_path: Path) -> Iterator[Any]:
+    return iter(())
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
+    """A new file, written under another name and put in its place when it is whole."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        file = unfinished.open("xb")
+    except OSError as error:
+        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
+    try:
+        with file:
+            yield file
+        unfinished.replace(path)
+    except OSError as error:
+        raise RunError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _later(what: str) -> Iterator[Callable[[float], None]]:
+    """Progress of long work, from when it proves to be long."""
+    began = time.monotonic()
+    with progress_bar() as tell:
+
+        def progress(done: float) -> None:
+            if time.monotonic() - began > QUIET_S:
+                tell(what, done)
+
+        yield progress

@@ -1,0 +1,434 @@
+"""Drives as MCAP, read back with the reader of the format's authors; the video decoded again."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+
+from rig import free_port, run, until
+from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan
+from runner.commands import Command
+from runner.config import load
+from runner.drive.log import FORMAT
+from runner.drive.mcap import follow
+from runner.sources import compile_plans
+
+pytest.importorskip("foxglove")
+reader = pytest.importorskip("mcap.reader")
+
+CAMERAS = ("front", "rear")
+BEGAN = 1_700_000_000.25
+
+
+def position(t, lat):
+    return {"t": t, "event": "position_reported", "lat": lat, "lon": 11.66, "speed_mps": 8.0, "heading_deg": 90}
+
+
+VEHICLE = [
+    {"t": 0.0, "event": "clock_advanced"},
+    position(0.5, 48.26),
+    {"t": 0.6, "event": "bitrate_predicted", "kbps": 3000},
+    {
+        "t": 0.6,
+        "log": "telemetry",
+        "predicted_kbps": 3000,
+        "position": None,
+        "cameras": {"front": {"applied": {}, "frames": 3, "bytes": 900}},
+        "refused": 0,
+    },
+    {"t": 0.7, "log": "note", "text": "front: pipeline built"},
+    position(1.5, 48.27),
+]
+SAMPLE = {
+    "t": 0.25,
+    "log": "sample",
+    "predicted_kbps": None,
+    "allocated_kbps": 0,
+    "actual_kbps": 0,
+    "position": {"lat": 48.5, "lon": 11.5},
+    "refused": 0,
+    "cameras": {},
+}
+ENDED = {"t": 2.0, "log": "ended"}
+
+
+def began(side, time=BEGAN):
+    config = {"name": "delivery_robot", "cameras": {name: {} for name in CAMERAS}}
+    versions = {"tod-runner": "1", "Python": "3"}
+    return {
+        "t": 0.0,
+        "log": "began",
+        "side": side,
+        "format": FORMAT,
+        "time": time,
+        "versions": versions,
+        "config": config,
+    }
+
+
+def write(directory, file, *lines, end="\n"):
+    directory.mkdir(exist_ok=True)
+    (directory / file).write_text("\n".join(map(json.dumps, lines)) + end)
+
+
+def messages(path):
+    """By topic: schema, channel and messages; checksums are compared."""
+    topics = {}
+    with path.open("rb") as file:
+        for schema, channel, message in reader.make_reader(file, validate_crcs=True).iter_messages():
+            topics.setdefault(channel.topic, (schema, channel, []))[2].append(message)
+    return topics
+
+
+def fields(data):
+    """Fields of a protobuf message by number; the last of each."""
+    found, at = {}, 0
+
+    def varint():
+        nonlocal at
+        value = shift = 0
+        while True:
+            byte = data[at]
+            at += 1
+            value |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                return value
+
+    while at < len(data):
+        number, kind = divmod(varint(), 8)
+        if kind == 0:
+            found[number] = varint()
+        else:
+            size = {1: 8, 5: 4}.get(kind) or varint()
+            found[number] = data[at : at + size]
+            at += size
+    return found
+
+
+def number(data):
+    return struct.unpack("<d", data)[0]
+
+
+def stamp(field):
+    parts = fields(field)
+    return parts.get(1, 0) * 10**9 + parts.get(2, 0)
+
+
+# --- a real drive -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """Two cameras that were really streamed and received, in a drive on both sides; the frames of each file."""
+    drive, told, arrived = tmp_path_factory.mktemp("filmed"), [], []
+    vehicle = load(["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"], check=check_plan)
+    vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in CAMERAS})
+    plans, files = compile_plans(vehicle), VideoFiles(drive, lambda *first: told.append(first))
+    reported = []
+    sending = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(what), files)
+    try:
+        sending.turn(Command(name, "size", (320, 180)) for name in CAMERAS)
+        for _ in range(2):
+            receiving = OperatorSide(plans, lambda camera, what: None, lambda *came: arrived.append(came), video=files)
+            try:
+                until(lambda r=receiving: all(c.decoded > 20 for c in r.sample({}).values()))
+                sending.turn(Command(name, "size", (160, 90)) for name in CAMERAS)
+                until(lambda r=receiving: all(c.width == 160 for c in r.sample({}).values()))
+            finally:
+                receiving.stop()
+            until(lambda: reported.count("pipeline gone") == reported.count("pipeline built"))
+    finally:
+        sending.stop()
+    for side, name in (("vehicle", "drive.jsonl"), ("operator", "operator.jsonl")):
+        start = told[0][2] - 1
+        lines = [
+            {"t": max(0.0, captured - start), "log": "video", "camera": camera, "file": file, "captured": captured}
+            for camera, file, captured in sorted(told, key=lambda first: first[2])
+            if f".{side}." in file
+        ]
+        assert len(lines) == 4
+        if side == "operator":
+            lines.append({**SAMPLE, "t": 90.0, "position": None, "cameras": _came(arrived, start)})
+        write(drive, name, began(side, start), *lines)
+    return drive, told
+
+
+def _came(units, start):
+    """What a sample says of access units."""
+    arrivals = {name: [] for name in CAMERAS}
+    for camera, unit in units:
+        arrivals[camera].append((round(unit.arrived - start, 4), round(1000 * (unit.arrived - unit.captured), 2)))
+    zeros = dict.fromkeys(("fps", "kbps", "allocated_kbps", "demand_kbps", "width", "height"), 0)
+    zeros |= dict.fromkeys(("lost", "rebuilt", "frames", "bytes"), 0) | {"scaling": None, "latency_ms": None}
+    return {name: {**zeros, "arrivals": arrivals[name]} for name in CAMERAS}
+
+
+def counted(path):
+    """Access units of a file, and pictures that ffmpeg makes of them."""
+    what = ["-count_frames", "-count_packets", "-select_streams", "v", "-show_entries"]
+    what += ["stream=nb_read_frames,nb_read_packets", "-of", "default=noprint_wrappers=1"]
+    shown = subprocess.run(["ffprobe", "-v", "error", *what, path], capture_output=True, text=True, check=True)
+    found = dict(line.split("=") for line in shown.stdout.split())
+    return int(found["nb_read_packets"]), int(found["nb_read_frames"])
+
+
+def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
+    drive, told = filmed
+    output = tmp_path / "out.mcap"
+    done = run("export", str(drive), f"output={output}")
+    assert done.returncode == 0, done.stderr
+    topics = messages(output)
+    for name in CAMERAS:
+        for side, topic in (("vehicle", f"/{name}/video"), ("operator", f"/{name}/video_received")):
+            schema, _, pictures = topics[topic]
+            assert (schema.name, schema.encoding) == ("foxglove.CompressedVideo", "protobuf")
+            units = [fields(picture.data) for picture in pictures]
+            assert {(unit[2], unit[4]) for unit in units} == {(name.encode(), b"h264")}
+            assert [stamp(unit[1]) for unit in units] == [picture.log_time for picture in pictures]
+            times = [picture.log_time for picture in pictures]
+            assert all(a < b for a, b in pairwise(times))
+            firsts = sorted(captured for camera, file, captured in told if camera == name and f".{side}." in file)
+            assert abs(times[0] / 1e9 - firsts[0]) < 2e-4
+            assert any(abs(time / 1e9 - firsts[1]) < 2e-4 for time in times)
+            written = tmp_path / f"{name}.{side}.h264"
+            written.write_bytes(b"".join(unit[3] for unit in units))
+            kept = [counted(drive / f"video/{name}.{side}.{n}.ts") for n in range(2)]
+            assert len(units) == kept[0][0] + kept[1][0] > 40
+            # On a busy machine packets get lost on loopback, too; what was sent is whole.
+            if side == "vehicle" or all(units == pictures for units, pictures in kept):
+                assert counted(written) == (len(units), len(units))
+
+
+def test_what_was_received_has_the_times_at_which_it_was_sent(filmed, tmp_path):
+    drive, _ = filmed
+    run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
+    topics = messages(tmp_path / "out.mcap")
+    for name in CAMERAS:
+        sent, came = (
+            {fields(picture.data)[3][-40:]: picture.log_time for picture in topics[topic][2]}
+            for topic in (f"/{name}/video", f"/{name}/video_received")
+        )
+        same = sent.keys() & came.keys()
+        assert len(same) > 30
+        assert max(abs(sent[end] - came[end]) for end in same) < 1_000_000  # 1 ms: clocks are read, numbers rounded
+
+
+def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed, tmp_path):
+    drive, _ = filmed
+    run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
+    _, _, pictures = messages(tmp_path / "out.mcap")["/front/video"]
+    for picture in pictures:
+        data = fields(picture.data)[3]
+        assert data.startswith((b"\0\0\0\1", b"\0\0\1"))
+        kinds = [part[0] & 31 for part in data.split(b"\0\0\1")[1:]]
+        assert sum(kind in (1, 5) for kind in kinds) == 1  # the encoder makes one slice of a picture
+        assert 5 not in kinds or {7, 8} <= set(kinds)
+    assert 5 in [part[0] & 31 for part in fields(pictures[0].data)[3].split(b"\0\0\1")[1:]]
+
+
+def test_a_video_that_is_missing_or_damaged_is_told_and_the_rest_exported(filmed, tmp_path):
+    drive = tmp_path / "drive"
+    shutil.copytree(filmed[0], drive)
+    (drive / "video/front.vehicle.0.ts").unlink()
+    (drive / "video/rear.vehicle.0.ts").write_bytes(b"no video" * 9999)
+    (drive / "video/rear.vehicle.1.ts").write_bytes(b"")
+    cut = drive / "video/front.operator.1.ts"
+    cut.write_bytes(cut.read_bytes()[:20_000])
+    done = run("export", str(drive))
+    assert done.returncode == 0
+    told = sorted(line for line in done.stderr.splitlines() if "video/" in line)
+    assert told == [
+        f"{drive}/video/front.vehicle.0.ts: no such file; the export goes on without it",
+        f"{drive}/video/rear.vehicle.0.ts: holds no video that can be read; the export goes on without it",
+        f"{drive}/video/rear.vehicle.1.ts: holds no video that can be read; the export goes on without it",
+    ]
+    topics = messages(drive / "drive.mcap")
+    assert "/rear/video" not in topics
+    assert len(topics["/front/video"][2]) == counted(drive / "video/front.vehicle.1.ts")[0]
+    whole = counted(drive / "video/front.operator.0.ts")[0]
+    assert whole < len(topics["/front/video_received"][2]) < whole + 60
+
+
+# --- lines ------------------------------------------------------------------------------------------------------------
+
+
+def test_lines_become_messages_with_their_schemas_on_one_clock(tmp_path):
+    drive = tmp_path / "drive"
+    write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
+    write(drive, "operator.jsonl", began("operator", BEGAN + 1), SAMPLE, {"t": 0.5, "log": "note", "text": "hm"}, ENDED)
+    link = {"t": 0.1, "log": "link", "kbps": 3000, "queue_ms": 4.5, "bytes": 1, "packets": 1, "dropped": 0}
+    write(drive, "link.jsonl", began("link"), link, ENDED)
+    done = run("export", str(drive))
+    assert (done.returncode, done.stderr) == (0, "")
+    topics = messages(drive / "drive.mcap")
+    assert done.stdout.startswith(f"{drive}/drive.mcap: {sum(len(found) for *_, found in topics.values())} messages, ")
+    assert set(topics) == {
+        "/position",
+        "/notes",
+        "/events/clock_advanced",
+        "/events/position_reported",
+        "/events/bitrate_predicted",
+        "/telemetry",
+        "/operator/sample",
+        "/link",
+    }
+    for topic, (schema, channel, found) in topics.items():
+        if channel.message_encoding != "json":
+            continue
+        assert schema.encoding == "jsonschema"
+        document = json.loads(schema.data)
+        assert document["type"] == "object"
+        assert "$ref" not in schema.data.decode()
+        for message in found:
+            line = json.loads(message.data)
+            Draft202012Validator(document).validate(line)
+            start = BEGAN + 1 if "operator" in topic else BEGAN
+            assert message.log_time == round(start * 1e9) + round(line["t"] * 1e9)
+    telemetry = json.loads(topics["/telemetry"][0].data)["properties"]["cameras"]
+    assert list(telemetry["properties"]) == list(CAMERAS)
+    notes = [fields(note.data) for note in topics["/notes"][2]]
+    assert [(note[4], note[3]) for note in notes] == [(b"vehicle", b"front: pipeline built"), (b"operator", b"hm")]
+
+
+def test_positions_are_location_fixes(tmp_path):
+    drive = tmp_path / "drive"
+    write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
+    write(drive, "operator.jsonl", began("operator"), SAMPLE, ENDED)
+    run("export", str(drive))
+    schema, _, fixes = messages(drive / "drive.mcap")["/position"]
+    assert schema.name == "foxglove.LocationFix"
+    found = [fields(fix.data) for fix in fixes]
+    assert [(number(fix[1]), number(fix[2])) for fix in found] == [(48.26, 11.66), (48.27, 11.66)]
+    times = [round(BEGAN * 1e9) + round(t * 1e9) for t in (0.5, 1.5)]
+    assert [fix.log_time for fix in fixes] == times == [stamp(fix[6]) for fix in found]
+    with (drive / "drive.mcap").open("rb") as file:
+        began_with = {m.name: m.metadata for m in reader.make_reader(file, validate_crcs=True).iter_metadata()}
+    assert json.loads(began_with["vehicle began"]["config"])["name"] == "delivery_robot"
+    assert math.isclose(json.loads(began_with["operator began"]["time"]), BEGAN)
+
+
+def test_an_operator_alone_knows_the_position_too(tmp_path):
+    drive = tmp_path / "drive"
+    write(drive, "operator.jsonl", began("operator"), SAMPLE, {**SAMPLE, "t": 0.5, "position": None}, ENDED)
+    run("export", str(drive))
+    (fix,) = messages(drive / "drive.mcap")["/position"][2]
+    assert number(fields(fix.data)[1]) == 48.5
+
+
+def test_frames_are_found_in_the_log_though_times_were_smoothed_and_frames_are_missing():
+    ms = 1_000_000
+    captured = [n * 50 * ms for n in range(100)]
+    known = [captured[n] for n in range(100) if n % 7]  # of the others the log says nothing
+    offset, found = 0, []
+    for n in range(100):
+        if n % 11 != 10:  # these are not in the file
+            smoothed = captured[n] - min(n, 15) * 8 * ms
+            offset = follow(known, smoothed, offset)
+            found.append((n, (smoothed + offset - captured[n]) / ms))
+    assert {n: error for n, error in found if error and n % 7} == {}
+    assert max(abs(error) for _, error in found) < 20
+    assert follow([], 5, 0) == 0
+
+
+def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
+    drive = tmp_path / "drive"
+    ticks = [{"t": n / 10, "event": "clock_advanced"} for n in range(30_000)]
+    write(drive, "drive.jsonl", began("vehicle"), *ticks, ENDED)
+    write(drive, "operator.jsonl", began("operator"), *({**SAMPLE, "t": n / 4} for n in range(2000)), ENDED)
+    assert run("export", str(drive)).returncode == 0
+    with (drive / "drive.mcap").open("rb") as file:
+        summary = reader.make_reader(file, validate_crcs=True).get_summary()
+        file.seek(0)
+        times = [m.log_time for *_, m in reader.make_reader(file).iter_messages(log_time_order=False)]
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+    assert len(summary.chunk_indexes) > 1
+    assert times == sorted(times)
+    assert len(times) == summary.statistics.message_count == 32_000
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
+    drive = tmp_path / "drive"
+    write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, end='\n{"t": 1.6, "ev')
+    done = run("export", str(drive))
+    assert done.returncode == 0
+    assert "line 8 is cut off" in done.stderr
+    assert len(messages(drive / "drive.mcap")["/position"][2]) == 2
+
+
+@pytest.mark.parametrize(
+    "lines, told",
+    [
+        (["{"], "drive.jsonl: line 1: not JSON: "),
+        ([json.dumps(began("vehicle")), "garbage", "{}"], "drive.jsonl: line 2: not JSON: "),
+        ([json.dumps({"t": 0, "event": "clock_advanced"})], "drive.jsonl: line 1: is no beginning of a drive"),
+        ([json.dumps(began("vehicle") | {"format": 9})], "drive.jsonl: line 1: format: 9: "),
+        ([], "drive.jsonl: is empty"),
+    ],
+)
+def test_what_is_no_drive_is_one_line(tmp_path, lines, told):
+    (tmp_path / "drive.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    done = run("export", str(tmp_path))
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"{tmp_path}/{told}")
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.jsonl"]
+
+
+def test_words_that_are_no_export(tmp_path):
+    drive = tmp_path / "drive"
+    write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "there.mcap").write_text("precious")
+    there = "is there already; remove it, or name another file by output="
+    name = "must name one drive: a directory that log= wrote"
+    for words, told in (
+        ([], f"command line: {name}"),
+        ([str(drive), str(drive)], f"command line: {drive} {drive}: {name}"),
+        ([f"{tmp_path}/none"], f"{tmp_path}/none: no such directory"),
+        ([f"{tmp_path}/empty"], f"{tmp_path}/empty: holds no drive: neither drive.jsonl nor operator.jsonl"),
+        ([str(drive), "mode=single"], "command line: mode=single: an export has no configuration, only output="),
+        (
+            [str(drive), f"output={tmp_path}/there.mcap"],
+            f"command line: output: '{tmp_path}/there.mcap': {there}",
+        ),
+        (
+            [str(drive), f"output={tmp_path}/none/x.mcap"],
+            f"command line: output: '{tmp_path}/none/x.mcap': no such file or directory",
+        ),
+    ):
+        done = run("export", *words)
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{told}\n")
+    assert (tmp_path / "there.mcap").read_text() == "precious"
+    assert [path.name for path in drive.iterdir()] == ["drive.jsonl"]
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd):
+    """The file that takes the bytes is one that has no room."""
+    from runner.__main__ import main
+
+    drive = tmp_path / "drive"
+    write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
+    original = Path.open
+
+    def full(path, mode="r", *args, **kwargs):
+        if mode != "xb":
+            return original(path, mode, *args, **kwargs)
+        path.symlink_to("/dev/full")
+        return original(path, "wb", *args, **kwargs)
+
+    monkeypatch.setattr(Path, "open", full)
+    assert main(["export", str(drive)]) == 1
+    assert capfd.readouterr().err.splitlines() == [f"{drive}/drive.mcap: no space left on device"]
+    assert [path.name for path in drive.iterdir()] == ["drive.jsonl"]
