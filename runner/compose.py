@@ -94,7 +94,7 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
 def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
     """Whether files that speak of the whole document say so; Hydra would put them elsewhere without a word."""
     for file in (find_file(directories, group, choices[group]) for group in WHOLE if group in choices):
-        if file.exists() and PACKAGE_HEADER not in file.read_text(encoding="utf-8"):
+        if file.exists() and PACKAGE_HEADER.encode() not in file.read_bytes():
             rule = f"must begin with the line {PACKAGE_HEADER}"
             raise ConfigError([Problem(label(file, directories), "", None, rule)])
 

@@ -86,7 +86,8 @@ def live_vehicle(
         say(what)
         drive.tell("note", text=what)
 
-    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: note(f"{camera}: {what}"))
+    video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: note(f"{camera}: {what}"), video)
 
     def on_request(payload: bytes) -> None:
         document, identity, problem = read_request(payload)

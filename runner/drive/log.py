@@ -92,6 +92,10 @@ class Log:
         """One line of a kind, at this moment."""
         self.write({"t": self.now(), "log": kind, **keys})
 
+    def video(self, camera: str, file: str, captured: float) -> None:
+        """A video file has its first frame, captured then (s since 1970)."""
+        self.tell("video", camera=camera, file=file, captured=captured)
+
     def close(self) -> None:
         """The clean end."""
         with self._lock:

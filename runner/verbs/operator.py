@@ -60,7 +60,9 @@ def run(arguments: Arguments) -> int:
             station.listeners.append(listener(station, drive))
         with _served(vehicle, station) as page:
             station.connect()
-            side = apply.OperatorSide(plans, station.report, page.show if page else None, arrivals=log is not None)
+            video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+            on_unit = page.show if page else None
+            side = apply.OperatorSide(plans, station.report, on_unit, arrivals=log is not None, video=video)
             drive.begin()
             gc.freeze()  # what is loaded by now stays: collecting it again and again would hold up frames
             until = None if duration is None else time.monotonic() + duration
