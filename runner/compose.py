@@ -83,7 +83,7 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     problems = [p for override in parsed for p in _choice_problems(override, directories)]
     if problems:
         raise ConfigError(problems)
-    _check_headers({o.key: str(o.value) for o in parsed if o.choice}, directories)
+    _check_headers({o.key: str(o.value) for o in parsed if o.key == "experiment"}, directories)
     config, choices = _compose(parsed, directories)
     _check_headers(choices, directories)
     parts = [Part(COMMAND_LINE, (), _nested(o.key, o.value)) for o in reversed(parsed) if not o.choice]

@@ -107,33 +107,36 @@ def composed(overrides: Sequence[str], user: Path | None, base: Base | None = No
     return recompose(*base, overrides, user) if base else compose(overrides, user)
 
 
-def load_experiment(overrides: Sequence[str], user: Path | None) -> tuple[Experiment, LinkSettings | None]:
+def load_experiment(
+    overrides: Sequence[str], user: Path | None, *, runnable: bool = False, check: Check | None = None
+) -> tuple[Experiment, LinkSettings | None]:
     """What the demo drives, and the limited link between its sides.
 
     raises  ConfigError with all problems, also those of maps and traces
     """
-    from runner.experiment import Experiment, read_experiment, read_link
+    from runner.experiment import Experiment, read_experiment, read_link, truth
 
-    builder = _Builder(compose(overrides, user), runnable=False, check=None)
+    builder = _Builder(compose(overrides, user), runnable, check)
     builder.vehicle()
     document, bases = builder.composed.document, [*conf_directories(user), Path.cwd()]
     experiment = builder.part(("experiment",), read_experiment) if "experiment" in document else Experiment()
     if "link" not in document:
         return builder.finished(experiment), None
-    link = None
-    if builder.fine("pqos"):
-        link = builder.part(("link",), lambda data: read_link(data, document["pqos"], bases))
+    rates = builder.part(("pqos",), lambda data: truth(data, bases))
+    link = builder.part(("link",), lambda data: read_link(data, rates, bases)) if rates else None
     return builder.finished(experiment), builder.finished(link)
 
 
-def load_study(overrides: Sequence[str], user: Path | None, *, check: Check | None = None) -> tuple[Vehicle, Study]:
+def load_study(
+    overrides: Sequence[str], user: Path | None, *, runnable: bool = False, check: Check | None = None
+) -> tuple[Vehicle, Study]:
     """The vehicle, and how rate-quality models of its cameras are measured.
 
     raises  ConfigError with all problems
     """
     from runner.rate_quality.study import read_study
 
-    builder = _Builder(compose(overrides, user), runnable=False, check=check)
+    builder = _Builder(compose(overrides, user), runnable, check)
     vehicle = builder.vehicle()
     study = builder.part(("study",), read_study)
     return builder.finished(vehicle), builder.finished(study)

@@ -14,6 +14,7 @@ from runner.pqos import Pqos, build_pqos, trace
 from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
 
+Rates = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
 STEP_S = 0.1  # at which the rate of a link follows a map
 
 
@@ -46,17 +47,14 @@ def read_experiment(data: Mapping[str, Any]) -> Experiment:
     return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs)
 
 
-def read_link(data: Mapping[str, Any], pqos: Mapping[str, Any], bases: Sequence[Path]) -> LinkSettings:
+def read_link(data: Mapping[str, Any], predicted: Rates, bases: Sequence[Path]) -> LinkSettings:
     """The link that the `link` section describes.
 
-    pqos    the section of that name, which the rate follows where the link names no file
-    bases   directories in which a relative file is looked up
-    raises  ModelError with the key, what was found and what is right
+    predicted  the rates that it follows where it names no file, see `truth`
+    bases      directories in which a relative file is looked up
+    raises     ModelError with the key, what was found and what is right
     """
-    if data["file"]:
-        rates = trace(find_file(data, "file", bases), data["loop"], exact(0))
-    else:
-        rates = _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
+    rates = trace(find_file(data, "file", bases), data["loop"], exact(0)) if data["file"] else predicted
     share = float(data["share"])
 
     def kbps_at(t: float) -> float:
@@ -65,8 +63,16 @@ def read_link(data: Mapping[str, Any], pqos: Mapping[str, Any], bases: Sequence[
     return LinkSettings(data["kind"], Limit(kbps_at, float(data["queue_ms"]), float(data["delay_ms"])))
 
 
-def _known(source: Pqos, track: Track | None) -> Callable[[float], Kbps]:
-    """What a source of predictions states for each moment of a drive, kbit/s; 0 where it states nothing."""
+def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> Rates:
+    """What the source of predictions in the `pqos` section states for each moment and place, not looking ahead.
+
+    raises  ModelError with the key, what was found and what is right
+    """
+    return _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
+
+
+def _known(source: Pqos, track: Track | None) -> Rates:
+    """What a source of predictions states for each moment of a drive; 0 where it states nothing."""
     rates: list[Kbps] = []
 
     def kbps_at(t: float) -> Kbps:

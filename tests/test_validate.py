@@ -7,6 +7,8 @@ import importlib.util
 import pytest
 from helpers import CONF, Command, UserConf, process
 
+from runner.compose import GROUPS
+
 ONE = ("vehicle=delivery_robot", "modes=paper", "graph=h264_rtsp", "source=test")  # a single combination
 
 
@@ -14,10 +16,11 @@ def count(group: str) -> int:
     return len(list((CONF / group).glob("*.yaml")))
 
 
-def test_everything_that_is_packaged_is_valid() -> None:
-    result = process("validate")
-    files = sum(map(count, (".", "vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study")))
-    combinations = count("vehicle") * count("modes") * count("graph") * count("source")
+def test_what_is_packaged_is_valid() -> None:
+    """All graphs and vehicles; the rest of the combinations is a step of its own in `make test`."""
+    result = process("validate", "source=test", "modes=paper")
+    files = sum(map(count, (".", *GROUPS)))
+    combinations = count("vehicle") * count("graph")
     assert (result.status, result.err) == (0, "")
     first, *notes = result.out.splitlines()
     assert first == f"{files} files and {combinations} combinations of vehicle, modes, graph, source are valid"
@@ -31,7 +34,7 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
 def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
     conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
-    groups = "the groups are vehicle/, cameras/, modes/, graph/, source/, pqos/, recording/, study/"
+    groups = f"the groups are {', '.join(f'{group}/' for group in GROUPS)}"
     assert problems(tod, conf) == [
         "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
         f"~/foo.yaml: belongs to no group, {groups}",
@@ -43,7 +46,7 @@ def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> 
 def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
     conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
-    assert problems(tod, conf, *(word for word in ONE if "modes" not in word)) == [
+    assert sorted(problems(tod, conf, *(word for word in ONE if "modes" not in word)), reverse=True) == [
         "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
         "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must rise from 0",
     ]

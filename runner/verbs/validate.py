@@ -13,16 +13,17 @@ with status 2 and all problems at once.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, repeat
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 
 from runner import schema
-from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
+from runner.compose import GROUPS, conf_directories, find_file, label, load_file, options, yaml_problem
 from runner.config import Check, load, load_experiment, load_run, load_study
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
@@ -31,6 +32,13 @@ from runner.verbs import Arguments
 
 DATA = ("maps", "traces")  # folders for what pqos files name; a bandwidth map may be YAML
 COMBINED = ("vehicle", "modes", "graph", "source")
+SINGLE: dict[str, Callable[..., object]] = {
+    "pqos": load_run,
+    "recording": load,
+    "study": load_study,
+    "link": load_experiment,
+    "experiment": load_experiment,
+}
 
 
 def run(arguments: Arguments) -> int:
@@ -38,14 +46,12 @@ def run(arguments: Arguments) -> int:
     found, files = check_files(directories)
     if found:
         raise ConfigError(found)
-    combinations = list(_combinations(arguments, directories))
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(combinations))) as pool:
-        chunk = max(1, len(combinations) // (8 * (os.cpu_count() or 1)))
-        results = list(pool.map(_check, combinations, chunksize=chunk))
+    combinations = [Task(load, words) for words in _combinations(arguments, directories)]
+    tasks = [*combinations, *_single_choices(arguments, directories)]
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(tasks))) as pool:
+        chunk = max(1, len(tasks) // (8 * (os.cpu_count() or 1)))
+        results = list(pool.map(_check, tasks, repeat(arguments.conf), chunksize=chunk))
     problems = [problem for result in results for problem in result.problems]
-    problems += _prediction_problems(arguments, directories)
-    problems += _study_problems(arguments, directories)
-    problems += _choice_problems(arguments, directories)
     if problems:
         raise ConfigError(problems)
     notes = dict.fromkeys(note for result in results for note in result.notes)
@@ -88,73 +94,60 @@ def check_file(path: Path, relative: Path, name: str) -> Iterator[Problem]:
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
+class Task(NamedTuple):
+    """Overrides to try, and what composes them: one of the functions of runner.config, called with `runnable=False`."""
+
+    compose: Callable[..., object]
+    overrides: list[str]
+
+
 @dataclass(frozen=True, slots=True)
 class Checked:
     problems: list[Problem]
     notes: list[str]
 
 
-def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator[tuple[list[str], Path | None]]:
+def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator[list[str]]:
     """Overrides for each combination; a choice on the command line narrows its axis."""
-    chosen = {word.partition("=")[0] for word in arguments.overrides}
     axes: list[list[list[str]]] = [[arguments.overrides]]
     for group in COMBINED:
         words = [[f"{group}={option}"] for option in options(group, directories)]
-        axes.append([[]] if group in chosen else words)
+        axes.append([[]] if _chosen(arguments, group) else words)
     for parts in product(*axes):
-        yield [word for part in parts for word in part], arguments.conf
+        yield [word for part in parts for word in part]
 
 
-def _check(combination: tuple[list[str], Path | None]) -> Checked:
-    overrides, user = combination
-    notes: list[str] = []
-    check = _registry_check(notes)
-    try:
-        load(overrides, user, runnable=False, check=check)
-    except ConfigError as error:
-        return Checked(error.problems, [])
-    return Checked([], notes)
-
-
-def _prediction_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
-    """What is wrong with the sources of predictions: maps, traces and tracks are read."""
-    chosen = any(word.lstrip("+~").startswith("pqos") for word in arguments.overrides)
-    for option in [""] if chosen else options("pqos", directories):
-        words = [*arguments.overrides, f"pqos={option}"] if option else arguments.overrides
-        yield from _run_problems(words, arguments.conf)
-
-
-def _choice_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
-    """What is wrong with files that no combination chose: ways to record, links, experiments with all their runs."""
-    for group in ("recording", "link", "experiment"):
-        if any(word.lstrip("+~").startswith(group) for word in arguments.overrides):
+def _single_choices(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Task]:
+    """Each file of the groups that are not combined: maps and traces are read, experiments with all their runs."""
+    yield Task(load_run, arguments.overrides)
+    for group, compose in SINGLE.items():
+        if _chosen(arguments, group):
             continue
         for option in options(group, directories):
             words = [*arguments.overrides, f"{group}={option}"]
-            try:
-                experiment, _ = load_experiment(words, arguments.conf)
-            except ConfigError as error:
-                yield from error.problems
-                continue
-            for added in ((), *experiment.runs.values()) if group == "experiment" else ((),):
-                yield from _run_problems([*words, *added], arguments.conf)
+            yield Task(compose, words)
+            if group == "experiment":
+                yield from (Task(load_run, [*words, *added]) for added in _runs(option, directories))
 
 
-def _run_problems(overrides: list[str], user: Path | None) -> list[Problem]:
+def _chosen(arguments: Arguments, group: str) -> bool:
+    """Whether the command line chooses a file of a group."""
+    return any(word.lstrip("+").partition("=")[0] == group for word in arguments.overrides)
+
+
+def _runs(experiment: str, directories: Sequence[Path]) -> list[list[str]]:
+    """What the runs of an experiment's file add; the file follows its schema."""
+    section = load_file(find_file(directories, "experiment", experiment))["experiment"]
+    return [[], *(section.get("runs") or {}).values()]
+
+
+def _check(task: Task, user: Path | None) -> Checked:
+    notes: list[str] = []
     try:
-        load_run(overrides, user, runnable=False, check=_registry_check([]))
+        task.compose(task.overrides, user, runnable=False, check=_registry_check(notes))
     except ConfigError as error:
-        return error.problems
-    return []
-
-
-def _study_problems(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Problem]:
-    """What is wrong with the ways of measuring models."""
-    for option in options("study", directories):
-        try:
-            load_study([*arguments.overrides, f"study={option}"], arguments.conf)
-        except ConfigError as error:
-            yield from error.problems
+        return Checked(error.problems, [])
+    return Checked([], notes)
 
 
 def _registry_check(notes: list[str]) -> Check | None:
