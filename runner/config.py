@@ -117,13 +117,17 @@ def load_experiment(
     from runner.experiment import Experiment, read_experiment, read_link, truth
 
     builder = _Builder(compose(overrides, user), runnable, check)
-    builder.vehicle()
+    vehicle = builder.vehicle()
     document, bases = builder.composed.document, [*conf_directories(user), Path.cwd()]
     experiment = builder.part(("experiment",), read_experiment) if "experiment" in document else Experiment()
     if "link" not in document:
         return builder.finished(experiment), None
     rates = builder.part(("pqos",), lambda data: truth(data, bases))
     link = builder.part(("link",), lambda data: read_link(data, rates, bases)) if rates else None
+    dialling = [name for name, camera in vehicle.cameras.items() if camera.graph.transport != "rtsp"] if vehicle else []
+    if link and dialling:
+        rule = f"joins sides over RTSP, the graph of {dialling[0]} brings its own line"
+        builder.problems.append(builder.composed.problem(("link", "kind"), link.kind, rule))
     return builder.finished(experiment), builder.finished(link)
 
 

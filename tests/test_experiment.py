@@ -81,3 +81,17 @@ def test_a_run_that_cannot_be_composed_is_told(tod: Command, conf: UserConf) -> 
     result = tod("validate", conf.word, *NARROW)
     assert result.status == 2
     assert "modes: papr: no such file in conf/modes/, did you mean paper?" in result.err
+
+
+def test_a_link_joins_rtsp_only(tod: Command) -> None:
+    result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
+    assert result.status == 2
+    rule = "joins sides over RTSP, the graph of front_left brings its own line"
+    assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
+
+
+def test_what_a_link_does_is_to_be_looked_at(tod: Command) -> None:
+    result = tod("demo", "link=relay", "source=test")
+    assert result.status == 2
+    rule = "what it does is to be looked at: give log=DIR or output=OUT"
+    assert result.err == f"command line: link: relay: {rule}\n"

@@ -10,7 +10,7 @@ with suppress(OSError):
 
 import gi
 
-for _name in ("Gst", "GstPbutils", "GstRtp", "GstRtsp", "GstRtspServer", "GstVideo"):
+for _name in ("Gst", "GstPbutils", "GstRtp", "GstRtsp", "GstRtspServer", "GstSdp", "GstVideo"):
     gi.require_version(_name, "1.0")
 
 from gi.repository import GLib, Gst  # noqa: E402

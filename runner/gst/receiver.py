@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from gi.repository import Gst
+from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan
 from runner.gst.pipeline import counted
@@ -73,7 +73,7 @@ class Receiver:
         video: VideoFiles | None = None,
     ) -> None:
         self._report, self._video = report, video
-        self._sink_name = plan.operator[-1].name
+        self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
@@ -112,6 +112,9 @@ class Receiver:
         self._begun = False
         self._jitter_buffers: list[Gst.Element] = []
         pipeline.connect("deep-element-added", self._on_element)
+        client = pipeline.get_by_name(self._client_name)
+        if GObject.signal_lookup("select-stream", client):
+            take_feedback(client)
         if self._video:
             VideoFile(self._video, self._name, "operator", _came, self._report).follow(pipeline)
         if self._on_unit:
@@ -179,6 +182,21 @@ def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:
     """When a frame was captured, s since 1970; when it came, where the line does not carry that."""
     captured = capture_time(buffer)
     return time.time() if captured is None else captured
+
+
+def take_feedback(client: Gst.Element) -> None:
+    """Let an RTSP client take the stream in the profile in which lost packets are asked for again (RFC 4585, 4588).
+
+    A server that offers both states the stream twice; by itself the client takes the first, which has no feedback.
+    """
+    chosen = [0]
+
+    def on_sdp(_client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
+        profiles = [sdp.get_media(number).get_proto() for number in range(sdp.medias_len())]
+        chosen[0] = next((number for number, profile in enumerate(profiles) if profile.endswith("AVPF")), 0)
+
+    client.connect("on-sdp", on_sdp)
+    client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:

@@ -237,6 +237,36 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
         assert all((ms is None) == (graph == "h264_srt") for _, ms in arrivals)
 
 
+def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
+    """Two drives one after the other, their logs of all three sides, one report of both."""
+    mine = tmp_path / "conf" / "experiment" / "mine.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text(
+        "# @package _global_\n"
+        "defaults: [{override /vehicle: delivery_robot}, {override /source: test}, {override /link: relay}, _self_]\n"
+        "link: {share: 0.7}\n"
+        "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]}}\n"
+    )
+    ports = ("page.serve=false", f"media.port={free_port()}", f"control.port={free_port()}")
+    words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
+    done = run("demo", *words)
+    assert done.returncode == 0, done.stderr
+    for name in ("equal", "paper"):
+        drive = read_drive(tmp_path / "out" / name)
+        assert (sorted(drive.sides), drive.warnings) == (["link", "operator", "vehicle"], [])
+        link = drive.sides["link"].lines
+        assert len(link) > 40
+        assert link[-1]["bytes"] > 500_000
+        predicted = [line["kbps"] for line in drive.sides["vehicle"].lines if line.get("event") == "bitrate_predicted"]
+        assert link[20]["kbps"] <= 0.75 * max(predicted)
+        assert link[-1]["dropped"] > 0  # more was sent than it carries
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "equal" in page and "paper" in page
+    again = run("demo", *words)
+    assert again.returncode == 2
+    assert again.stderr.startswith(f"command line: log: '{tmp_path / 'out' / 'equal'}': holds a drive already")
+
+
 @pytest.mark.skipif(not CLIPS, reason="needs the recorded clips")
 def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     words = (

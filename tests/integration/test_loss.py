@@ -50,3 +50,41 @@ def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
     said = subprocess.run([*command, "-f", "null", "-"], input=data, capture_output=True, check=False).stderr.decode()
     assert "error while decoding" not in said
     assert "concealing" not in said
+
+
+def test_lost_packets_are_sent_again(monkeypatch):
+    """Of those that are lost on the way most come a second time (RFC 4588), and few pictures are left out."""
+    from runner.apply import OperatorSide
+    from runner.gst import Gst
+
+    chance, dropped, buffers = random.Random(1), [], []
+
+    class Lossy(receiver.Receiver):
+        def _on_element(self, pipeline, parent, element):
+            super()._on_element(pipeline, parent, element)
+            kind = element.get_factory().get_name() if element.get_factory() else ""
+            if kind == "udpsrc":
+                element.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._lose)
+            elif kind == "rtpjitterbuffer":
+                buffers.append(element)
+
+        def _lose(self, _pad, info):
+            if info.get_buffer().get_size() < 500 or chance.random() >= 0.01:  # never the control packets
+                return Gst.PadProbeReturn.OK
+            dropped.append(1)
+            return Gst.PadProbeReturn.DROP
+
+    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+    with streaming("fps_max=15") as (side, _, plans, _):
+        knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
+        side.turn([Command("front_left", *knob) for knob in knobs.items()])
+        operator = OperatorSide(plans, lambda *_: None)
+        try:
+            until(lambda: len(dropped) > 30, seconds=60)
+            time.sleep(1)
+            lost = operator.sample({"front_left": True})["front_left"].lost
+        finally:
+            operator.stop()
+    came_again = sum(buffer.get_property("stats").get_value("rtx-success-count") for buffer in buffers)
+    assert came_again > len(dropped) / 2
+    assert lost < len(dropped) / 2
