@@ -15,7 +15,8 @@ test: $(READY)
 	$(BIN)/mypy
 	$(BIN)/check-jsonschema --check-metaschema schemas/*.json
 	$(BIN)/tod-runner validate
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile --ignore=tests/integration
+	$(BIN)/pytest tests/integration
 
 bench: $(READY)
 	$(BIN)/python bench/live.py

@@ -430,9 +430,9 @@ def _sent(sent: Sequence[tuple[float, Mapping[str, Any]]]) -> Sent:
 
 
 def _settled(t: Values, kbps: Values, frames: Values) -> Values:
-    """A rate that is nan until the window it is taken over has filled with video once."""
+    """A rate that is nan until its window has filled with video twice: the first holds what waited for the line."""
     came = t[frames > 0]
-    return np.where(t >= (came[0] if came.size else np.inf) + RATE_WINDOW_S, kbps, np.nan)
+    return np.where(t >= (came[0] if came.size else np.inf) + 2 * RATE_WINDOW_S, kbps, np.nan)
 
 
 def counted(counter: Values) -> Values:

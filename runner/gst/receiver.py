@@ -126,6 +126,8 @@ class Receiver:
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
+            # Frames come in bursts: the packet that is guessed to be next is the next frame's, and not missing.
+            element.set_property("rtx-next-seqnum", False)
             self._jitter_buffers.append(element)
 
     def _count(self) -> Received:
