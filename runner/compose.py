@@ -105,6 +105,8 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
     base    the document, as a drive keeps it; name: where it stands, for messages
     raises  ConfigError
     """
+    if not overrides:
+        return Composed(base, [Part(name, (), base)])
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
