@@ -23,7 +23,7 @@ conf=DIR (or the environment variable TOD_CONF) names a directory of your own; i
   tod-runner VERB --help                             one verb, with examples"""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911
     """Run one verb.
 
     returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C
@@ -48,6 +48,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Who read our output has gone; the interpreter would complain again when it flushes.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a disk that is full, a file that may not be read
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"{where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
+        return 1
 
 
 def _run(words: list[str]) -> int:

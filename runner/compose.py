@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
 COMMAND_LINE = "command line"
 PICKED = "picked"  # package in which a group's file is composed alone
+OPTIONAL = ("link", "experiment")  # groups of which no file need be chosen
+OF_THE_PLACE = ("place", "pose", "weight", "device", "address", "clip", "graph", "source")  # keys of a mount
 WHOLE = ("vehicle", "experiment")  # groups whose files speak of the whole document
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
 
@@ -117,10 +119,10 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
     config = OmegaConf.create(base)
     for override in sorted(parsed, key=lambda o: not o.choice):
         try:
-            if override.text.startswith("~"):
+            if override.text.startswith("~") or override.is_none:
                 above, _, key = override.key.rpartition(".")
-                OmegaConf.select(config, above).pop(key)
-            for key, value in _replaced(override, user):
+                (OmegaConf.select(config, above) if above else config).pop(key, None)
+            for key, value in _replaced(override, config, user):
                 OmegaConf.update(config, key, value, merge=not override.choice)
         except (OmegaConfBaseException, ValueError, TypeError, AttributeError, KeyError) as error:
             rule = str(error).partition("\n")[0]
@@ -130,9 +132,17 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
     return Composed(document, [*parts, Part(name, (), base)])
 
 
-def _replaced(override: Override, user: Path | None) -> Iterator[tuple[str, Any]]:
+def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str, Any]:
+    """Another kind of camera in the place of one that is mounted: what belongs to the place stays."""
+    from omegaconf import OmegaConf
+
+    before = OmegaConf.select(config, package) or {}
+    return {**{key: before[key] for key in OF_THE_PLACE if key in before}, **kind}
+
+
+def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iterator[tuple[str, Any]]:
     """Keys that an override of a composed document sets, and to what."""
-    if override.text.startswith("~"):
+    if override.text.startswith("~") or override.is_none:
         return
     if not override.choice:
         yield override.key, override.value
@@ -145,7 +155,7 @@ def _replaced(override: Override, user: Path | None) -> Iterator[tuple[str, Any]
         yield from ((key, document[key]) for key in ("name", "cameras"))
     else:
         document = compose([f"+{group}@{PICKED}={override.value}"], user).document
-        yield package or group, document[PICKED]
+        yield package or group, _mounted(document[PICKED], config, package) if group == "cameras" else document[PICKED]
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
@@ -161,8 +171,15 @@ class Override:
     choice: bool
 
     @property
+    def is_none(self) -> bool:
+        """Whether it takes away a choice that need not be made."""
+        return self.choice and self.key in OPTIONAL and self.value == "null"
+
+    @property
     def hydra(self) -> str:
         """As Hydra is to read it. A value may add a key that no file states; the schema knows which keys there are."""
+        if self.is_none:
+            return f"~{self.key}"
         return self.text if self.choice or self.text[0] in "+~" else f"++{self.text}"
 
 
@@ -196,7 +213,7 @@ def _parse_overrides(overrides: Sequence[str]) -> list[Override]:
 
 def _choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
     """A choice of a file that is not there, or a value for a key that belongs to the whole document."""
-    if not override.choice or override.value is None:
+    if not override.choice or override.value is None or override.is_none:
         return
     group = override.key.split("@")[0].lstrip("/")
     known = options(group, directories)

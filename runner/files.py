@@ -12,27 +12,36 @@ from runner.errors import RunError, UserError
 
 
 @contextmanager
-def whole_file(path: Path, argument: str = "output", *, also_after_errors: bool = False) -> Iterator[TextIO]:
+def whole_file(path: Path, argument: str = "output", *, partly: bool = False) -> Iterator[TextIO]:
     """A text file for `argument` of the command line, written under another name and put in its place at the end.
 
-    What is there and no file, such as /dev/null, is written to as it is. After an error what was there before stays,
-    unless what was written so far is wanted all the same.
+    What is there and no file, such as /dev/null, is written to as it is. What was there before stays where the writing
+    ends early.
 
-    raises  UserError where it cannot be written
+    partly  keep what was written before a mistake in the input, a UserError
+    raises  UserError where it cannot be opened, RunError where it cannot be written
     """
-    special = path.exists() and not path.is_file()
-    unfinished = path if special else path.with_name(f".{path.name}.{os.getpid()}")
     try:
+        special = path.exists() and not path.is_file()
+        unfinished = path if special else path.with_name(f".{path.name}.{os.getpid()}")
         file = unfinished.open("w", encoding="utf-8")
     except OSError as error:
         raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
-    done = False
+    keep = False
     try:
         with file:
-            yield file
-        done = True
+            try:
+                yield file
+            except UserError:
+                keep = partly
+                raise
+        keep = True
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     finally:
-        if not special and (done or also_after_errors):
+        if not special and keep:
             unfinished.replace(path)
         elif not special:
             unfinished.unlink(missing_ok=True)

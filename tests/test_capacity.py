@@ -91,4 +91,7 @@ def test_what_cannot_give_a_map_is_told(tod: Command, tmp_path: Path) -> None:
         result = tod("map", *words)
         assert result.status == status, result.err
         assert result.err.startswith(told) and result.err.count("\n") == 1
+    alone = write_drive(tmp_path / "alone", ["vehicle"], seconds=5)
+    assert tod("map", str(alone), output).err == f"no map: {alone} has no operator's log\n"
+    assert tod("map", str(good), output, "percentil=5").err.startswith("command line: percentil=5: unknown argument")
     assert not (tmp_path / "map.csv").exists()

@@ -54,7 +54,10 @@ def test_another_drive_breaks_the_claims_that_it_should(tmp_path: Path, override
 def test_short_drives_and_other_vehicles_are_no_driving_test(tmp_path: Path) -> None:
     short = held(write_drive(tmp_path / "short", ["vehicle"], seconds=30, overrides=TEST))
     assert short["The test takes approximately 100 s"] is False
-    assert short["Between 70 and 90 s less is predicted, and no resolution is changed"] is False
+    assert short["Between 70 and 90 s less is predicted, and no resolution is changed"] is None
+    assert short["Around 55 s lower resolutions are selected for all cameras except front center"] is None
+    blink = held(write_drive(tmp_path / "blink", ["vehicle"], seconds=1, overrides=TEST))
+    assert blink == {"The test takes approximately 100 s": False}
     robot = held(write_drive(tmp_path / "robot", seconds=5, overrides=(*TEST, "vehicle=delivery_robot")))
     assert robot == {"The paper's vehicle is driven": False}
 

@@ -56,7 +56,6 @@ def begun(directory: Path, config: dict[str, Any] | None = None) -> Log:
 def test_a_drive_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     log = Log(tmp_path / "a" / "drive", "operator", {"name": "tum_q7"}, {"GStreamer": "1.22"}, lambda what: None)
     log.tell("note", text="before the beginning")
-    assert not (tmp_path / "a").exists()  # what does not begin leaves nothing
     log.begin()
     log.tell("note", text="grün")
     log.close()
@@ -121,6 +120,46 @@ def test_where_nothing_can_be_written_is_told_before_the_drive(tmp_path: Path) -
     begun(tmp_path / "drive").close()
     with pytest.raises(UserError, match=r"holds a drive already \(drive.jsonl\), choose another directory"):
         Log(tmp_path / "drive", "vehicle", {}, {}, print)
+
+
+def test_what_never_begins_leaves_nothing(tmp_path: Path) -> None:
+    log = Log(tmp_path, "vehicle", {}, {}, print)
+    with pytest.raises(UserError, match="is empty: nothing was logged"):
+        read_drive(tmp_path)
+    log.close()
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "drive.jsonl").touch()  # of a process that was killed before it began
+    begun(tmp_path).close()
+    assert len(written(tmp_path)) == 2
+
+
+def test_who_is_told_of_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None:
+    """As the operator's station does: what it is told becomes a note of the log that has just ended."""
+    code = (
+        "import resource, sys; from pathlib import Path; from runner.drive.log import Log\n"
+        "log = Log(Path(sys.argv[1]), 'operator', {}, {}, lambda what: log.tell('note', text=what))\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000)); log.begin()\n"
+        "for n in range(9): log.tell('note', text='x' * 1000)\n"
+        "log.close(); print('done')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout == "done\n", done.stderr
+
+
+def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
+    """A request may name any camera; that it is refused is a line, too."""
+    log = begun(tmp_path)
+    event = {"t": 0.1, "event": "camera_switched", "camera": "\ud800", "on": False}
+    log.write(event)
+    log.close()
+    assert read_drive(tmp_path).sides["vehicle"].lines == [event]
 
 
 @pytest.mark.parametrize(

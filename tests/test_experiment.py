@@ -83,6 +83,27 @@ def test_a_run_that_cannot_be_composed_is_told(tod: Command, conf: UserConf) -> 
     assert "modes: papr: no such file in conf/modes/, did you mean paper?" in result.err
 
 
+def test_a_link_and_an_experiment_need_not_be_chosen() -> None:
+    assert "link" not in compose(["experiment=bottleneck", "link=null"]).document
+    assert "experiment" not in compose(["experiment=null"]).document
+
+
+def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> None:
+    conf.write(
+        "experiment/mine.yaml",
+        HEAD + "defaults: [driving_test, _self_]\nlog: {video: true}\nexperiment: {about: x, duration_s: 9}\n",
+    )
+    result = tod("validate", conf.word, *NARROW)
+    assert result.status == 0, result.err
+    conf.write("experiment/mine.yaml", HEAD + "defaults: [bottleneck, _self_]\nmode: collective\n")
+    assert "experiment: missing: must be given" not in tod("validate", conf.word, *NARROW).err
+    conf.write(
+        "experiment/mine.yaml",
+        HEAD + "defaults: [_self_]\nexperiment: {about: x, duration_s: 9, runs: {a: [modes=papr]}}\n",
+    )
+    assert "did you mean paper?" in tod("validate", conf.word, *NARROW).err
+
+
 def test_a_link_joins_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2

@@ -389,6 +389,36 @@ def test_files_that_are_no_drive_are_told(tod: Command, drive: Path, tmp_path: P
     assert result.err == f"command line: input: '{tmp_path}/drive.jsonl': no such file or directory\n"
 
 
+def test_what_is_read_is_not_written_over(tod: Command, drive: Path) -> None:
+    path = drive / "drive.jsonl"
+    before = path.read_bytes()
+    for word in (drive, path):
+        result = tod("replay", f"input={word}", f"output={path}")
+        assert (result.status, path.read_bytes()) == (2, before)
+        assert result.err == f"command line: output: '{path}': is what is read, choose another file\n"
+
+
+def test_an_answer_that_does_not_come_to_its_end_leaves_no_drive(
+    tod: Command, events_file: Path, tmp_path: Path
+) -> None:
+    with events_file.open("a") as file:
+        file.write("no\n")
+    result = tod("replay", *PAPER, f"input={events_file}", f"log={tmp_path / 'answer'}")
+    assert result.status == 2
+    assert list((tmp_path / "answer").iterdir()) == []
+
+
+def test_another_kind_of_camera_stays_in_its_place(tod: Command, drive: Path, tmp_path: Path) -> None:
+    words = ("cameras@cameras.rear_center=wide_720p", "cameras.rear_center.weight=2")
+    assert tod("replay", *words, f"input={drive}", f"log={tmp_path / 'if'}").status == 0
+    before, after = (json.loads((d / "drive.jsonl").open().readline())["config"] for d in (drive, tmp_path / "if"))
+    was, now = before["cameras"]["rear_center"], after["cameras"]["rear_center"]
+    assert {key: now[key] for key in ("place", "pose", "device")} == {
+        key: was[key] for key in ("place", "pose", "device")
+    }
+    assert (now["height_px"], now["weight"]) == (720, 2)
+
+
 def test_a_drive_is_never_written_over(tod: Command, drive: Path, story: Path) -> None:
     before = (drive / "drive.jsonl").read_bytes()
     result = tod("replay", f"input={story}", f"log={drive}")

@@ -67,7 +67,12 @@ def test_a_freeze_is_part_of_later_means() -> None:
 def test_nothing_is_judged_by_less_than_five_gaps() -> None:
     assert freezes(arrivals(*[0.025] * 4, 1.0, 0.025), [(0.0, 1.125)]) == []
     assert len(freezes(arrivals(*[0.025] * 5, 1.0, 0.025), [(0.0, 1.15)])) == 1
-    assert freezes(np.empty(0), ALWAYS) == []
+    assert freezes(np.empty(0), [(0.0, 1.9)]) == []
+
+
+def test_a_stream_that_never_comes_or_stops_before_it_can_be_judged_freezes() -> None:
+    assert freezes(np.empty(0), [(0.0, 50.0), (60.0, 100.0)]) == [Freeze(0.0, 50.0), Freeze(60.0, 40.0)]
+    assert freezes(arrivals(0.025, 0.025), [(0.0, 10.0)])[-1].seconds == pytest.approx(9.95, abs=0.1)
 
 
 def test_a_camera_that_is_not_sent_does_not_freeze() -> None:

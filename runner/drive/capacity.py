@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.drive.series import Positions, Series, Values
+from runner.pqos.bandwidth_map import EARTH_M
 
 WINDOW_S = 1.0  # that the rates of the samples are taken over
 WAITED_MS = 50.0  # more than the least latency of the drive: the queue before the link was filling
 GAP_S = 2.0  # positions further apart say nothing of the time between
-EARTH_M = 6378137.0  # WGS-84 equatorial radius
 
 
 class Sample(NamedTuple):
@@ -36,11 +36,18 @@ class Cell(NamedTuple):
     samples: int
 
 
+def cannot_tell(drive: Series) -> str:
+    """Why a drive says nothing of the link, or ""."""
+    if not any(camera.received for camera in drive.cameras.values()):
+        return "has no operator's log"
+    return "" if drive.positions else "has no positions"
+
+
 def limited_samples(drive: Series) -> list[Sample]:
-    """The samples of a drive in which the link was the limit."""
-    received = [camera.received for camera in drive.cameras.values() if camera.received]
-    if not received or drive.positions is None:
+    """The samples of a drive in which the link was the limit; none where it cannot tell."""
+    if cannot_tell(drive) or drive.positions is None:
         return []
+    received = [camera.received for camera in drive.cameras.values() if camera.received]
     t, kbps = drive.actual
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
@@ -100,7 +107,8 @@ def _waited(at: Values, t: Values, latency_ms: Values) -> np.ndarray[tuple[int, 
 def _at(positions: Positions, t: Values) -> tuple[Values, Values]:
     """Degrees in the middle of the second before each time; nan where no position is near."""
     middle = t - WINDOW_S / 2
-    nearest = np.abs(positions.t[None, :] - middle[:, None]).min(axis=1) if t.size else np.empty(0)
-    far = nearest > GAP_S
+    after = np.searchsorted(positions.t, middle).clip(1, max(1, len(positions.t) - 1))
+    neighbours = positions.t[[after - 1, np.minimum(after, len(positions.t) - 1)]]
+    far = np.abs(neighbours - middle).min(axis=0) > GAP_S
     lat, lon = (np.interp(middle, positions.t, values) for values in (positions.lat, positions.lon))
     return np.where(far, np.nan, lat), np.where(far, np.nan, lon)

@@ -16,6 +16,7 @@ from runner.errors import UserError
 from runner.step import Run
 
 FORMAT = 1
+WITHOUT_LOG = "the drive goes on without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 
 
@@ -40,9 +41,8 @@ class Log:
         versions: Mapping[str, str],
         report: Callable[[str], None],
     ) -> None:
-        if directory is not None:
-            check_free(directory, side)
-        self._directory, self._fd = directory, -1
+        self._path = None if directory is None else directory / FILES[side]
+        self._fd = -1 if directory is None else _create(directory, side)
         self._side, self._config, self._versions, self._report = side, config, versions, report
         self._lock = threading.Lock()
         self._began: float | None = None
@@ -51,12 +51,10 @@ class Log:
         self._early: list[Mapping[str, Any]] = []
 
     def begin(self, at: float | None = None) -> None:
-        """Time 0 of the drive: now the file is there.
+        """Time 0 of the drive.
 
         at  s since 1970, of a drive of the past whose lines bring their times; None: now
         """
-        if self._directory is not None:
-            self._fd = _create(self._directory, self._side)
         self.time = time.time() if at is None else at
         first = {
             "t": 0.0,
@@ -69,8 +67,8 @@ class Log:
         }
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
-            for line in (first, *self._early):
-                self._append(line)
+            failed = [self._append(line) for line in (first, *self._early)]
+        self._tell_failed(*failed)
 
     def now(self) -> float:
         """Time since the beginning, s."""
@@ -86,7 +84,8 @@ class Log:
                 return
             if self._past is not None:
                 self._past = line["t"]
-            self._append(line)
+            failed = self._append(line)
+        self._tell_failed(failed)
 
     def tell(self, kind: str, **keys: Any) -> None:
         """One line of a kind, at this moment."""
@@ -97,37 +96,61 @@ class Log:
         self.tell("video", camera=camera, file=file, captured=captured)
 
     def close(self) -> None:
-        """The clean end."""
+        """The clean end; a drive that never began leaves nothing."""
         with self._lock:
-            self._append({"t": self.now(), "log": "ended"})
-            if self._fd >= 0:
-                os.close(self._fd)
-            self._fd = -1
+            if self._began is not None:
+                self._append({"t": self.now(), "log": "ended"})
+            self._end(keep=self._began is not None)
 
-    def _append(self, line: Mapping[str, Any]) -> None:
+    def discard(self) -> None:
+        """Give up a log that did not come to its end."""
+        with self._lock:
+            self._end(keep=False)
+
+    def _end(self, keep: bool) -> None:
         if self._fd < 0:
             return
-        data = (json.dumps(line, ensure_ascii=False) + "\n").encode()
+        os.close(self._fd)
+        self._fd = -1
+        if self._path and not keep:
+            self._path.unlink(missing_ok=True)
+
+    def _append(self, line: Mapping[str, Any]) -> str:
+        """Write a line; returns why there will be no more, or ""."""
+        if self._fd < 0:
+            return ""
+        # Half of a surrogate pair, as a request or a file's name may hold, is written as JSON has it.
+        data = (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
         try:
             if os.write(self._fd, data) == len(data):
-                return
+                return ""
             why = "no space left on device"
         except OSError as error:
             why = (error.strerror or str(error)).lower()
-        os.close(self._fd)
-        self._fd = -1
-        self._report(f"the drive goes on without its log: {FILES[self._side]}: {why}")
+        self._end(keep=True)
+        return f"{WITHOUT_LOG}: {FILES[self._side]}: {why}"
+
+    def _tell_failed(self, *failed: str) -> None:
+        """Outside the lock: who is told may write a line of its own."""
+        for why in filter(None, failed):
+            self._report(why)
 
 
 def check_free(directory: Path, side: str) -> None:
-    """raises UserError where this side of a drive is there already"""
-    if os.path.lexists(directory / FILES[side]):
-        raise _refused(directory, f"holds a drive already ({FILES[side]}), choose another directory")
+    """raises UserError where this side of a drive is there already; a file without a line is none"""
+    path = directory / FILES[side]
+    try:
+        if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
+            raise _refused(directory, f"holds a drive already ({FILES[side]}), choose another directory")
+    except OSError as error:
+        raise _refused(directory, (error.strerror or str(error)).lower()) from None
 
 
 def _create(directory: Path, side: str) -> int:
     """A new file of a drive, open for appending."""
+    check_free(directory, side)
     try:
+        (directory / FILES[side]).unlink(missing_ok=True)
         directory.mkdir(parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
         return os.open(directory / FILES[side], flags, 0o666)

@@ -65,8 +65,11 @@ def read_drive(directory: Path) -> Drive:
 
 
 def _side(side: str, path: Path, warnings: list[str]) -> Side:
-    with path.open(encoding="utf-8", errors="replace") as file:
-        lines = [line for _, line in read_lines(file, str(path), warnings)]
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            lines = [line for _, line in read_lines(file, str(path), warnings)]
+    except OSError as error:
+        raise UserError(str(path), "", None, (error.strerror or str(error)).lower()) from None
     began = check_began(lines[0] if lines else None, str(path))
     if began["side"] != side:
         raise UserError(f"{path}: line 1", "side", repr(began["side"]), f"must be {side}")

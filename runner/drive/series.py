@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from runner.drive.read import Drive, Side
 from runner.errors import UserError
+from runner.pqos.bandwidth_map import EARTH_M
 
 Values = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-EARTH_M = 6378137.0  # WGS-84 equatorial radius, as runner.pqos.bandwidth_map takes it
 RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
 DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
 PANEL_CAMERAS = 4  # as many curves are told apart in one panel; more are split where the mounting gives no groups
@@ -154,7 +154,6 @@ class Series:
     end        s; the last line of the side that gives the axis
     measured   "received" or "sent": what `actual` is; "" where neither was logged
     predicted, allocated  each value holds until the next
-    total      the total in force before the cap at demand
     modes      (from s, mode)
     notes      (s, text)
     refused    requests
@@ -412,10 +411,12 @@ def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Rec
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
+    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame that was told before
     return Received(
         t=t,
         kbps=_settled(t, column("kbps"), frames),
-        **{key: column(key) for key in ("fps", "width", "height", "latency_ms")},
+        **{key: column(key) for key in ("fps", "width", "height")},
+        latency_ms=np.where(moved, column("latency_ms"), np.nan),
         frames=frames,
         **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
         arrival_t=arrivals[:, 0],

@@ -18,6 +18,7 @@ from runner.drive.series import CameraSeries, Line, Received, Series, Values, he
 FREEZE_GAPS = 30  # gaps that the mean is taken over (W3C webrtc-stats, freezeCount)
 FREEZE_FACTOR = 3.0  # of the mean gap
 FREEZE_MORE_S = 0.15  # over the mean gap
+FREEZE_STALLED_S = 2.0  # a stream that stops before it can be judged so, and for so long
 FREEZE_FIRST = 5  # gaps before a gap can be judged; the text leaves it open, libwebrtc waits for as many
 SECOND_S = 1.0
 NAN = float("nan")
@@ -241,12 +242,13 @@ def freezes(arrivals: Values, sending: Iterable[tuple[float, float]]) -> list[Fr
     returns   the whole gap of each, as totalFreezesDuration takes it
 
     The definition counts a freeze when the next frame comes. A stream that stops for good while it is to be sent is
-    counted too, up to the end of the span: else the worst case would look perfect.
+    counted too, up to the end of the span, and one that never begins: else the worst case would look perfect.
     """
     found = []
     for begin, until in sending:
         inside = arrivals[np.searchsorted(arrivals, begin) : np.searchsorted(arrivals, until, "right")]
         if not inside.size:
+            found += [Freeze(begin, until - begin)] if until - begin >= FREEZE_STALLED_S else []
             continue
         ends = np.append(inside[1:], until)
         gaps = ends - inside
@@ -255,6 +257,7 @@ def freezes(arrivals: Values, sending: Iterable[tuple[float, float]]) -> list[Fr
         first = np.maximum(index - FREEZE_GAPS, 0)
         means = (sums[index] - sums[first]) / np.maximum(index - first, 1)
         frozen = (gaps >= np.maximum(FREEZE_FACTOR * means, means + FREEZE_MORE_S) - 1e-9) & (index >= FREEZE_FIRST)
+        frozen[-1] |= gaps[-1] >= FREEZE_STALLED_S
         found += [Freeze(float(inside[i]), float(gaps[i])) for i in np.flatnonzero(frozen)]
     return found
 

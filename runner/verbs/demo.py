@@ -33,17 +33,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
 from runner.broker import private_broker
 from runner.compose import conf_directories
 from runner.config import composed, load_experiment, load_run
-from runner.drive.log import FILES, Log, check_free
+from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
 from runner.errors import RunError, UserError
 from runner.experiment import LinkSettings
 from runner.link import LimitedLink, limited_link
 from runner.model import Vehicle
 from runner.sources import render_missing
 from runner.verbs import Arguments
+from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
 
 FPS_PER_CORE = 5  # Hz; what is encoded, sent, decoded and shown eight times without falling behind
@@ -51,38 +54,62 @@ LOOK_S = 0.05  # how soon after a side's end the other is stopped
 DRIVE = "drive"  # where a drive lies below output=
 
 
+class _Run(NamedTuple):
+    """One of the drives that are made.
+
+    arguments  with the overrides of this one
+    directory  where it is logged; None: nowhere
+    """
+
+    name: str
+    arguments: Arguments
+    vehicle: Vehicle
+    directory: Path | None
+    link: LinkSettings | None
+
+
 def run(arguments: Arguments) -> int:
     apply = streaming()
     arguments = _with_rate(arguments)
-    experiment, link = load_experiment(arguments.overrides, arguments.conf)
+    experiment, _ = load_experiment(arguments.overrides, arguments.conf)
     duration_s = arguments.number("duration_s")
     duration_s = experiment.duration_s if duration_s is None else duration_s
-    runs = experiment.runs or {"": ()}
-    drives = {name: _directory(arguments, name) for name in runs}
-    if link and None in drives.values():
+    output, models = arguments.path("output"), arguments.path("models")
+    if output:
+        check_report(output, models)
+    elif models:
+        raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
+    runs = [_prepared(arguments, name, words, apply) for name, words in (experiment.runs or {"": ()}).items()]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no side is left behind
+    if experiment.about:
+        say(experiment.about)
+    status, driven = 0, list[Path]()
+    for number, one in enumerate(runs, 1):
+        if one.name:
+            say(f"drive {number} of {len(runs)}: {one.name}, {duration_s:g} s")
+        status = _drive(one, duration_s)
+        if status:
+            break
+        driven += [one.directory] if one.directory else []
+    if output and driven:
+        bases = [base / "cameras" for base in conf_directories(arguments.conf)]
+        say(f"report: {report(driven, output, models, bases)}")
+    return status
+
+
+def _prepared(arguments: Arguments, name: str, words: Sequence[str], apply: ModuleType) -> _Run:
+    """All that a drive needs, looked at before the first begins."""
+    own = replace(arguments, overrides=[*arguments.overrides, *words])
+    directory = _directory(arguments, name)
+    _, link = load_experiment(own.overrides, own.conf)
+    if link and directory is None:
         raise UserError(
             "command line", "link", link.kind, "what it does is to be looked at: give log=DIR or output=OUT"
         )
-    vehicles = {}
-    for name, words in runs.items():
-        overrides = [*arguments.overrides, *words]
-        vehicles[name], _, _ = load_run(overrides, arguments.conf, check=apply.check_plan)
-        with progress_bar() as progress:
-            render_missing(vehicles[name], progress)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no side is left behind
-    status = 0
-    for number, (name, words) in enumerate(runs.items(), 1):
-        if name:
-            say(f"drive {number} of {len(runs)}: {name}, {duration_s:g} s")
-        own = replace(arguments, overrides=[*arguments.overrides, *words])
-        status = status or _drive(own, vehicles[name], drives[name], duration_s, link)
-    if output := arguments.path("output"):
-        from runner.verbs.report import report
-
-        bases = [base / "cameras" for base in conf_directories(arguments.conf)]
-        page = report([drive for drive in drives.values() if drive], output, arguments.path("models"), bases)
-        say(f"report: {page}")
-    return status
+    vehicle, _, _ = load_run(own.overrides, own.conf, check=apply.check_plan)
+    with progress_bar() as progress:
+        render_missing(vehicle, progress)
+    return _Run(name, own, vehicle, directory, link)
 
 
 def _with_rate(arguments: Arguments) -> Arguments:
@@ -111,51 +138,61 @@ def _directory(arguments: Arguments, run: str) -> Path | None:
     return directory
 
 
-def _drive(
-    arguments: Arguments, vehicle: Vehicle, directory: Path | None, duration_s: float, settings: LinkSettings | None
-) -> int:
-    """One drive of both sides; returns the operator's exit status."""
-    own = [*arguments.overrides, *([f"conf={arguments.conf}"] if arguments.conf else [])]
-    own += [f"log={directory}"] if directory else []
+def _drive(run: _Run, duration_s: float) -> int:
+    """One drive of both sides; returns the operator's exit status.
+
+    raises  RunError where the vehicle's side or the link ends before the operator's
+    """
+    own = [*run.arguments.overrides, *([f"conf={run.arguments.conf}"] if run.arguments.conf else [])]
+    own += [f"log={run.directory}"] if run.directory else []
     with (
         tempfile.TemporaryFile("w+") as said,
-        _link(arguments, vehicle, directory, settings) as (link, log),
-        private_broker(link.broker if link else vehicle.control),
-        _side("vehicle", [*own, *(link.vehicle_overrides if link else ())], link, said.fileno()) as vehicle_side,
+        _link(run) as (link, log),
+        private_broker(link.broker if link else run.vehicle.control),
+        _side("vehicle", [*own, *(link.vehicle_overrides if link else ())], link, said.fileno()) as vehicle,
         _side("operator", [*own, *(link.operator_overrides if link else ()), f"duration_s={duration_s}"]) as operator,
     ):
         waiting = link is not None
         try:
-            while (status := operator.poll()) is None:
-                if waiting and link and directory and (began := _began(directory)):
+            while (status := operator.poll()) is None and vehicle.poll() is None:
+                if waiting and link and run.directory and (began := _began(run.directory)):
                     waiting = False
                     log.begin(began)
                     link.start(began)
+                if link:
+                    link.check()
                 time.sleep(LOOK_S)
         finally:
-            early = vehicle_side.poll()
-            operator.terminate()
-            vehicle_side.terminate()
-            vehicle_side.wait()
+            early = vehicle.poll()
+            for side in (operator, vehicle):
+                side.terminate()
+            for side in (operator, vehicle):
+                side.wait()
+        said.seek(0)
+        text = said.read().strip()
         if early is not None:
-            said.seek(0)
-            raise RunError(f"the vehicle's side ended early:\n{said.read().strip()}")
-    return status
+            raise RunError(f"the vehicle's side ended early:\n{text}")
+        for line in text.splitlines():
+            if WITHOUT_LOG in line:
+                say(line)
+    return status or 0
 
 
 @contextmanager
-def _link(
-    arguments: Arguments, vehicle: Vehicle, directory: Path | None, settings: LinkSettings | None
-) -> Iterator[tuple[LimitedLink | None, Log]]:
+def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
     """The limited link between the sides, where there is one, and its log."""
-    config = composed(arguments.overrides, arguments.conf).document
-    log = Log(directory if settings else None, "link", config, {}, say)
-    if settings is None:
-        yield None, log
-        return
-    with limited_link(settings.kind, settings.limit, vehicle.media, vehicle.control, log.write) as link:
-        yield link, log
-    log.close()
+    config = composed(run.arguments.overrides, run.arguments.conf).document
+    settings = run.link
+    log = Log(run.directory if settings else None, "link", config, {}, say)
+    try:
+        if settings is None:
+            yield None, log
+            return
+        media, control = run.vehicle.media, run.vehicle.control
+        with limited_link(settings.kind, settings.limit, media, control, log.write) as link:
+            yield link, log
+    finally:
+        log.close()
 
 
 def _began(directory: Path) -> float | None:

@@ -27,9 +27,10 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain, islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from runner.config import composed, load, load_run
+from runner.config import Base, composed, load, load_run
 from runner.decision import Decision
 from runner.drive.log import FILES, Log, run_lines
 from runner.drive.read import Line, check_began, is_log, read_line, read_lines
@@ -52,12 +53,10 @@ _encode = json.JSONEncoder(ensure_ascii=False).encode
 def run(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
-        vehicle, pqos, log = _load(arguments, name, began)
-        with _output(arguments) as output:
+        vehicle, pqos = _load(arguments, name, began)
+        with _output(arguments) as output, _log(arguments, name, began) as log:
             for line in replay(vehicle, events(lines, name), pqos, log):
                 output.write(line)
-        if log:
-            log.close()
     return 0
 
 
@@ -76,20 +75,36 @@ def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Line | None]:
     return chain(first, lines), line
 
 
-def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None, Log | None]:
-    """The configuration of the drive, or the composed one, with the overrides on top; and a log for the answer."""
-    base = (began["config"], f"{name}: line 1: config") if began else None
-    overrides, directory, pqos = arguments.overrides, arguments.path("log"), None
+def _base(name: str, began: Line | None) -> Base | None:
+    """The configuration that a drive was driven with."""
+    return (began["config"], f"{name}: line 1: config") if began else None
+
+
+def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None]:
+    """The configuration of the drive, or the composed one, with the overrides on top."""
+    overrides, base = arguments.overrides, _base(name, began)
     if any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in overrides):
         vehicle, pqos, _ = load_run(overrides, arguments.conf, runnable=False, base=base)
-    else:
-        vehicle = load(overrides, arguments.conf, runnable=False, base=base)
+        return vehicle, pqos
+    return load(overrides, arguments.conf, runnable=False, base=base), None
+
+
+@contextmanager
+def _log(arguments: Arguments, name: str, began: Line | None) -> Iterator[Log | None]:
+    """The answer as a drive, there only when it is whole; None where nobody asks for it."""
+    directory = arguments.path("log")
     if directory is None:
-        return vehicle, pqos, None
-    config = composed(overrides, arguments.conf, base).document
+        yield None
+        return
+    config = composed(arguments.overrides, arguments.conf, _base(name, began)).document
     log = Log(directory, "vehicle", config, {}, lambda what: print(what, file=sys.stderr))
-    log.begin(began["time"] if began else 0.0)
-    return vehicle, pqos, log
+    try:
+        log.begin(began["time"] if began else 0.0)
+        yield log
+    except BaseException:
+        log.discard()
+        raise
+    log.close()
 
 
 def replay(
@@ -166,13 +181,19 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
         yield "standard input", sys.stdin
         return
-    if path.is_dir():
-        path /= FILES["vehicle"]
     try:
+        path = path / FILES["vehicle"] if path.is_dir() else path
+        _keep(path, arguments.path("output"))
         with path.open(encoding="utf-8", errors="replace") as file:
             yield str(path), file
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+    except OSError as error:
         raise UserError("command line", "input", repr(str(path)), (error.strerror or "").lower()) from None
+
+
+def _keep(path: Path, output: Path | None) -> None:
+    """raises UserError where what is read would be written over"""
+    if output and output.is_file() and path.exists() and output.samefile(path):
+        raise UserError("command line", "output", repr(str(output)), "is what is read, choose another file")
 
 
 @contextmanager
@@ -184,5 +205,5 @@ def _output(arguments: Arguments) -> Iterator[TextIO]:
         sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)  # type: ignore[union-attr]
         yield sys.stdout
         return
-    with whole_file(path, also_after_errors=True) as file:  # also after a bad line: what was put out before stays
+    with whole_file(path, partly=True) as file:
         yield file

@@ -33,7 +33,6 @@ DOCUMENT = "report.json"
 
 def run(arguments: Arguments) -> int:
     paths, output = _wanted(arguments)
-    _need_libraries()
     page = report(
         paths, output, arguments.path("models"), [base / "cameras" for base in conf_directories(arguments.conf)]
     )
@@ -72,6 +71,19 @@ def report(
     return index
 
 
+def check_report(output: Path, models: Path | None) -> None:
+    """Whether a report can be made once there are drives.
+
+    raises  UserError where the directories are none, RunError where a library is missing
+    """
+    above = next((path for path in (output, *output.parents) if path.exists()), Path())
+    if not above.is_dir():
+        raise UserError("command line", "output", repr(str(output)), f"must be a directory, {above} is a file")
+    if models and not models.is_dir():
+        raise UserError("command line", "models", repr(str(models)), "no such directory")
+    _need_libraries()
+
+
 def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
     if arguments.overrides:
         rule = f"unknown argument, there is {', '.join((*_own(), 'conf'))}"
@@ -81,9 +93,7 @@ def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
     output = arguments.path("output")
     if output is None:
         raise UserError("command line", "output", None, "must be given: the directory that the report is written to")
-    above = next((path for path in (output, *output.parents) if path.exists()), Path())
-    if not above.is_dir():
-        raise UserError("command line", "output", repr(str(output)), f"must be a directory, {above} is a file")
+    check_report(output, arguments.path("models"))
     return [Path(word) for word in arguments.words], output
 
 

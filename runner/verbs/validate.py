@@ -23,8 +23,8 @@ from typing import NamedTuple
 import yaml
 
 from runner import schema
-from runner.compose import GROUPS, conf_directories, find_file, label, load_file, options, yaml_problem
-from runner.config import Check, load, load_experiment, load_run, load_study
+from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
+from runner.config import Check, composed, load, load_experiment, load_run, load_study
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan
 from runner.model import ModelError
@@ -127,7 +127,7 @@ def _single_choices(arguments: Arguments, directories: Sequence[Path]) -> Iterat
             words = [*arguments.overrides, f"{group}={option}"]
             yield Task(compose, words)
             if group == "experiment":
-                yield from (Task(load_run, [*words, *added]) for added in _runs(option, directories))
+                yield from (Task(load_run, [*words, *added]) for added in _runs(words, arguments.conf))
 
 
 def _chosen(arguments: Arguments, group: str) -> bool:
@@ -135,10 +135,15 @@ def _chosen(arguments: Arguments, group: str) -> bool:
     return any(word.lstrip("+").partition("=")[0] == group for word in arguments.overrides)
 
 
-def _runs(experiment: str, directories: Sequence[Path]) -> list[list[str]]:
-    """What the runs of an experiment's file add; the file follows its schema."""
-    section = load_file(find_file(directories, "experiment", experiment))["experiment"]
-    return [[], *(section.get("runs") or {}).values()]
+def _runs(overrides: list[str], user: Path | None) -> list[list[str]]:
+    """What the runs of an experiment add; nothing where it cannot be composed, which is told elsewhere."""
+    try:
+        section = composed(overrides, user).document.get("experiment")
+    except ConfigError:
+        return []
+    runs = section.get("runs") if isinstance(section, dict) else None
+    added = runs.values() if isinstance(runs, dict) else ()
+    return [[], *(words for words in added if isinstance(words, list) and all(isinstance(w, str) for w in words))]
 
 
 def _check(task: Task, user: Path | None) -> Checked:

@@ -132,7 +132,7 @@ function latencyOverTime(drive) {
   const said = watched ? "no freezes" : "arrivals were not logged: freezes are not known";
   const annotations = frozen.length ? [] : [{ text: said, showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.03, font: { size: 12, color: themed("muted") } }];
   const yaxis = spread("latency in ms", low, high, { domain: [strip + 0.08, 1] });
-  const yaxis2 = axis("", { domain: [0, strip], type: "category", tickfont: { size: 11 }, visible: frozen.length > 0 });
+  const yaxis2 = axis("", { domain: [0, strip], type: "category", dtick: 1, tickfont: { size: frozen.length > 4 ? 9 : 11 }, visible: frozen.length > 0 });
   return { traces, layout: { xaxis: time({ anchor: "free", position: 0 }), yaxis, yaxis2, annotations, bargap: 0.2, barmode: "overlay", hovermode: "closest" } };
 }
 
