@@ -15,8 +15,8 @@ test: $(READY)
 	$(BIN)/mypy
 	$(BIN)/check-jsonschema --check-metaschema schemas/*.json
 	$(BIN)/tod-runner validate
-	$(BIN)/pytest -n auto --dist loadfile --ignore=tests/integration
-	$(BIN)/pytest tests/integration
+	$(BIN)/pytest -m "not alone" -n auto --dist loadfile
+	$(BIN)/pytest -m alone
 
 bench: $(READY)
 	$(BIN)/python bench/live.py
