@@ -75,7 +75,7 @@ def test_lost_packets_are_sent_again(monkeypatch):
             return Gst.PadProbeReturn.DROP
 
     monkeypatch.setattr("runner.apply.Receiver", Lossy)
-    with streaming("fps_max=15") as (side, _, plans, _):
+    with streaming("graph.retransmission_ms=200", "fps_max=15") as (side, _, plans, _):
         knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
         side.turn([Command("front_left", *knob) for knob in knobs.items()])
         operator = OperatorSide(plans, lambda *_: None)
