@@ -176,7 +176,7 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     factory = CameraServer._factory
 
     def with_feedback_only(self, plan):
-        # Offered both, rtspsrc takes AVP, which has no retransmission.
+        # Offered both, a client that does not choose takes AVP, which has no retransmission.
         made = factory(self, plan)
         made.set_profiles(GstRtsp.RTSPProfile.AVPF)
         return made
@@ -184,7 +184,7 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
     # A queue that takes most of a frame and not all of it: the rest comes as soon as it is asked for.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
-    overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15")
+    overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
     with (
         streaming(*overrides, cameras=("rear",)) as (side, vehicle, plans, _),
         limited_link("relay", limit, vehicle.media, _ends()[0], print) as link,
