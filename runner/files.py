@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TextIO
 
@@ -12,8 +12,19 @@ from runner.errors import RunError, UserError
 
 
 @contextmanager
+def unfinished(path: Path) -> Iterator[Path]:
+    """Another name to write a file under; what is there at the end takes its place, what ends early is removed."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
 def whole_file(path: Path, argument: str = "output", *, partly: bool = False) -> Iterator[TextIO]:
-    """A text file for `argument` of the command line, written under another name and put in its place at the end.
+    """A text file for `argument` of the command line, there when it is whole.
 
     What is there and no file, such as /dev/null, is written to as it is. What was there before stays where the writing
     ends early.
@@ -21,30 +32,29 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
     partly  keep what was written before a mistake in the input, a UserError
     raises  UserError where it cannot be opened, RunError where it cannot be written
     """
+    mistake = None
     try:
         special = path.exists() and not path.is_file()
-        unfinished = path if special else path.with_name(f".{path.name}.{os.getpid()}")
-        file = unfinished.open("w", encoding="utf-8")
-    except OSError as error:
-        raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
-    keep = False
-    try:
-        with file:
+        with nullcontext(path) if special else unfinished(path) as part, _opened(part, path, argument) as file:
             try:
                 yield file
-            except UserError:
-                keep = partly
-                raise
-        keep = True
+            except UserError as error:
+                if not partly:
+                    raise
+                mistake = error
     except BrokenPipeError:
         raise
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        if not special and keep:
-            unfinished.replace(path)
-        elif not special:
-            unfinished.unlink(missing_ok=True)
+    if mistake:
+        raise mistake
+
+
+def _opened(part: Path, path: Path, argument: str) -> TextIO:
+    try:
+        return part.open("w", encoding="utf-8")
+    except OSError as error:
+        raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -52,11 +62,9 @@ def write_whole(path: Path, content: bytes) -> None:
 
     raises  RunError
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
+        with unfinished(path) as part:
+            part.write_bytes(content)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None

@@ -164,7 +164,7 @@ class Loop:
     def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:
         before, self._run = self._run, after
         self.applier.turn(after.commands)
-        for line in run_lines(to_json(event), before, after, describe(event)):
+        for line in run_lines(event, before, after):
             self.log.write(line)
         if isinstance(event, PositionReported):
             self._position = event

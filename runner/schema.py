@@ -137,9 +137,7 @@ def event_problem(document: Any) -> str:
     check = event_validator(name) if isinstance(name, str) else None
     if check is None:
         return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
-    if check.is_valid(document):
-        return ""
-    return _in_one_line(check.iter_errors(document))
+    return _in_one_line(check, document)
 
 
 def log_problem(document: Mapping[str, Any]) -> str:
@@ -148,9 +146,7 @@ def log_problem(document: Mapping[str, Any]) -> str:
     check = log_validator(kind) if isinstance(kind, str) else None
     if check is None:
         return f"log: {shown(kind)}: unknown kind of line, {suggest(str(kind), log_kinds())}"
-    if check.is_valid(document):
-        return ""
-    return _in_one_line(check.iter_errors(document))
+    return _in_one_line(check, document)
 
 
 @cache
@@ -198,8 +194,11 @@ def _oddities(value: Any, path: Path) -> Iterator[Finding]:
         yield Finding(path, f"{value}", "must be a finite number")
 
 
-def _in_one_line(errors: Iterable[Any]) -> str:
-    found = _explained(errors)
+def _in_one_line(check: Draft202012Validator, document: Any) -> str:
+    """All that is wrong with a document; "" if nothing is."""
+    if check.is_valid(document):  # much cheaper than to look for all errors
+        return ""
+    found = _explained(check.iter_errors(document))
     return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from runner.compose import compose
 from runner.config import load_run
+from runner.drive.log import FILES
 from runner.events import ClockAdvanced, Event, PositionReported, to_json
 from runner.model import plain
 from runner.step import Run, start, step
@@ -21,7 +22,6 @@ EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
 OPERATOR_LATER_S = 1.5  # the operator begins to log later than the vehicle
 TICK_S, TELEMETRY_S, SAMPLE_S, LINK_S = 0.1, 0.2, 0.25, 0.1
 FOLLOWS_S = 0.4  # time constant of the encoder's rate control
-FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}
 VERSIONS = {"tod-runner": "0.1.0", "Python": "3.11.2", "GStreamer": "1.22.0"}
 Lines = list[dict[str, Any]]
 

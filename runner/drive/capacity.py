@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.drive.series import Positions, Series, Values
-from runner.pqos.bandwidth_map import EARTH_M
+from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # that the rates of the samples are taken over
 WAITED_MS = 50.0  # more than the least latency of the drive: the queue before the link was filling
@@ -79,8 +79,7 @@ def _cell(inside: list[Sample], percentile: float) -> Cell:
 
 def _square(sample: Sample, origin: Sample, cell_m: float) -> tuple[int, int]:
     """Column and row, on the plane around the first sample."""
-    east = np.radians(np.remainder(sample.lon - origin.lon + 180, 360) - 180) * np.cos(np.radians(origin.lat)) * EARTH_M
-    north = np.radians(sample.lat - origin.lat) * EARTH_M
+    east, north = offset(origin.lat, origin.lon, sample.lat, sample.lon)
     return int(np.floor(east / cell_m)), int(np.floor(north / cell_m))
 
 

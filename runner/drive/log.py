@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.errors import UserError
+from runner.events import Event, describe, to_json
 from runner.step import Run
 
 FORMAT = 1
@@ -162,10 +163,10 @@ def _refused(directory: Path, rule: str) -> UserError:
     return UserError("command line", "log", repr(str(directory)), rule)
 
 
-def run_lines(event: Mapping[str, Any], before: Run, after: Run, cause: str) -> Iterable[dict[str, Any]]:
+def run_lines(event: Event, before: Run, after: Run) -> Iterable[dict[str, Any]]:
     """What a drive log says of one event: the event, and what was decided where that changed."""
-    yield dict(event)
+    yield to_json(event)
     if after.commands or after.decision != before.decision:
         commands = [command.to_json() for command in after.commands]
         decision = after.decision.to_json()
-        yield {"t": after.state.t, "log": "decision", "cause": cause, **decision, "commands": commands}
+        yield {"t": after.state.t, "log": "decision", "cause": describe(event), **decision, "commands": commands}

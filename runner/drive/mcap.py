@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from runner.gst.video_reader import Unit
 
 SECOND_NS = 1_000_000_000
-SAME_NS = (
-    20_000_000  # a frame of the file and one of the log, further apart, are not the same; less than most cameras' gap
-)
+# A frame of the file and one of the log that are further apart are not the same; less than most cameras' gap.
+SAME_NS = 20_000_000
 TELL_EVERY = 500  # messages between two tellings of progress
 # By kind of line, its topic. Notes become foxglove.Log, positions also foxglove.LocationFix, videos their pictures.
 TOPICS = {

@@ -44,9 +44,7 @@ class Decided:
     """
 
     t: Values
-    on: Flags
     sending: Flags
-    demand: Values
     kbps: Values
     scaling: Values
     width: Values
@@ -60,7 +58,7 @@ class Received:
     """What the operator got of one camera. Counters run on where the log's own began again from 0.
 
     t                        s, of each sample
-    fps, kbps                over the second before
+    kbps                     over the second before
     width, height            px of the picture, 0 before the first
     latency_ms               capture to decode of the last sampled frame
     frames, bytes            counters at each sample
@@ -69,7 +67,6 @@ class Received:
     """
 
     t: Values
-    fps: Values
     kbps: Values
     width: Values
     height: Values
@@ -390,9 +387,7 @@ def _decided(decided: Sequence[tuple[float, Mapping[str, Any]]], full: int) -> D
     shares = [roi["width"] * roi["height"] / full if roi and full else 1.0 for roi in regions]
     return Decided(
         t=np.array([t for t, _ in decided], dtype=float),
-        on=np.array([camera["on"] for _, camera in decided], dtype=bool),
         sending=np.array([camera["sending"] for _, camera in decided], dtype=bool),
-        demand=column("demand_kbps"),
         kbps=column("kbps"),
         scaling=column("scaling"),
         width=column("width"),
@@ -415,7 +410,7 @@ def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Rec
     return Received(
         t=t,
         kbps=_settled(t, column("kbps"), frames),
-        **{key: column(key) for key in ("fps", "width", "height")},
+        **{key: column(key) for key in ("width", "height")},
         latency_ms=np.where(moved, column("latency_ms"), np.nan),
         frames=frames,
         **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},

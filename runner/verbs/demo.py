@@ -71,7 +71,7 @@ class _Run(NamedTuple):
 def run(arguments: Arguments) -> int:
     apply = streaming()
     arguments = _with_rate(arguments)
-    experiment, _ = load_experiment(arguments.overrides, arguments.conf)
+    experiment, link = load_experiment(arguments.overrides, arguments.conf)
     duration_s = arguments.number("duration_s")
     duration_s = experiment.duration_s if duration_s is None else duration_s
     output, models = arguments.path("output"), arguments.path("models")
@@ -79,7 +79,7 @@ def run(arguments: Arguments) -> int:
         check_report(output, models)
     elif models:
         raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
-    runs = [_prepared(arguments, name, words, apply) for name, words in (experiment.runs or {"": ()}).items()]
+    runs = [_prepared(arguments, name, words, link, apply) for name, words in (experiment.runs or {"": ()}).items()]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no side is left behind
     if experiment.about:
         say(experiment.about)
@@ -97,11 +97,14 @@ def run(arguments: Arguments) -> int:
     return status
 
 
-def _prepared(arguments: Arguments, name: str, words: Sequence[str], apply: ModuleType) -> _Run:
-    """All that a drive needs, looked at before the first begins."""
+def _prepared(
+    arguments: Arguments, name: str, words: Sequence[str], link: LinkSettings | None, apply: ModuleType
+) -> _Run:
+    """All that a drive needs, looked at before the first begins; `link` is that of a run which adds nothing."""
     own = replace(arguments, overrides=[*arguments.overrides, *words])
     directory = _directory(arguments, name)
-    _, link = load_experiment(own.overrides, own.conf)
+    if words:
+        _, link = load_experiment(own.overrides, own.conf)
     if link and directory is None:
         raise UserError(
             "command line", "link", link.kind, "what it does is to be looked at: give log=DIR or output=OUT"
@@ -114,9 +117,9 @@ def _prepared(arguments: Arguments, name: str, words: Sequence[str], apply: Modu
 
 def _with_rate(arguments: Arguments) -> Arguments:
     """With a frame rate that this machine carries, where neither the user nor an experiment names one."""
-    if composed(arguments.overrides, arguments.conf).document.get("fps_max") is not None:
-        return arguments
     if any(word.lstrip("+~").startswith("fps_max") for word in arguments.overrides):
+        return arguments
+    if composed(arguments.overrides, arguments.conf).document.get("fps_max") is not None:
         return arguments
     fps_max = f"fps_max={FPS_PER_CORE * len(os.sched_getaffinity(0))}"
     return replace(arguments, overrides=[fps_max, *arguments.overrides])
@@ -181,13 +184,13 @@ def _drive(run: _Run, duration_s: float) -> int:
 @contextmanager
 def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
     """The limited link between the sides, where there is one, and its log."""
-    config = composed(run.arguments.overrides, run.arguments.conf).document
     settings = run.link
-    log = Log(run.directory if settings else None, "link", config, {}, say)
+    if settings is None:
+        yield None, Log(None, "link", {}, {}, say)
+        return
+    config = composed(run.arguments.overrides, run.arguments.conf).document
+    log = Log(run.directory, "link", config, {}, say)
     try:
-        if settings is None:
-            yield None, log
-            return
         media, control = run.vehicle.media, run.vehicle.control
         with limited_link(settings.kind, settings.limit, media, control, log.write) as link:
             yield link, log

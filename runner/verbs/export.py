@@ -26,6 +26,7 @@ from typing import Any, BinaryIO
 
 from runner.drive.read import read_drive
 from runner.errors import RunError, UserError
+from runner.files import unfinished
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
@@ -50,7 +51,7 @@ def run(arguments: Arguments) -> int:
         print(warning, file=sys.stderr)
     filmed = any(line.get("log") == "video" for side in drive.sides.values() for line in side.lines)
     read_video = streaming().read_video if filmed else _nothing
-    with _whole(output) as file, _later(f"{output}") as progress:
+    with _new(output) as file, _later(f"{output}") as progress:
         count = write_mcap(drive, file, read_video, lambda what: print(what, file=sys.stderr), progress)
     print(f"{output}: {count} messages, {output.stat().st_size / 1e6:.1f} MB")
     return 0
@@ -61,21 +62,20 @@ def _nothing(_path: Path) -> Iterator[Any]:
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[BinaryIO]:
-    """A new file, written under another name and put in its place when it is whole."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+def _new(path: Path) -> Iterator[BinaryIO]:
+    """A new file, there when it is whole."""
     try:
-        file = unfinished.open("xb")
-    except OSError as error:
-        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
-    try:
-        with file:
+        with unfinished(path) as part, _opened(part, path) as file:
             yield file
-        unfinished.replace(path)
     except OSError as error:
         raise RunError(f"{path}: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
+
+
+def _opened(part: Path, path: Path) -> BinaryIO:
+    try:
+        return part.open("xb")
+    except OSError as error:
+        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from runner.decision import Decision
 from runner.drive.log import FILES, Log, run_lines
 from runner.drive.read import Line, check_began, is_log, read_line, read_lines
 from runner.errors import UserError
-from runner.events import BitratePredicted, Event, describe, parse, to_json
+from runner.events import BitratePredicted, Event, parse, to_json
 from runner.files import whole_file
 from runner.model import Vehicle
 from runner.schema import log_problem
@@ -119,7 +119,7 @@ def replay(
     for document, event in inputs if pqos is None else _predicted(inputs, pqos):
         before, now = now, step(vehicle, now, event)
         if log:
-            for line in run_lines(to_json(event), before, now, describe(event)):
+            for line in run_lines(event, before, now):
                 log.write(line)
         yield answers.line(document, now)
 

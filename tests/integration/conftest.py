@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-BESIDE_OTHERS = ("test_export", "test_keyframe", "test_model", "test_report_page", "test_video_files")
+BESIDE_OTHERS = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
