@@ -9,6 +9,7 @@ from enum import Enum
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.clocks import unix_time
 from runner.gst.pipeline import counted
 from runner.gst.source import loop_clip
 
@@ -144,8 +145,7 @@ class Recorder:
         clock = self._pipeline.get_clock()
         if clock is None:
             return 0.0
-        age = clock.get_time() - self._pipeline.get_base_time() - self._first
-        return time.time() - float(age / Gst.SECOND)
+        return unix_time(clock, self._pipeline.get_base_time(), self._first)
 
     # --- watching -----------------------------------------------------------------------------------------------------
 

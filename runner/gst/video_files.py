@@ -11,6 +11,8 @@ from pathlib import Path
 
 from gi.repository import Gst
 
+from runner.gst.clocks import unix_time
+
 DIRECTORY = "video"  # below that of the drive
 _MARK = "video-"  # how the names of the elements in front of the file begin, see runner/graph.py
 
@@ -120,8 +122,7 @@ def born(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
     if segment is None or clock is None:
         return time.time()
     running = segment.parse_segment().to_running_time(Gst.Format.TIME, buffer.pts)
-    age = clock.get_time() - element.get_base_time() - running
-    return time.time() - float(age / Gst.SECOND)
+    return unix_time(clock, element.get_base_time(), running)
 
 
 def _new_file(directory: Path, camera: str, side: str) -> Path:

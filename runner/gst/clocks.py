@@ -1,0 +1,31 @@
+"""What the clock of the wall showed at a time in a pipeline."""
+
+from __future__ import annotations
+
+import time
+
+from gi.repository import Gst
+
+CLOSE_NS = 20_000  # two clocks read within this are read at once
+TRIES = 10
+
+
+def unix_time(clock: Gst.Clock, base_time: int, running: int) -> float:
+    """A running time of a pipeline, as s since 1970.
+
+    clock, base_time, running  the pipeline's clock; ns by it
+    """
+    return float((_ahead(clock) + base_time + running) / Gst.SECOND)
+
+
+def _ahead(clock: Gst.Clock) -> int:
+    """By how much the clock of the wall is ahead of another, ns.
+
+    Another thread may run between reading one and the other. So one is read before and after the other, several times
+    where it took long, and the closest reading holds.
+    """
+    readings: list[tuple[int, int]] = []  # between its ends, ns: what lies in the middle of them
+    while len(readings) < TRIES and min(readings, default=(CLOSE_NS + 1, 0))[0] > CLOSE_NS:
+        before, there, after = time.time_ns(), clock.get_time(), time.time_ns()
+        readings.append((after - before, (before + after) // 2 - there))
+    return min(readings)[1]
