@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from runner.drive.statistics import (
     rate_curves,
     statistics,
 )
+from runner.drive.tables import camera_rows
 from runner.rate_quality.artefact import read_model
 
 NAN = float("nan")
@@ -133,6 +136,14 @@ def test_a_drive_with_both_sides(tmp_path: Path) -> None:
         assert sum(camera.sizes.values()) == pytest.approx(1, abs=0.02)
     assert set(front.factors) == {0.25, 0.5}
     assert front.arrival.median < front.decode.median
+
+
+def test_sizes_are_told_in_the_order_of_their_factors(tmp_path: Path) -> None:
+    camera = statistics(series(read_drive(write_drive(tmp_path / "drive")))).cameras["front_left"]
+    told = replace(camera, factors={0.25: 0.2, 0.5: 0.8}, sizes={(960, 540): 0.8, (480, 270): 0.2})
+    headings, (row,) = camera_rows(SimpleNamespace(metric=None, cameras={"front": told}))
+    assert row[headings.index("factor: time")] == "0.25: 20%\n0.5: 80%"
+    assert row[headings.index("sizes px")] == "480x270\n960x540"
 
 
 def test_a_vehicle_alone_has_no_latency_and_no_losses(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def drive_rows(drives: Sequence[Statistics]) -> tuple[Row, list[Row]]:
 def _camera(camera: CameraStatistics) -> Row:
     frozen = [freeze.seconds for freeze in camera.freezes or ()]
     known = camera.freezes is not None
-    longest = sorted(camera.sizes.items(), key=lambda each: -each[1])[:SIZES]
+    longest = sorted(camera.sizes, key=lambda size: -camera.sizes[size])[:SIZES]
     return (
         camera.name,
         str(camera.frames),
@@ -52,7 +52,7 @@ def _camera(camera: CameraStatistics) -> Row:
         shown(camera.allocated),
         percent(camera.share),
         "\n".join(f"{f:g}: {share:.0%}" if f else f"off: {share:.0%}" for f, share in camera.factors.items()),
-        "\n".join(f"{width}x{height}" for (width, height), _ in longest) or NOTHING,
+        "\n".join(f"{width}x{height}" for width, height in sorted(longest)) or NOTHING,  # rising, as factors are
         _latency(camera.arrival),
         _latency(camera.decode),
         counted(len(frozen) if known else None),
