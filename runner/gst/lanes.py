@@ -13,7 +13,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from gi.repository import Gst, GstVideo
+from gi.repository import GLib, Gst, GstVideo
 from numpy.typing import NDArray
 
 from runner.errors import RunError
@@ -89,8 +89,8 @@ def run_lanes(
 def _parsed(line: str) -> Gst.Pipeline:
     try:
         return Gst.parse_launch(line)
-    except Exception as error:  # GLib.Error
-        raise RunError(f"GStreamer: {error}") from None
+    except GLib.Error as error:
+        raise RunError(f"GStreamer: {error.message}") from None
 
 
 def _wait(pipeline: Gst.Pipeline, run: _Run, on_progress: Callable[[int], None]) -> None:

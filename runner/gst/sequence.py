@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from gi.repository import Gst, GstPbutils
+from gi.repository import GLib, Gst, GstPbutils
 
 from runner.errors import UserError
 
@@ -45,8 +45,8 @@ def discover(path: Path, where: str) -> Form:
     discoverer = GstPbutils.Discoverer.new(TIMEOUT_S * Gst.SECOND)
     try:
         info = discoverer.discover_uri(path.resolve().as_uri())
-    except Exception as error:  # GLib.Error
-        raise UserError("command line", where, repr(str(path)), f"cannot be read as video: {error}") from None
+    except GLib.Error as error:
+        raise UserError("command line", where, repr(str(path)), f"cannot be read as video: {error.message}") from None
     streams = info.get_video_streams()
     if not streams:
         raise UserError("command line", where, repr(str(path)), "has no video")
