@@ -52,7 +52,7 @@ def test_the_server_of_front_left() -> None:
 
 def test_the_receiver_of_front_left() -> None:
     assert plan().receiver == (
-        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left latency=40 timeout=0 drop-on-latency=true "
+        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left latency=40 timeout=0 "
         f"do-retransmission=true add-reference-timestamp-meta=true ! {DECODE}"
     )
 
@@ -84,7 +84,7 @@ def test_the_printed_lines_of_front_left() -> None:
     assert plan().operator_line() == (
         "udpsrc name=wire address=127.0.0.1 port=5600 "
         "caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96 ! "
-        f"rtpjitterbuffer name=jitterbuffer latency=40 drop-on-latency=true ! {DECODE}"
+        f"rtpjitterbuffer name=jitterbuffer latency=40 ! {DECODE}"
     )
 
 
