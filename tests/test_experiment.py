@@ -101,6 +101,8 @@ def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> Non
     )
     result = tod("validate", conf.word, *NARROW)
     assert result.status == 0, result.err
+    conf.write("experiment/mine.yaml", HEAD + "defaults: [bottleneck, _self_]\nmode: collective\n")
+    assert "experiment: missing: must be given" not in tod("validate", conf.word, *NARROW).err
     conf.write(
         "experiment/mine.yaml",
         HEAD + "defaults: [_self_]\nexperiment: {about: x, duration_s: 9, runs: {a: [modes=papr]}}\n",

@@ -217,13 +217,13 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
         f"media.port={free_port()}",
         f"control.port={free_port()}",
     )
-    done = run("demo", *words, "duration_s=6", f"log={tmp_path}")
+    done = run("demo", *words, "duration_s=8", f"log={tmp_path}")
     assert done.returncode == 0, done.stderr
     frames = {}
     for line in done.stdout[done.stdout.rindex("received") :].splitlines():
         words = line.split()
         if words and words[0] in ("front", "rear", "mast"):
-            assert int(words[1]) > 35, line
+            assert int(words[1]) > 50, line
             assert words[3] == "0", line  # no second was short of frames
             frames[words[0]] = int(words[1])
     drive = read_drive(tmp_path)
