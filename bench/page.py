@@ -1,6 +1,6 @@
 """From source to screen: what a frame costs on its way into the browser, by stage, and whether eight tiles keep up.
 
-  python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, five pages each
+  python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each
   python bench/page.py --seconds 60 --show  with a window instead of headless
 
 The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
@@ -35,7 +35,7 @@ from runner.telemetry import middle, percentile
 
 STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
 SETTLE_S = 5
-ROUNDS = 5
+ROUNDS = 8
 
 
 def main() -> None:
@@ -57,8 +57,7 @@ def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int],
     with tempfile.TemporaryDirectory() as directory:
         words = _configuration(Path(directory), count, *form, kbps)
         render_missing(load(words, Path(directory)), lambda *_: None)
-        with _station([*words, f"conf={directory}"]) as (url, operator):
-            rounds = [_round(browser, url, operator, seconds / ROUNDS) for _ in range(ROUNDS)]
+        rounds = [_round(browser, [*words, f"conf={directory}"], seconds / ROUNDS) for _ in range(ROUNDS)]
     print(f"\n{what}, {ROUNDS} times {seconds / ROUNDS:g} s")
     cameras = [frames for one in rounds for frames in one.frames]
     for number, stage in enumerate(STAGES):
@@ -82,13 +81,14 @@ class Round(NamedTuple):
     cores: float
 
 
-def _round(browser: Browser, url: str, operator: int, seconds: float) -> Round:
-    """Open a page in a context of its own and look at it.
+def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
+    """Start both sides, open a page in a context of its own and look at it.
 
-    Cameras and screen keep their phase to each other as long as a page is open, so one page alone says little.
+    Cameras and screen keep their phase to each other for a whole drive, so one drive alone says little.
     """
-    with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
+    with _station(words) as (url, operator), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page = context.new_page()
+        time.sleep(SETTLE_S)
         page.goto(url)
         time.sleep(SETTLE_S)
         before, began, used = page.evaluate("tod.measure()")["cameras"], time.time(), _cpu_s(operator)
