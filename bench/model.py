@@ -2,7 +2,7 @@
 
   python bench/model.py CLIP
 
-Timed are whole processes with an empty cache, the adaptive plan of `tod-runner model` first. Against it: the full
+Timed are whole processes that know no point yet, the adaptive plan of `tod-runner model` first. Against it: the full
 plan; the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales up
 and has its ssim filter compare; and the full grid with scikit-image's MSSIM on every frame, extrapolated from one point
 and some frames. Beside the times: what either plan chose.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -36,6 +37,7 @@ def main() -> None:
         sys.exit(__doc__)
     clip = Path(sys.argv[1]).resolve()
     with tempfile.TemporaryDirectory() as directory:
+        model(clip, Path(directory), "full", "scalings=[0.5]", "bitrates_kbps=[200,400]")  # libraries, fonts, registry
         adaptive, adaptive_s = model(clip, Path(directory), "adaptive")
         full, full_s = model(clip, Path(directory), "full")
         print(f"adaptive plan: {adaptive_s:.1f} s, {len(adaptive['points'])} encodings, {memory_mb():.0f} MB at most")
@@ -48,13 +50,13 @@ def main() -> None:
         print(f"scikit-image on every frame, extrapolated: {spent:.0f} s: {spent / adaptive_s:.0f} times as long")
 
 
-def model(clip: Path, directory: Path, plan: str) -> tuple[dict[str, Any], float]:
-    """A model file, and the seconds that it took from an empty cache."""
-    output = directory / plan
-    words = ["camera=front_center", f"sequence={clip}", f"output={output}", f"plan={plan}"]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(directory / f"cache_{plan}")}
+def model(clip: Path, directory: Path, plan: str, *words: str) -> tuple[dict[str, Any], float]:
+    """A model file, and the seconds that it took with no point in the cache."""
+    output, cache = directory / plan, directory / "cache"
+    shutil.rmtree(cache / "tod-runner", ignore_errors=True)
+    words = ("camera=front_center", f"sequence={clip}", f"output={output}", f"plan={plan}", *words)
     began = time.perf_counter()
-    run([sys.executable, "-m", "runner", "model", *words], env=environment)
+    run([sys.executable, "-m", "runner", "model", *words], env={**os.environ, "XDG_CACHE_HOME": str(cache)})
     spent = time.perf_counter() - began
     return json.loads((output / "front_center.model.json").read_text()), spent
 
