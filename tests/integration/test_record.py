@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from rig import CLIPS, process, run, until
+from rig import CHECKOUT, CLIPS, process, run, until
 from runner import recordings
 from runner.config import load
 from runner.errors import RunError
@@ -32,17 +32,20 @@ RAW = '{name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}'
 
 @pytest.fixture
 def conf(tmp_path: Path) -> Path:
-    """Sources of the user's own: one ends, one fails, one is noise, too much for an encoder."""
+    """Sources of the user's own, one ends and one fails; and an encoder that takes 0.2 s for each frame."""
     directory = tmp_path / "conf"
     (directory / "source").mkdir(parents=True)
     sources = {
         "short": [LIVE.replace("ball", "ball, num-buffers: 20"), RAW],
         "failing": [LIVE, RAW, "{name: fault, element: identity, properties: {error-after: 20}}"],
-        "noise": [LIVE.replace("ball", "snow"), RAW],
     }
     for name, elements in sources.items():
         text = "elements:\n" + "".join(f"  - {element}\n" for element in elements)
         (directory / "source" / f"{name}.yaml").write_text(text)
+    (directory / "recording").mkdir()
+    text = (CHECKOUT / "conf" / "recording" / "x264.yaml").read_text()
+    slow = "elements:\n  - {name: slow, element: identity, properties: {sleep-time: 200000}}\n"
+    (directory / "recording" / "slow.yaml").write_text(text.replace("elements:\n", slow))
     return directory
 
 
@@ -182,8 +185,8 @@ def test_a_source_that_ends_early_is_told(tmp_path, conf):
 
 
 def test_lost_frames_are_counted_and_told(tmp_path, conf):
-    words = ("source=noise", f"conf={conf}", f"output={tmp_path / 'rec'}")
-    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=60")
+    words = ("source=test", "recording=slow", f"conf={conf}", f"output={tmp_path / 'rec'}")
+    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=30")  # the queue takes ten
     done = run("record", *ONE, *words, *huge, "duration_s=2")
     assert done.returncode == 0, done.stderr
     about = index(tmp_path / "rec")["cameras"]["rear"]
