@@ -12,6 +12,7 @@ from runner import rules, schema, sources
 from runner.commands import KnobValue
 from runner.compose import Composed, compose, conf_directories, recompose
 from runner.errors import ConfigError, Problem
+from runner.files import why_no_file
 from runner.graph import Plan, assignments, check_video, compile_graph
 from runner.model import (
     Camera,
@@ -297,7 +298,7 @@ class _Builder:
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
             elif key == "clip" and not Path(str(given)).is_file():
-                self._report(where, ModelError(key, repr(given), "no such file"))
+                self._report(where, ModelError(key, repr(given), why_no_file(Path(str(given)))))
 
     def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
         """Whether everything that source, graph and recording refer to is there."""

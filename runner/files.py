@@ -57,6 +57,11 @@ def _opened(part: Path, path: Path, argument: str) -> TextIO:
         raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
 
 
+def why_no_file(path: Path) -> str:
+    """The rule that a path breaks which names no file; /dev/zero and directories are there and none."""
+    return "must be a file" if path.exists() else "no such file"
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """A file that is there wholly or not at all.
 

@@ -451,6 +451,7 @@ def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Comm
             ["conf/source/file.yaml: clip: null: must be given, here or for each mounted camera as clip"],
         ),
         (["source=file", "source.clip=/no.mp4"], ["command line: source.clip: '/no.mp4': no such file"]),
+        (["source=file", "source.clip=/dev/zero"], ["command line: source.clip: '/dev/zero': must be a file"]),
         (
             ["source=file", f"source.clip={CONF}/config.yaml", "cameras.top_left.clip=/no.mp4"],
             ["command line: cameras.top_left.clip: '/no.mp4': no such file"],

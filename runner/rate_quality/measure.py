@@ -8,7 +8,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from runner.errors import RunError, UserError
-from runner.files import write_whole
+from runner.files import why_no_file, write_whole
 from runner.graph import compile_graph
 from runner.model import Camera, ModelError, Progress, Vehicle
 from runner.rate_quality import plans
@@ -135,7 +135,7 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
     where = f"masks.{name}"
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if picture is None:
-        rule = "cannot be read as a picture" if path.is_file() else "no such file"
+        rule = "cannot be read as a picture" if path.is_file() else why_no_file(path)
         raise UserError("command line", where, repr(str(path)), rule)
     if picture.shape != (camera.height, camera.width):
         found = f"{picture.shape[1]}x{picture.shape[0]}"

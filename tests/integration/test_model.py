@@ -323,6 +323,7 @@ def two_sizes(path: Path) -> None:
     ("name", "content", "said"),
     [
         ("gone.mp4", None, "no such file"),
+        ("/dev/zero", None, "must be a file"),
         ("empty.mp4", b"", "the file is empty"),
         ("noise.mp4", os.urandom(4096), "cannot be read as video"),
         ("two.ts", two_sizes, "the size changes from 320x192 to 160x96 within the sequence"),
