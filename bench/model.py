@@ -40,8 +40,9 @@ def main() -> None:
         model(clip, Path(directory), "full", "scalings=[0.5]", "bitrates_kbps=[200,400]")  # libraries, fonts, registry
         adaptive, adaptive_s = model(clip, Path(directory), "adaptive")
         full, full_s = model(clip, Path(directory), "full")
-        print(f"adaptive plan: {adaptive_s:.1f} s, {len(adaptive['points'])} encodings, {memory_mb():.0f} MB at most")
+        print(f"adaptive plan: {adaptive_s:.1f} s, {len(adaptive['points'])} encodings")
         print(f"full plan: {full_s:.1f} s, {len(full['points'])} encodings: {full_s / adaptive_s:.1f} times as long")
+        print(f"memory: {memory_mb():.0f} MB at most in either")
         for one, name in ((adaptive, "adaptive"), (full, "full")):
             print(f"  {name}: factors {one['scaling']} from {one['b_min_kbps']} kbit/s, b_full {one['b_full_kbps']}")
         spent = two_processes(clip, Path(directory))
