@@ -78,8 +78,9 @@ class Sweep:
             while waiting:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
+                    number = futures.pop(future)  # a cluster forgets what nobody holds, and need not find it again
                     yield from future.result()
-                    done.tell(futures[future], 1.0)
+                    done.tell(number, 1.0)
         finally:
             done.cancelled = True
             for future in futures:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing import get_context
+from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is not there
 
@@ -51,4 +57,48 @@ def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
             client = stack.enter_context(Client(address, timeout=SCHEDULER_S))
         except OSError as error:
             raise RunError(f"the Dask scheduler {scheduler or ''} does not answer: {error}") from None
-        yield client.get_executor()
+        yield _Cluster(client.get_executor())
+
+
+class _Cluster(Executor):
+    """A cluster whose tasks run without collection of cycles."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+
+    def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        return self._executor.submit(uncollected, function, *args, **kwargs)
+
+
+class _Collector:
+    """Python's collector of cycles, which several threads of a process may want still."""
+
+    def __init__(self) -> None:
+        self._lock, self._wishes, self._was_on = threading.Lock(), 0, False
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._wishes:
+                self._was_on = gc.isenabled()
+                gc.disable()
+            self._wishes += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._wishes -= 1
+            if not self._wishes and self._was_on:
+                gc.enable()
+
+
+_still = _Collector()
+
+
+def uncollected(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a function and leave cycles of garbage until the last such call of the process is over.
+
+    A Dask worker looks at the frames of its threads every few milliseconds. Where cycles are collected just then and a
+    thread of GStreamer enters Python for the first time, Python before 3.12 waits for itself for ever
+    (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave few cycles.
+    """
+    with _still:
+        return function(*args, **kwargs)

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -235,8 +236,36 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, 
         command = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", *words, where, *SMALL)
         with process("model", *command, env=cache) as child:
             until(lambda: kept.is_dir() and len(list(kept.glob("*.json"))) > 1, 90)  # a first set is done
-            os.kill(cluster.workers[0].pid, signal.SIGKILL)
+            at_work = max(cluster.scheduler.workers.values(), key=lambda worker: len(worker.processing))
+            os.kill(cluster.workers[at_work.name].pid, signal.SIGKILL)
             assert child.wait(timeout=120) == 0, child.stdout.read()
+    assert points_of(tmp_path) == points_of(measured[0])
+
+
+WATCHED = """
+import gc, sys, threading, time
+from runner.__main__ import main
+from runner.rate_quality.workers import uncollected
+
+def watch():
+    while True:
+        sys._current_frames()
+        time.sleep(0.002)
+
+gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # others run meanwhile
+gc.set_threshold(50)
+threading.Thread(target=watch, daemon=True).start()
+sys.exit(uncollected(main, sys.argv[1:]))
+"""
+
+
+def test_measuring_goes_on_under_the_eyes_of_a_dask_worker(clip, measured, tmp_path, cache):
+    """Of a worker the part that looks at its threads, and collects cycles while it does, but all the time."""
+    words = ("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
+    environment = {**os.environ, **cache, "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, "-c", WATCHED, *words, "metric=[mssim,psnr]"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
     assert points_of(tmp_path) == points_of(measured[0])
 
 
