@@ -97,8 +97,9 @@ def uncollected(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) 
     """Call a function and leave cycles of garbage until the last such call of the process is over.
 
     A Dask worker looks at the frames of its threads every few milliseconds. Where cycles are collected just then and a
-    thread of GStreamer enters Python for the first time, Python before 3.12 waits for itself for ever
-    (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave few cycles.
+    thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them, wait
+    for themselves for ever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
+    as few cycles, however many frames they see.
     """
     with _still:
         return function(*args, **kwargs)
