@@ -10,10 +10,11 @@ import queue
 import socket
 import time
 
-from runner.broker import private_broker
-from runner.control import OFFLINE, OPERATOR_GONE, Link
-from runner.model import Endpoint
-from runner.telemetry import middle, percentile
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+from runner.mqtt.link import Link
+from runner.mqtt.messages import OFFLINE, OPERATOR_GONE, Message, topic
+from runner.operator.meter import middle, percentile
 
 ROUNDS = 1000
 
@@ -24,23 +25,27 @@ def main() -> None:
         broker = Endpoint("127.0.0.1", probe.getsockname()[1])
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     with private_broker(broker):
+        state, request, reply = (topic("bench", *parts) for parts in (("state",), ("request", "op"), ("reply", "op")))
 
-        def answer(asked: bytes) -> None:
-            vehicle.publish("reply", {"id": json.loads(asked)["id"], "result": "applied", "reason": ""})
+        def answer(asked: Message) -> None:
+            vehicle.publish(reply, {"id": json.loads(asked.payload)["id"], "result": "applied", "reason": ""})
 
-        vehicle = Link("bench", broker, ("state", OFFLINE), {"request": answer}, lambda here: None)
-        operator = Link("bench", broker, ("request", OPERATOR_GONE), {"reply": answers.put}, lambda here: None)
-        vehicle.connect()
-        operator.connect()
+        vehicle = Link(broker, (state, OFFLINE), {request: answer}, lambda here: None, print)
+        operator = Link(
+            broker, (request, OPERATOR_GONE), {reply: lambda m: answers.put(m.payload)}, lambda here: None, print
+        )
+        for link in (vehicle, operator):
+            link.connect()
+            link.wait_connected(5)
         waits = []
         for number in range(ROUNDS):
             began = time.perf_counter()
-            operator.publish("request", {"id": str(number), "event": "total_set", "kbps": 4000})
+            operator.publish(request, {"id": str(number), "event": "total_set", "kbps": 4000})
             answers.get(timeout=5)
             waits.append(1000 * (time.perf_counter() - began) / 2)
             time.sleep(0.002)
-        operator.close("request", OPERATOR_GONE)
-        vehicle.close("state", OFFLINE)
+        operator.close((request, OPERATOR_GONE))
+        vehicle.close((state, OFFLINE))
     print(f"control link, one way: median {middle(waits):.2f} ms, p95 {percentile(waits, 0.95):.2f} ms ({ROUNDS})")
 
 

@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from runner.apply import VehicleSide, check_plan
-from runner.commands import Command
-from runner.config import load
+from runner.configuration.config import configuration
+from runner.core.commands import Command
+from runner.core.model import Vehicle
 from runner.gst import Gst, knobs
-from runner.model import Vehicle
-from runner.sources import compile_plans, render_missing
-from runner.telemetry import middle, percentile
+from runner.operator.meter import middle, percentile
+from runner.plans import compile_plans, render_missing
 
 PORT = 18554
 Sample = tuple[float, int, int, int]  # time, width, height, bytes
@@ -109,7 +109,7 @@ def bitrate_step(source: Sequence[str], fps: int) -> None:
 
 
 def _vehicle(overrides: Sequence[str]) -> Vehicle:
-    vehicle = load([*overrides, f"media.port={PORT}"], check=check_plan)
+    vehicle = configuration([*overrides, f"media.port={PORT}"], check=check_plan).vehicle()
     render_missing(vehicle, lambda what, done: print(f"\r{what} {done:4.0%}", end="", file=sys.stderr))
     return vehicle
 
@@ -132,9 +132,10 @@ def _streaming(vehicle: Vehicle) -> Iterator[VehicleSide]:
 def _operator(overrides: Sequence[str]) -> Iterator[None]:
     """Receives and decodes all cameras in a process of its own, as the operator does."""
     code = (
-        "import sys, time; from runner.apply import OperatorSide; from runner.config import load;"
-        "from runner.sources import compile_plans;"
-        "side = OperatorSide(compile_plans(load(sys.argv[1:])), lambda *_: None); time.sleep(600)"
+        "import sys, time; from runner.apply import OperatorSide;"
+        "from runner.configuration.config import configuration;"
+        "from runner.plans import compile_plans;"
+        "side = OperatorSide(compile_plans(configuration(sys.argv[1:]).vehicle()), lambda *_: None); time.sleep(600)"
     )
     command = [sys.executable, "-c", code, *overrides, f"media.port={PORT}"]
     with subprocess.Popen(command) as child:

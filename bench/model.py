@@ -25,7 +25,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runner.compose import conf_directories, load_file
+from runner.configuration.files import conf_directories
+from runner.configuration.yaml_file import load_file
 
 STUDY = load_file(conf_directories(None)[0] / "study" / "paper.yaml")
 X264 = "tune=zerolatency:intra-refresh=1:threads=1"

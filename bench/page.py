@@ -27,11 +27,11 @@ from playwright.sync_api import Browser, sync_playwright
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import CHROMIUM_FLAGS, answers, free_port, process, until
-from runner.broker import private_broker
-from runner.config import load
-from runner.model import Endpoint
-from runner.sources import render_missing
-from runner.telemetry import middle, percentile
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+from runner.operator.meter import middle, percentile
+from runner.plans import render_missing
 
 STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
 SETTLE_S = 5
@@ -56,7 +56,7 @@ def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int],
     """Drive a vehicle of some equal cameras and look at its page."""
     with tempfile.TemporaryDirectory() as directory:
         words = _configuration(Path(directory), count, *form, kbps)
-        render_missing(load(words, Path(directory)), lambda *_: None)
+        render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
         rounds = [_round(browser, [*words, f"conf={directory}"], seconds / ROUNDS) for _ in range(ROUNDS)]
     print(f"\n{what}, {ROUNDS} times {seconds / ROUNDS:g} s")
     cameras = [frames for one in rounds for frames in one.frames]

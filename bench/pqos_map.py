@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runner.events import PositionReported
+from runner.core.events import PositionReported
 from runner.pqos import build_pqos
 from runner.pqos.bandwidth_map import EARTH_M
 

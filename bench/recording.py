@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.config import load
+from runner.configuration.config import configuration
 from runner.graph import launch
 from runner.gst import Gst
 
@@ -82,7 +82,8 @@ def measure(name: str, encode: str, source: str, raw: Path, frame_bytes: int, *,
 
 def main() -> None:
     candidates = {
-        name: launch(load([f"recording={name}"], runnable=False).recording.elements) for name in ("x264", "ffv1")
+        name: launch(configuration([f"recording={name}"], runnable=False).vehicle().recording.elements)
+        for name in ("x264", "ffv1")
     }
     with tempfile.TemporaryDirectory(dir="/dev/shm") as directory:
         raw = Path(directory) / "frames.yuv"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 
 from runner.errors import RunError, UserError
-from runner.verbs import EXTRAS, VERBS, Arguments
+from runner.system import signals
+
+# All else is imported once signals are taken: an exception in an import would be a traceback.
 
 USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
 
@@ -23,13 +27,26 @@ conf=DIR (or the environment variable TOD_CONF) names a directory of your own; i
   tod-runner VERB --help                             one verb, with examples"""
 
 
-def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911
+def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
-    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C
+    argv     None: the process's own; a process that was ended by a signal then does not return from here
+    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C, 143 SIGTERM
     """
+    with signals.handled():
+        status = _status(list(sys.argv[1:] if argv is None else argv))
+        if argv is None and signals.received():
+            # The interpreter would wait for libraries whose threads may still be in Python.
+            with suppress(OSError):
+                sys.stdout.flush()
+            os._exit(status)
+    return status
+
+
+def _status(words: list[str]) -> int:  # noqa: PLR0911
     try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
+        with signals.interruptible():
+            return _run(words)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
@@ -37,13 +54,18 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911
         print(error, file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        from runner.verbs import extra_of
+
+        extra = extra_of((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        print(f"the Python module {error.name} is not installed: pip install 'tod-runner[{extra}]'", file=sys.stderr)
+        print(
+            f"the Python module {error.name} is not installed: install the extra {extra}, see docs/install.md",
+            file=sys.stderr,
+        )
         return 1
     except KeyboardInterrupt:
-        return 130
+        return 128 + (signals.received() or signal.SIGINT)
     except BrokenPipeError:
         # Who read our output has gone; the interpreter would complain again when it flushes.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -55,6 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911
 
 
 def _run(words: list[str]) -> int:
+    from runner.verbs import VERBS, Arguments
+
     if not words or words[0] in ("-h", "--help", "help"):
         print(USAGE.format(verbs="\n".join(f"  {name:10}{verb.summary}" for name, verb in VERBS.items())))
         return 0 if words else 2
@@ -65,7 +89,7 @@ def _run(words: list[str]) -> int:
         return 0
     name, *rest = words
     if name not in VERBS:
-        from runner.model import suggest
+        from runner.core.model import suggest
 
         raise UserError("command line", "", name, f"unknown verb, {suggest(name, VERBS)}")
     verb = VERBS[name]

@@ -10,10 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from runner.commands import Command, KnobValue
+from runner.core.commands import Command, KnobValue
+from runner.core.model import Media, suggest
 from runner.errors import RunError
 from runner.graph import Plan, launch
-from runner.gst import GLib, Gst
+from runner.gst import TYPELIBS, GLib, Gst
+from runner.gst.aside import settle
+from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
 from runner.gst.recorder import Recorded, Recorder, Stage
@@ -21,22 +24,26 @@ from runner.gst.registry import check_plan, missing_plugins, missing_recorders, 
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.gst.video_files import VideoFile, VideoFiles, born
-from runner.model import Endpoint
+from runner.gst.watched import WatchedSource
 
 if TYPE_CHECKING:
+    from fractions import Fraction
     from pathlib import Path
 
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
     from runner.gst.sequence import Form
     from runner.gst.video_reader import Unit
-    from runner.rate_quality.lanes import LaneSet
+    from runner.lanes import LaneSet
 
 __all__ = [
+    "TYPELIBS",
+    "OnUnit",
     "OperatorSide",
     "Received",
     "Recorded",
     "RecordingSide",
     "Stage",
+    "Unit",
     "VehicleSide",
     "VideoFiles",
     "check_machine",
@@ -48,9 +55,12 @@ __all__ = [
     "read_video",
     "run_lanes",
     "versions",
+    "write_clip",
 ]
 
 Report = Callable[[str, str], None]  # camera, what happened to it
+CALL_S = 10.0  # what GLib's thread is asked to do takes milliseconds; after so long it hangs
+STOP_S = 2.0  # how long the end waits for pipelines to stop
 
 
 def check_machine(plans: Sequence[Plan]) -> None:
@@ -96,8 +106,12 @@ class _Glib:
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
         self._thread.start()
 
-    def call(self, function: Callable[[], None]) -> None:
-        """Run a function in the loop's thread and wait for it; what it raises is raised here."""
+    def call(self, what: str, function: Callable[[], None]) -> None:
+        """Run a function in the loop's thread and wait for it; what it raises is raised here.
+
+        what    the function's work, for people
+        raises  RunError where it is not done within CALL_S
+        """
         done = threading.Event()
         raised: list[BaseException] = []
 
@@ -110,11 +124,20 @@ class _Glib:
             return False
 
         GLib.idle_add(once)
-        done.wait()
+        if not done.wait(CALL_S):
+            raise RunError(f"GStreamer hangs: {what} takes more than {CALL_S:g} s")
         if raised:
             raise raised[0]
 
-    def quit(self) -> None:
+    def end(self, stop: Callable[[], None]) -> None:
+        """Run the last function, give state changes time to finish, end the loop. What hangs by then is left alone."""
+        try:
+            self.call("stopping", stop)
+            settle(STOP_S)
+        finally:
+            self._quit()
+
+    def _quit(self) -> None:
         self._loop.quit()
         self._thread.join(timeout=5)
 
@@ -142,7 +165,7 @@ class VehicleSide:
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Endpoint, report: Report, video: VideoFiles | None = None) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, report: Report, video: VideoFiles | None = None) -> None:
         self._report, self._video = report, video
         plans = _kept(plans, video)
         self._lock = threading.Lock()
@@ -159,7 +182,7 @@ class VehicleSide:
             for caller in self._callers.values():
                 caller.start()
 
-        self._glib.call(start)
+        self._glib.call("starting the cameras", start)
 
     def turn(self, commands: Iterable[Command]) -> None:
         """Carry out commands: those of one camera between the same two of its frames. Returns at once."""
@@ -173,10 +196,15 @@ class VehicleSide:
             if pipeline:
                 pipeline.turn(self._wanted_of(name), values)
 
+    def give_control(self, operator: str) -> None:
+        """State which operator is in control, "" for none: its viewers are always let in, see `runner.gst.viewers`."""
+        if self._server:
+            self._server.controller = operator
+
     def push(self, camera: str, frame: Any) -> bool:
-        """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle.push`."""
-        with self._lock:
-            self._wanted[camera]  # an unknown camera is the caller's mistake
+        """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle`."""
+        if camera not in self._wanted:
+            raise ValueError(f"camera {camera!r}: no such camera, {suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 
@@ -198,6 +226,11 @@ class VehicleSide:
                 pipeline.knobs.faults.clear()
         return told
 
+    def sources(self) -> dict[str, str]:
+        """By camera, what is wrong with a source that has failed and is being replaced; the others are left out."""
+        pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
+        return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
+
     def stop(self) -> None:
         def stop() -> None:
             for caller in self._callers.values():
@@ -205,14 +238,18 @@ class VehicleSide:
             if self._server:
                 self._server.stop()
 
-        self._glib.call(stop)
-        self._glib.quit()
+        self._glib.end(stop)
 
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
         """A pipeline that was just built, with every knob where it is wanted."""
+        name = plan.camera.name
+        source = None
+        if plan.frozen_s is not None:
+            source = WatchedSource(plan, lambda what: self._report(name, what))
+            source.take_place(pipeline, plan)
         if self._video:
-            VideoFile(self._video, plan.camera.name, "vehicle", born, self._report).follow(pipeline)
-        return CameraPipeline(pipeline, plan, self._wanted_of(plan.camera.name), self._turned)
+            VideoFile(self._video, name, "vehicle", born, self._report).follow(pipeline)
+        return CameraPipeline(pipeline, plan, self._wanted_of(name), self._turned, source)
 
     def _turned(self) -> None:
         self.on_turned()  # as it is then, not as it was when the pipeline was built
@@ -230,11 +267,12 @@ class VehicleSide:
 class OperatorSide:
     """All cameras of the vehicle, received and decoded.
 
-    report      told, from another thread, what happens to a camera
+    report      told, from another thread, what happens to which cameras
     on_unit     told, from the camera's streaming thread, each access unit that comes
     on_picture  told, from the camera's streaming thread, each decoded picture
     arrivals    keep when each access unit came, for the samples
     video       where what is received is kept; None: nowhere
+    operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
     raises      RunError where what `video` needs is not installed
     Without `on_unit`, `on_picture` and `arrivals` no Python runs per frame.
     """
@@ -247,30 +285,36 @@ class OperatorSide:
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
         video: VideoFiles | None = None,
+        operator: str = "",
     ) -> None:
         plans = _kept(plans, video)
         self._glib = _Glib()
-        self._receivers = {p.camera.name: Receiver(p, report, on_unit, on_picture, arrivals, video) for p in plans}
+        self._gathered = gathered = Gathered(report)
+        self._receivers = {
+            plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator) for plan in plans
+        }
 
         def start() -> None:
             for receiver in self._receivers.values():
                 receiver.start()
 
-        self._glib.call(start)
+        self._glib.call("starting the receivers", start)
 
     def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
         """What has come of each camera; to be called a few times a second.
 
-        sending  which cameras should send; one that should and is silent is built anew
+        sending  which cameras should send; one that should and is silent is built anew. Those of which nobody knows are
+                 left out
+        raises   RunError where GStreamer hangs
         """
         samples: dict[str, Received] = {}
 
         def sample() -> None:
             for name, receiver in self._receivers.items():
-                receiver.should_send = sending.get(name, False)
+                receiver.should_send = sending.get(name)
                 samples[name] = receiver.sample()
 
-        self._glib.call(sample)
+        self._glib.call("reading the receivers' counters", sample)
         return samples
 
     def stop(self) -> None:
@@ -278,8 +322,8 @@ class OperatorSide:
             for receiver in self._receivers.values():
                 receiver.stop()
 
-        self._glib.call(stop)
-        self._glib.quit()
+        self._glib.end(stop)
+        self._gathered.flush()
 
 
 class RecordingSide:
@@ -292,7 +336,7 @@ class RecordingSide:
     def __init__(self, plans: Sequence[Plan], files: Mapping[str, Path], duration_s: float | None) -> None:
         self._glib = _Glib()
         self._recorders = {p.camera.name: Recorder(p, str(files[p.camera.name]), duration_s) for p in plans}
-        self._for_each(Recorder.start)
+        self._for_each("starting the recorders", Recorder.start)
 
     def sample(self) -> dict[str, Recorded]:
         """What was recorded of each camera so far."""
@@ -301,24 +345,28 @@ class RecordingSide:
         def sample() -> None:
             samples.update({name: recorder.sample() for name, recorder in self._recorders.items()})
 
-        self._glib.call(sample)
+        self._glib.call("reading the recorders' counters", sample)
         return samples
 
     def finish(self) -> None:
         """Let every file end with what its source has delivered by now; returns at once."""
-        self._for_each(Recorder.finish)
+        self._for_each("ending the files", Recorder.finish)
 
     def stop(self) -> None:
         """End at once; what is not finished stays incomplete."""
-        self._for_each(Recorder.stop)
-        self._glib.quit()
 
-    def _for_each(self, do: Callable[[Recorder], None]) -> None:
+        def stop() -> None:
+            for recorder in self._recorders.values():
+                recorder.stop()
+
+        self._glib.end(stop)
+
+    def _for_each(self, what: str, do: Callable[[Recorder], None]) -> None:
         def each() -> None:
             for recorder in self._recorders.values():
                 do(recorder)
 
-        self._glib.call(each)
+        self._glib.call(what, each)
 
 
 # --- offline: what driving does not load ------------------------------------------------------------------------------
@@ -336,6 +384,13 @@ def read_video(path: Path) -> Iterator[Unit]:
     from runner.gst import video_reader
 
     return video_reader.read_video(path)
+
+
+def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps: Fraction) -> None:
+    """Frames made in Python as a clip, see `runner.gst.clip_writer.write_clip`."""
+    from runner.gst import clip_writer
+
+    clip_writer.write_clip(path, frames, width, height, fps)
 
 
 def run_lanes(

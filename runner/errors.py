@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+from runner.redact import redacted
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +21,7 @@ class Problem:
     rule: str
 
     def __str__(self) -> str:
-        return ": ".join(part for part in (self.file, self.path, self.found, self.rule) if part)
+        return redacted(": ".join(part for part in (self.file, self.path, self.found, self.rule) if part))
 
 
 class UserError(Exception):
@@ -41,3 +43,17 @@ class ConfigError(UserError):
 
 class RunError(Exception):
     """A run failed on this machine: exit status 1. The text says what to do."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(redacted(text))
+
+
+class MissingBindings(ImportError):
+    """GStreamer's Python bindings, or parts of them, do not load.
+
+    missing  why each part does not load, and what brings it
+    """
+
+    def __init__(self, missing: Mapping[str, str]) -> None:
+        super().__init__("; ".join(f"{part}: {why}" for part, why in missing.items()))
+        self.missing = missing

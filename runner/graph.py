@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from runner.commands import KnobValue
-from runner.model import (
+from runner.core.commands import KnobValue
+from runner.core.model import (
     PLACEHOLDER,
     Camera,
     Element,
@@ -61,7 +61,8 @@ _FILE_SINK = Element(
     {"sync": False, "async": False, "enable-last-sample": False, "buffer-mode": "unbuffered"},
 )
 _COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
-_KEPT_CODECS = ("h264", "h265")
+CODECS = ("h264", "h265")  # of which access units are known: for files and for the operator's page
+_FROZEN_INTERVALS = 10  # a source that is slow by itself is not frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +98,12 @@ class Plan:
         return self.camera.graph.transport == "rtsp"
 
     @property
+    def frozen_s(self) -> float | None:
+        """Without a frame for so long, s, the source is frozen and has to be replaced; None: it is not watched."""
+        frozen_s = self.camera.source.frozen_s
+        return None if frozen_s is None else max(frozen_s, _FROZEN_INTERVALS / float(self.camera.fps))
+
+    @property
     def pipeline(self) -> str:
         """The vehicle's side as GStreamer parses it, knobs not yet turned."""
         return launch((*self.source, *self._teed("vehicle", self.vehicle))) + self._file_branch
@@ -125,7 +132,7 @@ class Plan:
         """Elements between the stream and its file; none where there is no file."""
         if not self.video:
             return ()
-        codec = _kept_codec(self.camera.graph)
+        codec = video_codec(self.camera.graph)
         # Whoever opens the file has to find the parameter sets at each keyframe.
         parser = Element("video-parser", f"{codec}parse", {"config-interval": -1})
         return (_FILE_GATE, _FILE_QUEUE, parser, _FILE_MUXER, _FILE_SINK)
@@ -206,8 +213,8 @@ def check_video(graph: Graph) -> None:
         if _COUNTERS[side] not in (element.name for element in elements):
             rule = f"log.video needs an identity named {_COUNTERS[side]} where the stream is encoded"
             raise ModelError(f"graph.{side}", None, rule)
-    if not _kept_codec(graph):
-        raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(_KEPT_CODECS)}")
+    if not video_codec(graph):
+        raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(CODECS)}")
 
 
 def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
@@ -251,10 +258,10 @@ def rtsp_url(media: Endpoint, camera: str) -> str:
     return f"rtsp://{media.host}:{media.port}/{camera}"
 
 
-def _kept_codec(graph: Graph) -> str:
-    """Codec of a graph as its elements name it (x264enc and rtph264pay, ...), or "" where no file can hold it."""
+def video_codec(graph: Graph) -> str:
+    """Codec of a graph as its elements name it (x264enc and rtph264pay, ...), or "" for others than `CODECS`."""
     factories = [element.factory for element in (*graph.vehicle, *graph.operator)]
-    return next((codec for codec in _KEPT_CODECS if any(codec in factory for factory in factories)), "")
+    return next((codec for codec in CODECS if any(codec in factory for factory in factories)), "")
 
 
 def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:

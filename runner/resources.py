@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import runner
+
 
 def directory(name: str) -> Path:
-    """The packaged conf/ or schemas/: inside the installed package, beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    inside = package / name
-    return inside if inside.is_dir() else package.parent / name
+    """The packaged conf/ or schemas/: inside the installed package; in a checkout a link to the one beside it."""
+    return (Path(runner.__file__).parent / name).resolve()

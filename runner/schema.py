@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from runner.model import suggest
+from runner.core.model import suggest
 from runner.resources import directory
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
 
 Path = tuple[str | int, ...]
+DEEPEST_JSON = 32  # levels; a composed configuration has ten
+LONGEST_SHOWN = 80  # characters of a value in a message
 LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
 
 _TYPES = {
@@ -30,6 +34,7 @@ _TYPES = {
 _PATTERNS = {
     "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
     "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
+    r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation, in the place of one
 }
 
 
@@ -68,28 +73,53 @@ def dotted(path: Path) -> str:
 
 def shown(value: Any) -> str:
     """A value as it stands in YAML, cut where it is long."""
-    text = repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return shortened(repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str))
+
+
+def shortened(text: str) -> str:
+    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
 
 
 @cache
 def validator(schema: str) -> Draft202012Validator:
-    from jsonschema import Draft202012Validator
+    return _draft()({"$ref": f"{schema}.schema.json"}, registry=_registry())
 
-    return Draft202012Validator({"$ref": f"{schema}.schema.json"}, registry=_registry())
+
+@cache
+def _draft() -> type[Draft202012Validator]:
+    """JSON Schema 2020-12, whose patterns are those of ECMA-262: $ is the end, and not also before a last newline."""
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
+    from jsonschema.validators import extend
+
+    def pattern(_validator: Any, wanted: str, value: Any, _schema: Any) -> Iterator[ValidationError]:
+        if isinstance(value, str) and not re.search(re.sub(r"\$$", r"\\Z", wanted), value):
+            yield ValidationError(f"{value!r} does not match {wanted!r}")
+
+    draft: type[Draft202012Validator] = extend(Draft202012Validator, {"pattern": pattern})  # type: ignore[no-untyped-call]
+    return draft
 
 
 @cache
 def event_validator(name: str) -> Draft202012Validator | None:
     """Validator of one event's own definition; None: there is no such event."""
-    from jsonschema import Draft202012Validator
-
-    definitions = schema_document("event")["$defs"]
-    if name not in definitions or name == "t":
+    if name not in event_names():
         return None
-    definition = definitions[name]
-    properties = definition["properties"] | {"t": definitions["t"]}  # a reference less to follow for each event
-    return Draft202012Validator(definition | {"properties": properties})
+    definition = schema_document("event")["$defs"][name]
+    parts = definition["properties"].items()
+    # No references left to follow for each event.
+    properties = {key: referred(part["$ref"], "event")[0] if "$ref" in part else part for key, part in parts}
+    return _draft()(definition | {"properties": properties})
+
+
+def referred(reference: str, schema: str) -> tuple[Any, str]:
+    """What a reference in a schema refers to, and the name of the schema that holds it."""
+    file, _, pointer = reference.partition("#")
+    home = file.removesuffix(".schema.json") or schema
+    found: Any = schema_document(home)
+    for step in pointer.split("/")[1:]:
+        found = found[step]
+    return found, home
 
 
 @cache
@@ -97,17 +127,39 @@ def log_validator(kind: str) -> Draft202012Validator | None:
     """Validator of one kind of line in a drive's files; None: there is no such kind."""
     if kind not in log_kinds():
         return None
+    return _draft()({"$ref": f"drive.schema.json#/$defs/{kind}"}, registry=_registry())
+
+
+@cache
+def message_validator(kind: str) -> Draft202012Validator:
+    """Validator of what the vehicle sends over the control link: state, telemetry, reply or configuration."""
     from jsonschema import Draft202012Validator
 
-    return Draft202012Validator({"$ref": f"drive.schema.json#/$defs/{kind}"}, registry=_registry())
+    return Draft202012Validator({"$ref": f"control.schema.json#/$defs/{kind}"}, registry=_registry())
 
 
 def read_json(text: str | bytes) -> Any:
     """A JSON document that comes from outside, its numbers finite: NaN, Infinity and 1e999 are none.
 
-    raises  ValueError, RecursionError
+    raises  ValueError, also for what is nested deeper than any message of ours
     """
-    return json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+    try:
+        document = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    if brackets > DEEPEST_JSON and _depth(document) > DEEPEST_JSON:
+        raise ValueError("nested too deeply")
+    return document
+
+
+def _depth(document: Any) -> int:
+    """Levels of lists and mappings, counted level by level."""
+    depth, level = 0, [document]
+    while level := [inner for inner in level if isinstance(inner, dict | list)]:
+        depth += 1
+        level = [part for inner in level for part in (inner.values() if isinstance(inner, dict) else inner)]
+    return depth
 
 
 def _no_number(text: str) -> float:
@@ -149,6 +201,11 @@ def log_problem(document: Mapping[str, Any]) -> str:
     return _in_one_line(check, document)
 
 
+def message_problem(kind: str, document: Any) -> str:
+    """What is wrong with a message of the vehicle, in one line; "" if nothing is."""
+    return _in_one_line(message_validator(kind), document)
+
+
 @cache
 def log_kinds() -> tuple[str, ...]:
     return tuple(schema_document("drive")["properties"]["log"]["enum"])
@@ -175,8 +232,12 @@ def _registry() -> Any:
     from referencing import Registry
     from referencing.jsonschema import DRAFT202012
 
-    resources = ((f"{name}.schema.json", DRAFT202012.create_resource(schema_document(name))) for name in schema_names())
-    return Registry().with_resources(resources)
+    def resource(name: str) -> Any:
+        # A $schema of its own would make jsonschema go on with its own class in place of `_draft`.
+        content = {key: value for key, value in schema_document(name).items() if key != "$schema"}
+        return DRAFT202012.create_resource(content)
+
+    return Registry().with_resources((f"{name}.schema.json", resource(name)) for name in schema_names())
 
 
 def _oddities(value: Any, path: Path) -> Iterator[Finding]:
@@ -192,6 +253,8 @@ def _oddities(value: Any, path: Path) -> Iterator[Finding]:
             yield from _oddities(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
+    elif isinstance(value, int) and abs(value) >= 10**LONGEST_WHOLE:
+        yield Finding(path, None, f"must have at most {LONGEST_WHOLE} digits")
 
 
 def _in_one_line(check: Draft202012Validator, document: Any) -> str:
@@ -246,8 +309,9 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "exclusiveMinimum":
             return f"must be above {limit}"
         case "enum":
-            hint = suggest(value, limit) if isinstance(value, str) else ""
-            return f"must be one of {', '.join(map(str, limit))}" + (f", {hint}" if "mean" in hint else "")
+            options = ["null" if option is None else str(option) for option in limit]
+            hint = suggest(value, options) if isinstance(value, str) else ""
+            return f"must be one of {', '.join(options)}" + (f", {hint}" if "mean" in hint else "")
         case "const":
             return f"must be {shown(limit)}"
         case "minItems" | "minLength" | "minProperties":

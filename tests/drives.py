@@ -11,12 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from runner.compose import compose
-from runner.config import load_run
+from runner.configuration.compose import compose
+from runner.configuration.config import configuration
+from runner.core.events import ClockAdvanced, Event, PositionReported, to_json
+from runner.core.model import plain
+from runner.core.step import Run, start, step
 from runner.drive.log import FILES
-from runner.events import ClockAdvanced, Event, PositionReported, to_json
-from runner.model import plain
-from runner.step import Run, start, step
+from runner.records import (
+    CameraSample,
+    CameraState,
+    CameraTelemetry,
+    DecisionMade,
+    LinkSample,
+    Position,
+    Sample,
+    Telemetry,
+    VehicleState,
+    line_to_json,
+)
 
 EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
 OPERATOR_LATER_S = 1.5  # the operator begins to log later than the vehicle
@@ -76,7 +88,8 @@ def _drive(
     frozen: tuple[tuple[str, float, float], ...],
 ) -> tuple[dict[str, Any], dict[str, Lines]]:
     words = ["source=test", *overrides]
-    made = _Made(np.random.default_rng(seed), *load_run(words, None), seconds, congested, frozen)
+    config = configuration(words)
+    made = _Made(np.random.default_rng(seed), config.vehicle(), *config.pqos(), seconds, congested, frozen)
     made.drive(sorted(events, key=lambda event: event.t))
     config = compose(words).document
     return config, {"vehicle": made.vehicle_log, "operator": made.operator_log, "link": made.link_log}
@@ -108,7 +121,7 @@ class _Made:
             name: dict.fromkeys(("frames", "bytes", "got", "got_bytes", "lost", "rebuilt"), 0) for name in names
         }
         self.due = dict.fromkeys(names, 0.0)  # when the next frame is captured
-        self.arrivals: dict[str, list[list[float | None]]] = {name: [] for name in names}
+        self.arrivals: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
         self.past: list[tuple[float, dict[str, tuple[int, int]]]] = []
         self.dropped = self.passed = self.packets = 0
 
@@ -141,15 +154,14 @@ class _Made:
         self.vehicle_log.append(to_json(event))
         if not self.now.commands and self.now.decision == before.decision:
             return
-        commands = [command.to_json() for command in self.now.commands]
-        said = {"t": event.t, "cause": cause, **self.now.decision.to_json()}
-        self.vehicle_log.append({**said, "log": "decision", "commands": commands})
-        state = json.loads(json.dumps(said))
-        for camera in state["cameras"].values():
-            camera |= {"weight": 1, "applied": {}}
+        decision = self.now.decision
+        made = DecisionMade.of(event.t, cause, decision, self.now.commands)
+        self.vehicle_log.append(line_to_json(made))
         if event.t >= OPERATOR_LATER_S or not self.operator_log:
             shifted = max(0.0, round(event.t - OPERATOR_LATER_S + 0.02, 6))
-            self.operator_log.append(state | {"log": "state", "online": True, "t": shifted})
+            cameras = {name: CameraState.at(setting, 1, {}, None) for name, setting in decision.settings.items()}
+            state = VehicleState(shifted, cause, decision.mode, made.total_kbps, cameras)
+            self.operator_log.append(line_to_json(state))
 
     def _predicted(self) -> float:
         prediction = self.now.state.prediction
@@ -183,20 +195,14 @@ class _Made:
         if lost or still or arrived < OPERATOR_LATER_S:
             return
         count["got"], count["got_bytes"] = count["got"] + 1, count["got_bytes"] + size
-        self.arrivals[name].append([round(arrived - OPERATOR_LATER_S, 6), round(ms, 2)])
+        self.arrivals[name].append((round(arrived - OPERATOR_LATER_S, 6), round(ms, 2)))
 
     def _telemetry(self, t: float) -> dict[str, Any]:
-        cameras = {
-            name: {"applied": {}, "frames": count["frames"], "bytes": count["bytes"]}
-            for name, count in self.count.items()
-        }
-        said = {"predicted_kbps": self._predicted(), "position": self._place(), "cameras": cameras}
-        return {"t": t, "log": "telemetry", **said, "refused": self.refused}
+        cameras = {name: CameraTelemetry({}, count["frames"], count["bytes"]) for name, count in self.count.items()}
+        return line_to_json(Telemetry(t, self._predicted(), self._place(), cameras, self.refused))
 
-    def _place(self) -> dict[str, Any] | None:
-        if self.position is None:
-            return None
-        return {key: value for key, value in to_json(self.position).items() if key not in ("t", "event")}
+    def _place(self) -> Position | None:
+        return Position.of(self.position) if self.position else None
 
     def _sample(self, t: float) -> dict[str, Any]:
         self.past = [each for each in self.past if each[0] >= t - 1.25]
@@ -204,42 +210,41 @@ class _Made:
         first = next((each for each in reversed(self.past) if each[0] <= t - 1.0 + 1e-6), self.past[0])
         seconds = max(t - first[0], 1e-6)
         cameras = {name: self._received(name, first[1][name], seconds) for name in self.count}
-        return {
-            "t": round(t - OPERATOR_LATER_S, 6),
-            "log": "sample",
-            "predicted_kbps": self._predicted(),
-            "allocated_kbps": sum(camera["allocated_kbps"] for camera in cameras.values()),
-            "actual_kbps": round(sum(camera["kbps"] for camera in cameras.values()), 1),
-            "position": self._place(),
-            "refused": self.refused,
-            "cameras": cameras,
-        }
+        sample = Sample(
+            t=round(t - OPERATOR_LATER_S, 6),
+            predicted_kbps=self._predicted(),
+            allocated_kbps=sum(camera.allocated_kbps for camera in cameras.values()),
+            actual_kbps=round(sum(camera.kbps for camera in cameras.values()), 1),
+            position=self._place(),
+            refused=self.refused,
+            cameras=cameras,
+        )
+        return line_to_json(sample)
 
-    def _received(self, name: str, first: tuple[int, int], seconds: float) -> dict[str, Any]:
+    def _received(self, name: str, first: tuple[int, int], seconds: float) -> CameraSample:
         count, setting, arrivals = self.count[name], self.now.decision.settings[name], self.arrivals[name]
         self.arrivals[name] = []
         new = seconds > 0.1
-        return {
-            "fps": round((count["got"] - first[0]) / seconds, 2) if new else 0.0,
-            "kbps": round((count["got_bytes"] - first[1]) * 8 / 1000 / seconds, 1) if new else 0.0,
-            "allocated_kbps": setting.kbps,
-            "demand_kbps": plain(setting.demand),
-            "scaling": None if setting.scaling is None else plain(setting.scaling),
-            "width": setting.width if count["got"] else 0,
-            "height": setting.height if count["got"] else 0,
-            "latency_ms": round(arrivals[-1][1] + 4 + self.random.gamma(2.0, 1.0), 2) if arrivals else None,
-            "lost": count["lost"],
-            "rebuilt": count["rebuilt"],
-            "frames": count["got"],
-            "bytes": count["got_bytes"],
-            "arrivals": arrivals,
-        }
+        return CameraSample(
+            fps=round((count["got"] - first[0]) / seconds, 2) if new else 0.0,
+            kbps=round((count["got_bytes"] - first[1]) * 8 / 1000 / seconds, 1) if new else 0.0,
+            allocated_kbps=setting.kbps,
+            demand_kbps=plain(setting.demand),
+            scaling=None if setting.scaling is None else plain(setting.scaling),
+            width=setting.width if count["got"] else 0,
+            height=setting.height if count["got"] else 0,
+            latency_ms=round(arrivals[-1][1] + 4 + self.random.gamma(2.0, 1.0), 2) if arrivals else None,
+            lost=count["lost"],
+            rebuilt=count["rebuilt"],
+            frames=count["got"],
+            bytes=count["got_bytes"],
+            arrivals=tuple(arrivals),
+        )
 
     def _link(self, t: float) -> dict[str, Any]:
         kbps = round(self._predicted() * 1.1)
         queue = max(0.0, float(self.random.normal(4, 2)))
-        counters = {"bytes": self.passed, "packets": self.packets, "dropped": self.dropped}
-        return {"t": t, "log": "link", "kbps": kbps, "queue_ms": round(queue, 2), **counters}
+        return line_to_json(LinkSample(t, kbps, round(queue, 2), self.passed, self.packets, self.dropped))
 
 
 def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: float) -> Path:

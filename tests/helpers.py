@@ -12,19 +12,19 @@ from typing import Any, NamedTuple
 import pytest
 
 from runner.__main__ import main
-from runner.config import load
-from runner.decision import Setting
-from runner.events import parse
-from runner.model import Vehicle
+from runner.configuration.config import configuration
+from runner.core.decision import Setting
+from runner.core.events import parse
+from runner.core.model import Vehicle
+from runner.core.step import Run, start, step
 from runner.resources import directory
-from runner.step import Run, start, step
 
 CONF = directory("conf")
 
 
 @cache
 def vehicle(*overrides: str) -> Vehicle:
-    return load(["source=test", *overrides])
+    return configuration(["source=test", *overrides]).vehicle()
 
 
 class Drive:

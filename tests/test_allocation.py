@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.allocation import allocate, demand
-from runner.model import Roi
+from runner.core.allocation import allocate, demand
+from runner.core.model import Roi
 
 FULL = Roi(0, 0, 1920, 1040)
 ONES = {name: Fraction(1) for name in "abcdefgh"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from drives import write_drive
 
-from runner.config import load_experiment
+from runner.configuration.config import configuration
 from runner.drive.claims import claims
 from runner.drive.read import read_drive
 from runner.drive.series import series
@@ -20,7 +20,7 @@ def held(path: Path) -> dict[str, bool | None]:
 
 
 def test_the_driving_test_does_what_the_paper_reports(tmp_path: Path) -> None:
-    experiment, link = load_experiment(TEST, None)
+    experiment, link = configuration(TEST, runnable=False).experiment()
     assert (experiment.duration_s, experiment.claims, link) == (100, "driving_test", None)
     checks = claims(series(read_drive(write_drive(tmp_path / "drive", seconds=100, overrides=TEST))))
     assert len(checks) == 9

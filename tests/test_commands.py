@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from helpers import Drive
 
-from runner.commands import Command, after, difference, wanted
-from runner.model import Roi
+from runner.core.commands import Command, after, difference, wanted
+from runner.core.model import Roi
 
 DRIVE = Drive("modes=paper", "vehicle=delivery_robot")
 DECISION = DRIVE.run.decision

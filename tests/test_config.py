@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 from helpers import CONF, Command, UserConf, process, vehicle
 
-from runner.config import load
+from runner.configuration.config import configuration
+from runner.core.model import Mode
 from runner.errors import ConfigError, Problem
-from runner.model import Mode
 
 TOP_KEYS = "mode, fps_max, media, control, page, log, name, cameras, modes, graph, source, pqos, recording, ..."
 CAMERA_KEYS = (
     "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
 )
+OWN = "files of your own need conf=DIR"
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
     "kbps, bps, left, right, top, bottom, on, off (quote these two), or a caps template over {width} and {height}"
@@ -87,7 +88,7 @@ def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
 
 def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"b_full_kbps: 5000": "b_full_kbps: 7000"})
-    cameras = load(["source=test"], conf.path).cameras
+    cameras = configuration(["source=test"], conf.path).vehicle().cameras
     assert cameras["front_center"].rate_quality.b_full == 7000
     assert cameras["front_left"].rate_quality.b_full == 6000
     assert vehicle().cameras["front_center"].rate_quality.b_full == 5000
@@ -101,7 +102,7 @@ def test_a_user_adds_vehicle_camera_graph_modes_and_source(conf: UserConf) -> No
     conf.write("modes/own.yaml", "defaults: [paper, _self_]\n")
     conf.write("source/own.yaml", "elements: [{name: source, element: videotestsrc, properties: {pattern: ball}}]\n")
     conf.write("vehicle/mine.yaml", MINE.replace("top_view", "tiny"))
-    mine = load(["vehicle=mine", "graph=own", "modes=own", "source=own"], conf.path)
+    mine = configuration(["vehicle=mine", "graph=own", "modes=own", "source=own"], conf.path).vehicle()
     assert (mine.name, list(mine.cameras)) == ("mine", ["a"])
     camera = mine.cameras["a"]
     assert (camera.width, camera.graph.settings["first_port"]) == (640, 7000)
@@ -114,7 +115,7 @@ def test_a_modes_file_builds_on_another(conf: UserConf) -> None:
         "defaults: [paper, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 700}\n"
         "  - demand_from_roi: {}\n  - share_by_demand: {}\n  - scaling_from_rate_quality: {}\n",
     )
-    modes = load(["source=test", "modes=own"], conf.path).modes
+    modes = configuration(["source=test", "modes=own"], conf.path).vehicle().modes
     paper = vehicle("modes=paper").modes
     assert modes[Mode.AUTOMATIC][0].parameters == {"start_kbps": 700}
     assert modes[Mode.COLLECTIVE] == paper[Mode.COLLECTIVE]
@@ -127,7 +128,7 @@ def test_a_vehicle_builds_on_another(conf: UserConf) -> None:
         "# @package _global_\ndefaults:\n  - tum_q7\n  - override /cameras@cameras.rear_center: top_view\n  - _self_\n"
         "name: mine\ncameras: {front_left: {weight: 3}}\n",
     )
-    cameras = load(["source=test", "vehicle=mine"], conf.path).cameras
+    cameras = configuration(["source=test", "vehicle=mine"], conf.path).vehicle().cameras
     assert (len(cameras), cameras["front_left"].weight, cameras["rear_center"].width) == (8, 3, 1280)
 
 
@@ -136,7 +137,7 @@ def test_a_mounted_camera_may_have_its_own_graph_and_source(conf: UserConf) -> N
     conf.write(
         "vehicle/mine.yaml", MINE.replace("  - _self_\n", f"  - /cameras@cameras.b: top_view\n{own}  - _self_\n")
     )
-    cameras = load(["source=test", "vehicle=mine"], conf.path).cameras
+    cameras = configuration(["source=test", "vehicle=mine"], conf.path).vehicle().cameras
     assert [c.graph.transport for c in cameras.values()] == ["pipeline", "rtsp"]
     assert [c.source.elements[0].factory for c in cameras.values()] == ["appsrc", "videotestsrc"]
 
@@ -245,7 +246,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             GRAPH,
             {"{mtu_bytes}": "{mtu_byte}"},
-            "vehicle[6].properties.mtu: '{mtu_byte}': nothing fills {mtu_byte}, did you mean mtu_bytes?",
+            "sender[1].properties.mtu: '{mtu_byte}': nothing fills {mtu_byte}, did you mean mtu_bytes?",
         ),
         (GRAPH, {"name: scaler": "name: crop"}, "vehicle[2].name: 'crop': is already the name of another element"),
         (
@@ -323,7 +324,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ("  - _self_\n", "  - delivery_robot\n", "defaults[3]: 'delivery_robot': is this file itself"),
         ("weight: 2", "weight: '${'", "cameras.front.weight: no viable alternative at input '${'"),
         ("cameras:\n", "cameras: [1]\nx:\n", "a key is a list here and a mapping in a file that this builds on"),
-        ("weight: 2", "weight: &a [*a]", "an alias, *NAME, stands inside what it refers to"),
+        ("weight: 2", "weight: &a [*a]", "line 15: an alias, *a, stands inside what it refers to"),
         (
             ": compact_480p",
             ": ${oc.env:HOME}",
@@ -346,7 +347,8 @@ def test_a_native_picture_must_hold_the_crop(conf: UserConf, tod: Command) -> No
 @pytest.mark.parametrize(
     "content, told",
     [
-        (b"", "must begin with the line # @package _global_"),
+        (b"", "is empty, must be a mapping"),
+        (b"name: x\n", "must begin with the line # @package _global_"),
         (b"name: \xff", "'utf-8' codec can't decode byte 0xff in position 6: invalid start byte"),
         (b"# @package _global_\n- a\n- b\n", '["a", "b"]: must be a mapping'),
         (
@@ -385,8 +387,8 @@ def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
     [
         (["vehicle=tum_q8"], "vehicle: tum_q8: no such file in conf/vehicle/, did you mean tum_q7?"),
         (["modes=saef"], "modes: saef: no such file in conf/modes/, did you mean safe?"),
-        (["pqos=none"], "pqos: none: no such file in conf/pqos/, there is constant, live, map, trace"),
-        (["vehicle=null"], "vehicle: null: no such file in conf/vehicle/, there is delivery_robot, tum_q7"),
+        (["pqos=none"], f"pqos: none: no such file in conf/pqos/, there is constant, live, map, trace; {OWN}"),
+        (["vehicle=null"], f"vehicle: null: no such file in conf/vehicle/, there is delivery_robot, tum_q7; {OWN}"),
         (["+graph@cameras.front_left.graph=h264_srtt"], "no such file in conf/graph/, did you mean h264_srt?"),
         (["vehicle=a,b"], "vehicle=a,b: a,b,c is a sweep; write [a,b,c] for a list"),
         (["mode=single,automatic"], "mode=single,automatic: a,b,c is a sweep; write [a,b,c] for a list"),
@@ -407,6 +409,9 @@ def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
         (["fps_max=on"], "fps_max: 'on': must be a number or null"),
         (["media.port=0"], "media.port: 0: must be at least 1"),
         (["media.port=on"], "media.port: 'on': must be a whole number"),
+        (["media.rtp_ports=[21000,20000]"], "media.rtp_ports: [21000, 20000]: must rise: the first and the last port"),
+        (["media.max_viewers=0"], "media.max_viewers: 0: must be at least 1"),
+        (["media.session_timeout_s=1.5"], "media.session_timeout_s: 1.5: must be a whole number"),
         (["media.host=on", "media.port=true"], "media.port: true: must be a whole number"),
         (["name=${oc.env:HOME}"], "name: Unsupported interpolation type oc.env"),
         (["name=${nope}"], "name: Interpolation key 'nope' not found"),

@@ -165,7 +165,7 @@ def test_falling_curves_are_found():
 
 
 def test_the_choice_is_a_valid_rate_quality_model():
-    from runner.model import RateQualityModel
+    from runner.core.model import RateQualityModel
 
     choice = choose(grid(), WISHES)
     model = RateQualityModel(choice.scaling, tuple(map(Fraction, choice.b_min)), Fraction(choice.b_full))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from runner.core.events import CameraSwitched
 from runner.drive.log import Log
 from runner.drive.read import read_drive
 from runner.errors import UserError
+from runner.records import LinesDropped, Note
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 NOTES = """
@@ -29,7 +32,7 @@ log = Log(Path(sys.argv[1]), "vehicle", dict(), dict(), said.append)
 log.begin()
 {limit}
 for number in range({count}):
-    log.tell("note", text=f"{{number}} " + "x" * 5000)
+    log.note(f"{{number}} " + "x" * 5000)
 log.close()
 print(len(said), *said)
 """
@@ -47,6 +50,12 @@ def child(directory: Path, count: str, limit: str = "") -> subprocess.Popen[str]
     )
 
 
+def run(code: str, directory: Path) -> subprocess.CompletedProcess[str]:
+    """Python code in a process of its own, told a directory."""
+    command = [sys.executable, "-c", code, str(directory)]
+    return subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=60, check=False)
+
+
 def begun(directory: Path, config: dict[str, Any] | None = None) -> Log:
     log = Log(directory, "vehicle", config or {}, {"GStreamer": "1.22"}, lambda what: None)
     log.begin()
@@ -55,17 +64,17 @@ def begun(directory: Path, config: dict[str, Any] | None = None) -> Log:
 
 def test_a_drive_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     log = Log(tmp_path / "a" / "drive", "operator", {"name": "tum_q7"}, {"GStreamer": "1.22"}, lambda what: None)
-    log.tell("note", text="before the beginning")
+    log.note("before the beginning")
     log.begin()
-    log.tell("note", text="grün")
+    log.note("grün")
     log.close()
-    log.tell("note", text="after the end")
+    log.note("after the end")
     drive = read_drive(tmp_path / "a" / "drive")
     assert (drive.name, drive.warnings, list(drive.sides)) == ("drive", [], ["operator"])
     side = drive.sides["operator"]
-    assert (side.began["config"], side.began["versions"]["GStreamer"]) == ({"name": "tum_q7"}, "1.22")
-    assert abs(side.began["time"] - time.time()) < 60
-    assert [line.get("text") for line in side.lines] == ["before the beginning", "grün"]
+    assert (side.began.config, side.began.versions["GStreamer"]) == ({"name": "tum_q7"}, "1.22")
+    assert abs(side.began.time - time.time()) < 60
+    assert [note.text for note in side.of(Note)] == ["before the beginning", "grün"]
     assert side.ended
 
 
@@ -88,10 +97,71 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
     with child(tmp_path, "100", limit) as process:
         told, _ = process.communicate(timeout=60)
     assert process.returncode == 0
-    assert told == "1 the drive goes on without its log: drive.jsonl: no space left on device\n"
+    first = "the drive goes on without its log: drive.jsonl: no space left on device"
+    assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", told)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
-    assert "is cut off and was left out" in drive.warnings[0]
+    assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: has no end; the process was killed, or still runs"]
+
+
+def test_a_log_goes_on_when_the_disk_has_room_again(tmp_path: Path) -> None:
+    """Nothing is lost meanwhile: the lines wait."""
+    code = (
+        "import resource, sys, time; from pathlib import Path; from runner.drive.log import Log\n"
+        "said = []; log = Log(Path(sys.argv[1]), 'vehicle', {}, {}, said.append); log.begin()\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))\n"
+        "for n in range(99): log.note(f'{n} ' + 'x' * 1000)\n"
+        "while not said: time.sleep(0.01)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))\n"
+        "while len(said) < 2: time.sleep(0.01)\n"
+        "log.note('99'); log.close(); print(*said, sep='\\n')\n"
+    )
+    done = run(code, tmp_path)
+    assert done.stdout.splitlines() == [
+        "the drive goes on without its log: drive.jsonl: no space left on device",
+        "the log is written again: drive.jsonl",
+    ], done.stderr
+    drive = read_drive(tmp_path)
+    assert drive.warnings == []
+    assert [note.text.split()[0] for note in drive.sides["vehicle"].of(Note)] == [str(n) for n in range(100)]
+
+
+def test_a_disk_that_hangs_holds_up_nobody_and_what_is_dropped_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is a pipe that nobody reads until all is said."""
+    monkeypatch.setattr("runner.drive.log.QUEUED_LINES", 100)
+    read_end, write_end = os.pipe()
+    monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
+    log = begun(tmp_path)
+    for number in range(1000):  # would never end if any of them waited for the disk
+        log.note(f"{number} " + "x" * 5000)
+    with open(read_end, "rb") as pipe:
+        closing = threading.Thread(target=log.close)
+        closing.start()
+        (tmp_path / "drive.jsonl").write_bytes(pipe.read())
+    closing.join(60)
+    drive = read_drive(tmp_path)
+    dropped = sum(line.lines for line in drive.sides["vehicle"].of(LinesDropped))
+    kept = [int(note.text.split()[0]) for note in drive.sides["vehicle"].of(Note)]
+    assert (len(kept) + dropped, kept) == (1000, sorted(kept))
+    assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: {dropped} lines were dropped, since the disk was too slow"]
+
+
+def test_a_disk_that_hangs_for_good_keeps_no_process_from_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runner.drive.log.CLOSE_S", 0.1)
+    read_end, write_end = os.pipe()
+    monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
+    said: list[str] = []
+    log = Log(tmp_path, "vehicle", {}, {}, said.append)
+    log.begin()
+    for _ in range(20):
+        log.note("x" * 5000)
+    log.close()
+    assert re.fullmatch(r"drive.jsonl: \d+ lines were not written", said[0])
+    os.close(read_end)  # the thread of the log ends
 
 
 def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
@@ -99,7 +169,7 @@ def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
 
     def write(name: str) -> None:
         for number in range(200):
-            log.tell("note", text=f"{name} {number} " + name * 3000)
+            log.note(f"{name} {number} " + name * 3000)
 
     threads = [threading.Thread(target=write, args=(name,)) for name in "abcd"]
     for thread in threads:
@@ -107,10 +177,10 @@ def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     log.close()
-    lines = read_drive(tmp_path).sides["vehicle"].lines
-    assert len(lines) == 4 * 200
+    texts = [note.text for note in read_drive(tmp_path).sides["vehicle"].of(Note)]
+    assert len(texts) == 4 * 200
     for name in "abcd":
-        assert [line["text"].split()[1] for line in lines if line["text"][0] == name] == [str(n) for n in range(200)]
+        assert [text.split()[1] for text in texts if text[0] == name] == [str(n) for n in range(200)]
 
 
 def test_where_nothing_can_be_written_is_told_before_the_drive(tmp_path: Path) -> None:
@@ -137,27 +207,20 @@ def test_who_is_told_of_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None
     """As the operator's station does: what it is told becomes a note of the log that has just ended."""
     code = (
         "import resource, sys; from pathlib import Path; from runner.drive.log import Log\n"
-        "log = Log(Path(sys.argv[1]), 'operator', {}, {}, lambda what: log.tell('note', text=what))\n"
+        "log = Log(Path(sys.argv[1]), 'operator', {}, {}, lambda what: log.note(what))\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000)); log.begin()\n"
-        "for n in range(9): log.tell('note', text='x' * 1000)\n"
+        "for n in range(9): log.note('x' * 1000)\n"
         "log.close(); print('done')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run(code, tmp_path)
     assert done.stdout == "done\n", done.stderr
 
 
 def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
     """A request may name any camera; that it is refused is a line, too."""
     log = begun(tmp_path)
-    event = {"t": 0.1, "event": "camera_switched", "camera": "\ud800", "on": False}
-    log.write(event)
+    event = CameraSwitched(t=0.1, camera="\ud800", on=False)
+    log.event(event)
     log.close()
     assert read_drive(tmp_path).sides["vehicle"].lines == [event]
 
@@ -186,7 +249,7 @@ def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
 )
 def test_what_is_no_drive_is_told_with_its_line(tmp_path: Path, change: Any, told: str) -> None:
     log = begun(tmp_path)
-    log.tell("note", text="a")
+    log.note("a")
     log.close()
     file = tmp_path / "drive.jsonl"
     file.write_text("".join(change(written(tmp_path))))

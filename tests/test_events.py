@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from runner.core.events import EVENTS, BitratePredicted, CameraConfigured, RoiSet, WeightsSet, parse, to_json
+from runner.core.model import Roi
 from runner.drive.read import read_line
-from runner.events import EVENTS, BitratePredicted, CameraConfigured, RoiSet, WeightsSet, parse, to_json
-from runner.model import Roi
 from runner.schema import event_names, event_problem
 
 EXAMPLES: list[dict[str, Any]] = [

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from helpers import Command, UserConf
 
-from runner.compose import compose, options
-from runner.config import load_experiment, load_run
+from runner.configuration.compose import compose
+from runner.configuration.config import configuration
+from runner.configuration.experiment import LinkSettings
+from runner.configuration.files import options
 from runner.resources import directory
 
 HEAD = "# @package _global_\n"
@@ -24,10 +26,10 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 
 @pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
-    experiment, link = load_experiment([f"experiment={name}"], None)
+    experiment, link = configuration([f"experiment={name}"], runnable=False).experiment()
     assert (link is not None) == (name == "bottleneck")
     for words in ((), *experiment.runs.values()):
-        load_run([f"experiment={name}", *words], None, runnable=False)
+        configuration([f"experiment={name}", *words], runnable=False).pqos()
 
 
 def test_the_command_line_has_the_last_word() -> None:
@@ -41,19 +43,24 @@ def test_the_command_line_has_the_last_word() -> None:
     assert (other.document["pqos"]["file"], other.document["experiment"]["duration_s"]) == ("maps/demo_loop.csv", 7)
 
 
+def limited(*words: str) -> LinkSettings:
+    _, link = configuration(words, runnable=False).experiment()
+    assert link is not None
+    return link
+
+
 def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_path: Path) -> None:
-    _, link = load_experiment(["experiment=driving_test", "link=relay", "link.share=2"], None)
-    assert link is not None and link.kind == "relay"
+    link = limited("experiment=driving_test", "link=relay", "link.share=2")
+    assert link.kind == "relay"
     rates = [link.limit.kbps_at(t / 10) / 2 for t in range(1000)]
     assert min(rates) == 3030 and max(rates) < 8000
     assert rates[120] > 4000  # where the prediction, which looks ahead, is in the dip already
     trace = tmp_path / "uplink.csv"
     trace.write_text("t_s,uplink_kbps\n0,1000\n1,2000\n")
-    _, link = load_experiment(["link=netns", f"link.file={trace}", "link.share=1.5"], None)
-    assert link is not None
+    link = limited("link=netns", f"link.file={trace}", "link.share=1.5")
     assert [link.limit.kbps_at(t) for t in (0, 0.9, 1, 2.5)] == [1500, 1500, 3000, 1500]
-    _, link = load_experiment(["link=relay", "pqos=constant", "pqos.kbps=700", "link.share=1"], None)
-    assert link is not None and [link.limit.kbps_at(t) for t in (0, 0.3, 50)] == [700, 700, 700]
+    link = limited("link=relay", "pqos=constant", "pqos.kbps=700", "link.share=1")
+    assert [link.limit.kbps_at(t) for t in (0, 0.3, 50)] == [700, 700, 700]
 
 
 @pytest.mark.parametrize(
@@ -69,6 +76,10 @@ def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_
         ),
         ("defaults: [{override /modes: paper}, _self_]\n" + TAIL, "must begin with the line # @package _global_"),
         (HEAD + "defaults: [_self_]\nexperiment: {about: x}\n", "experiment.duration_s: missing: must be given"),
+        (
+            HEAD + "defaults: [_self_]\nexperiment: {about: x, duration_s: 5, claims: driving_tst}\n",
+            "experiment.claims: 'driving_tst': must be one of driving_test, null, did you mean driving_test?",
+        ),
         (HEAD + "defaults: [_self_]\nfsp_max: 3\n" + TAIL, "fsp_max: unknown key, did you mean fps_max?"),
     ],
 )
@@ -86,7 +97,9 @@ def test_a_run_that_cannot_be_composed_is_told(tod: Command, conf: UserConf) -> 
     conf.write("experiment/mine.yaml", HEAD + "defaults: [_self_]\n" + runs)
     result = tod("validate", conf.word, *NARROW)
     assert result.status == 2
-    assert "modes: papr: no such file in conf/modes/, did you mean paper?" in result.err
+    path = conf.path / "experiment/mine.yaml"
+    assert result.err.startswith(f"{path}: experiment.runs.a: modes=papr: no such file in conf/modes/ or ")
+    assert "did you mean paper?" in result.err
 
 
 def test_a_link_and_an_experiment_need_not_be_chosen() -> None:
@@ -122,3 +135,10 @@ def test_what_a_link_does_is_to_be_looked_at(tod: Command) -> None:
     assert result.status == 2
     rule = "what it does is to be looked at: give log=DIR or output=OUT"
     assert result.err == f"command line: link: relay: {rule}\n"
+
+
+def test_the_demo_does_not_write_among_other_files(tod: Command, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    result = tod("demo", "source=test", f"output={tmp_path}")
+    rule = "must be a new or an empty directory, holds thesis.tex"
+    assert (result.status, result.err) == (2, f"command line: output: '{tmp_path}': {rule}\n")

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from helpers import CONF, vehicle
 
-from runner.commands import KnobValue
+from runner.core.commands import KnobValue
+from runner.core.model import Camera, Element, Endpoint, Graph, ModelError, Roi, Source, Turn
 from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
-from runner.model import Camera, Element, Endpoint, Graph, ModelError, Roi, Source, Turn
 
 MEDIA = Endpoint("127.0.0.1", 8554)
 LEFT = vehicle("modes=paper").cameras["front_left"]
@@ -52,7 +52,7 @@ def test_the_server_of_front_left() -> None:
 
 def test_the_receiver_of_front_left() -> None:
     assert plan().receiver == (
-        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left latency=40 timeout=0 "
+        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left latency=40 tcp-timeout=1000000 timeout=0 "
         f"do-retransmission=true add-reference-timestamp-meta=true ! {DECODE}"
     )
 

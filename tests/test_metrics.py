@@ -357,13 +357,15 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
     exe = fake("exit 0", filters=" .. vmafmotion V->V nothing")
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
-    assert str(raised.value) == f"TOD_FFMPEG={exe} is no ffmpeg with libvmaf: pip install 'tod-runner[vmaf]'"
+    assert (
+        str(raised.value) == f"TOD_FFMPEG={exe} is no ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
+    )
     monkeypatch.delenv("TOD_FFMPEG")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", exe)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
-    assert str(raised.value) == "VMAF needs an ffmpeg with libvmaf: pip install 'tod-runner[vmaf]'"
+    assert str(raised.value) == "VMAF needs an ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
     fake("exit 0")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TOD_FFMPEG", "./ffmpeg")

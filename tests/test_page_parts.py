@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 import math
+import socket
+from contextlib import contextmanager, suppress
+from types import SimpleNamespace
 
 import pytest
+from helpers import vehicle
 
-from runner.units import AccessUnit
+from runner.h264.access_unit import AccessUnit
 
 pytest.importorskip("aiohttp")
 from runner.page.control import KEPT_S, Control
 from runner.page.history import KEPT, History
+from runner.page.server import Page
 from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, Viewer
+from runner.records import CameraSample, Position, Sample
+
+FULL = b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n"
 
 
 def unit(number, key=False, captured=None):
@@ -29,6 +37,51 @@ def sent(viewer):
             camera, flags, _, _, _, _ = HEADER.unpack_from(message)
             messages.append((camera, flags, message[HEADER.size]))
     return messages
+
+
+@contextmanager
+def served():
+    """Port of a page."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    page = Page(vehicle(f"page.port={port}"), SimpleNamespace(state={}, note=print))
+    page.start()
+    try:
+        yield port
+    finally:
+        page.stop()
+
+
+@pytest.mark.parametrize("begun", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", FULL + b"GET / H"])
+def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
+    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        line.sendall(begun.replace(b"PORT", str(port).encode()))
+        with suppress(ConnectionResetError):
+            while line.recv(65536):  # the answer to what is finished, then the end
+                pass
+
+
+@pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])
+def test_what_is_no_http_is_refused_without_a_traceback(line, caplog, capfd):
+    with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+        connection.sendall(line + b"\r\n\r\n")
+        assert connection.recv(12)[:10] in (b"HTTP/1.0 4", b"HTTP/1.1 4")
+    assert (caplog.text, *capfd.readouterr()) == ("", "", "")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:abc", "[::1", "a:b:c", "127.0.0.1:99999", "%zz", "", "a b"])
+def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
+    with served() as port:
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+            line.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+            answer = b"".join(iter(lambda: line.recv(65536), b""))
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+            line.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nConnection: close\r\n\r\n".encode())
+            assert line.recv(12) == b"HTTP/1.1 200"
+    assert answer[:12] in (b"HTTP/1.1 403", b"HTTP/1.1 400")
+    assert caplog.text == ""
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
@@ -107,10 +160,20 @@ def test_a_reload_keeps_control_and_a_page_that_left_loses_it():
     assert control.seen_by("a") == "another"
 
 
-def sample(time, **more):
-    camera = {"kbps": time, "allocated_kbps": 1, "scaling": None}
-    totals = {"predicted_kbps": None, "allocated_kbps": 1, "actual_kbps": time, "position": None}
-    return {"time": time, **totals, "cameras": {"front": camera}, **more}
+def sample(time, position=None):
+    camera = CameraSample(
+        fps=10,
+        kbps=time,
+        allocated_kbps=500,
+        demand_kbps=1000,
+        scaling=None,
+        width=0,
+        height=0,
+        latency_ms=None,
+        lost=0,
+        rebuilt=0,
+    )
+    return Sample(time, None, 0, 0, position, 0, {"front": camera})
 
 
 def test_history_keeps_a_point_a_second_for_minutes():
@@ -127,6 +190,6 @@ def test_history_keeps_a_point_a_second_for_minutes():
 def test_history_has_a_place_for_what_was_not_known():
     history = History()
     history.add(sample(0))
-    history.add(sample(1, position={"lat": 48.1, "lon": 11.6}))
+    history.add(sample(1, position=Position(48.1, 11.6)))
     assert history.columns()["lat"] == [None, 48.1]
     assert history.columns()["cameras"]["front"]["scaling"] == [None, None]

@@ -14,8 +14,8 @@ import pytest
 from helpers import Command, UserConf, process, vehicle
 from shared_data import shared
 
-from runner.events import BitratePredicted, to_json
-from runner.model import Vehicle
+from runner.core.events import BitratePredicted, to_json
+from runner.core.model import Vehicle
 from runner.pqos import Pqos, build_pqos
 from runner.verbs.replay import events, replay
 
@@ -406,6 +406,26 @@ def test_an_answer_that_does_not_come_to_its_end_leaves_no_drive(
     result = tod("replay", *PAPER, f"input={events_file}", f"log={tmp_path / 'answer'}")
     assert result.status == 2
     assert list((tmp_path / "answer").iterdir()) == []
+
+
+def test_an_answer_written_as_a_drive_does_not_flood_standard_output(
+    tod: Command, events_file: Path, tmp_path: Path
+) -> None:
+    result = tod("replay", *PAPER, f"input={events_file}", f"log={tmp_path / 'answer'}")
+    assert result == (0, "", "")
+    decisions = tmp_path / "decisions.jsonl"
+    words = (f"input={events_file}", f"log={tmp_path / 'again'}", f"output={decisions}")
+    assert tod("replay", *PAPER, *words) == (0, "", "")
+    assert len(decisions.read_text().splitlines()) == len(events_file.read_text().splitlines())
+
+
+@pytest.mark.parametrize("depth", [40, 985, 100_000])
+def test_json_that_is_nested_too_deeply(tod: Command, tmp_path: Path, depth: int) -> None:
+    path = tmp_path / "deep.jsonl"
+    path.write_text('{"t": 0, "event": ' + "[" * depth + "]" * depth + "}\n")
+    result = tod("replay", *PAPER, f"input={path}")
+    assert (result.status, result.out) == (2, "")
+    assert result.err == f"{path}: line 1: not JSON: nested too deeply\n"
 
 
 def test_another_kind_of_camera_stays_in_its_place(tod: Command, drive: Path, tmp_path: Path) -> None:

@@ -14,13 +14,14 @@ import pytest
 from drives import Lines, write_drive, write_models
 from helpers import CONF, Command, process
 
-from runner.compose import compose
+from runner.configuration.compose import compose
+from runner.core.events import CameraSwitched
 from runner.drive.checks import Check
 from runner.drive.colours import DAY, NIGHT
+from runner.drive.figures import Figure, figures
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.events import CameraSwitched
 from runner.schema import findings
 
 pytest.importorskip("matplotlib")
@@ -35,6 +36,18 @@ STATIC = Path(CONF).parent / "runner" / "page" / "static"
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("drives") / "test_drive"
     return write_drive(path, seconds=20, freezes={"top_rear": [(6.0, 1.5)]}, congested=0.5)
+
+
+def defined(path: Path) -> dict[str, Figure]:
+    """The figures of a drive, by name."""
+    return {figure.name: figure for figure in figures([statistics(series(read_drive(path)))])[0]}
+
+
+def drawn(figure: Figure) -> Any:
+    """As print draws it."""
+    from runner.drive.print import drawn
+
+    return drawn(figure)
 
 
 def document(output: Path) -> dict[str, Any]:
@@ -208,18 +221,70 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("congested, scale", [(0.0, "linear"), (3.0, "log")])
 def test_the_axis_of_latencies_holds_them_all(tmp_path: Path, congested: float, scale: str) -> None:
-    from runner.drive.figures import latency
-
     path = write_drive(tmp_path / "drive", seconds=20, congested=congested)
-    drive = statistics(series(read_drive(path)))
-    figure = latency([drive])
-    assert not isinstance(figure, str)
-    axes = figure.axes[0]
+    axes = drawn(defined(path)["latency"]).axes[0]
     shown = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
     low, high = axes.get_ylim()
     assert axes.get_yscale() == scale
     assert low <= np.nanmin(shown)
     assert high >= np.nanmax(shown)
+
+
+def test_print_and_page_draw_the_same_curves(drive: Path) -> None:
+    for name, figure in defined(drive).items():
+        charts = [chart for row in figure.rows for chart in row]
+        axes = [each for each in drawn(figure).axes if each.get_title(loc="left")] or drawn(figure).axes[:1]
+        assert len(axes) == len(charts), name
+        for each, chart in zip(axes, charts, strict=True):
+            asked = [curve for curve in chart.curves if not curve.filled]
+            for line, curve in zip(each.lines[: len(asked)] if asked else (), asked, strict=True):
+                assert np.array_equal(np.asarray(line.get_ydata()), curve.y, equal_nan=True), (name, curve.label)
+
+
+def test_cameras_that_coincide_are_one_curve_with_their_range(drive: Path) -> None:
+    (both, top) = defined(drive)["bitrates"].rows[0]
+    assert [curve.label for curve in both.curves] == [
+        "front_left, front_right: mean and range",
+        "front_center",
+        "rear_center",
+    ]
+    assert [curve.label for curve in top.curves] == ["all 4 cameras: mean and range"]
+    (mean,) = top.curves
+    assert mean.around is not None
+    low, high = mean.around
+    known = np.isfinite(mean.y)
+    assert (low <= mean.y)[known].all()
+    assert (mean.y <= high)[known].all()
+    assert (low < high)[known].any()
+
+
+def test_an_offset_is_stated_where_curves_overlap(drive: Path) -> None:
+    along, top = defined(drive)["scaling"].rows[0]
+    stated = [re.search(r"\(offset ([+-]0\.\d+)\)", curve.label) for curve in along.curves]
+    assert [each and each[1] for each in stated] == ["+0.007", None, "-0.007"]
+    for curve, each in zip(along.curves, stated, strict=True):
+        offset = float(each[1]) if each else 0.0
+        assert set(np.round(curve.y[np.isfinite(curve.y)] - offset, 3)) <= {0.125, 0.25, 0.5}
+    assert [curve.label for curve in top.curves] == ["all 4 cameras"]
+
+
+def test_one_camera_is_called_by_its_name(tmp_path: Path) -> None:
+    others = ("front_center", "front_right", "rear_center", "top_front", "top_left", "top_right", "top_rear")
+    found = defined(write_drive(tmp_path / "drive", seconds=5, overrides=[f"~cameras.{name}" for name in others]))
+    assert [chart.title for row in found["bitrates"].rows for chart in row] == ["front_left"]
+    assert [chart.title for row in found["latency"].rows for chart in row] == ["each second", "distribution"]
+    assert [curve.label for curve in found["latency"].rows[1][0].curves] == ["front_left"]
+
+
+def test_a_note_stands_once_and_figures_above_versions(tod: Command, drive: Path, tmp_path: Path) -> None:
+    other = write_drive(tmp_path / "other", seconds=5)
+    assert tod("report", str(drive), str(other), f"output={tmp_path / 'out'}").status == 0
+    page = (tmp_path / "out" / "index.html").read_text()
+    text = page[: page.index("<script type")]
+    for once in ("no camera has a rate-quality model", "quality: left out", "Arrival and decode:", "GStreamer 1.22.0"):
+        assert text.count(once) == 1, once
+    assert text.index('id="quality"' if 'id="quality"' in text else 'id="latency"') < text.index("<h2>Versions</h2>")
+    assert text.index('id="bitrate_on_track"') < text.index("GStreamer 1.22.0")
 
 
 def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path) -> None:
@@ -284,7 +349,7 @@ def test_without_its_libraries(tmp_path: Path, drive: Path, monkeypatch: pytest.
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "matplotlib" else real(name))
     status, out, err = tod("report", str(drive), f"output={tmp_path / 'out'}")
     assert (status, out) == (1, "")
-    assert err == "the Python modules matplotlib are not installed: pip install 'tod-runner[report]'\n"
+    assert err == "the Python modules matplotlib are not installed: extra report, see docs/install.md\n"
 
 
 def test_it_needs_neither_gstreamer_nor_opencv(drive: Path, tmp_path: Path) -> None:

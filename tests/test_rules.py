@@ -9,15 +9,17 @@ from importlib.metadata import EntryPoint
 from typing import Any
 
 import pytest
-from helpers import Drive, vehicle
+from helpers import CONF, Drive, vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner import rules
-from runner.events import BitratePredicted
-from runner.model import Mode, ModelError, Roi, Vehicle
-from runner.rules import call_rule, check_order, decide
-from runner.state import State
+from runner.configuration.rule_lists import call_rule, check_order
+from runner.core import rules
+from runner.core.events import BitratePredicted, parse
+from runner.core.model import Mode, ModelError, Roi, Vehicle
+from runner.core.rules import decide
+from runner.core.state import State
+from runner.core.step import Run, start, step
 
 TUM = vehicle("modes=paper")
 START = State.initial(TUM, Mode.AUTOMATIC)
@@ -182,13 +184,13 @@ def test_nothing_is_sent_while_the_operator_is_gone(mode: Mode) -> None:
     drive = Drive("modes=safe", "pqos=live", f"mode={mode}")
     before = {name: drive.sent(name) for name in drive.vehicle.cameras}
     drive.accept("operator_disconnected", t=10)
-    for t, sending in ((11, True), (15, True), (15.1, False)):
+    for t, sending in ((10.5, True), (11, True), (11.1, False)):
         drive.accept("bitrate_predicted", t=t, kbps=3000)
         assert {setting.sending for setting in drive.run.decision.settings.values()} == {sending}
     assert {(c.knob, c.value) for c in drive.run.commands} == {("sending", False)}
-    assert drive["front_left"].reason.endswith("not sending: operator gone for 5.1 s")
+    assert drive["front_left"].reason.endswith("not sending: operator gone for 1.1 s")
     assert drive["front_left"].on and drive["front_left"].kbps == 0
-    drive.accept("operator_connected", t=15.2)
+    drive.accept("operator_connected", t=11.2)
     assert {(c.knob, c.value) for c in drive.run.commands} == {("sending", True)}
     assert {name: drive.sent(name) for name in drive.vehicle.cameras} == before
 
@@ -242,6 +244,80 @@ def test_memory_is_empty_under_the_paper_and_frozen_elsewhere() -> None:
     assert paper.run.memory == {}
     assert set(steady.run.memory) == {"hold_upscaling"}
     assert repr(before.memory) == remembered
+
+
+# --- what rules read --------------------------------------------------------------------------------------------------
+
+FRONT_LEFT = {"camera": st.just("front_left")}
+KBPS = {"kbps": st.sampled_from([0, 0.5, 300, 1320, 2970, 5225.5, 12_000])}
+EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
+    "mode_selected": {"mode": st.sampled_from(list(map(str, Mode)))},
+    "bitrate_predicted": {**KBPS, "lower_kbps": st.sampled_from([0, 900, 4000]), "valid_s": st.sampled_from([0.5, 4])},
+    "position_reported": {"lat": st.just(48.1), "lon": st.just(11.6)},
+    "total_set": KBPS,
+    "camera_switched": {**FRONT_LEFT, "on": st.booleans()},
+    "roi_set": {
+        **FRONT_LEFT,
+        **dict.fromkeys(("x", "y"), st.sampled_from([0, 200])),
+        **dict.fromkeys(("width", "height"), st.sampled_from([16, 240])),
+    },
+    "camera_configured": {**FRONT_LEFT, **KBPS, "scaling": st.sampled_from([0.125, 0.5])},
+    "weights_set": {"weights": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([0, 0.5, 3]))},
+    "link_measured": {**FRONT_LEFT, **KBPS},
+    "operator_connected": {},
+    "operator_disconnected": {},
+    "clock_advanced": {},
+}
+EVENT = st.sampled_from(list(EVENTS)).flatmap(
+    lambda name: st.fixed_dictionaries({"event": st.just(name), **EVENTS[name]})
+)
+PASSING = st.tuples(EVENT, st.sampled_from([0, 0.1, 0.6, 1.5, 4]))  # and the s that pass before the event
+
+
+def reading_everything(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with rules that do not state what they read."""
+
+    def call(of: Any) -> rules.RuleCall:
+        return replace(of, rule=replace(of.rule, reads=rules.EVERYTHING))
+
+    return replace(vehicle, modes={mode: tuple(map(call, calls)) for mode, calls in vehicle.modes.items()})
+
+
+@pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
+@settings(max_examples=40, deadline=None)
+@given(events=st.lists(PASSING, min_size=10, max_size=40))
+def test_stating_what_is_read_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
+    stated = vehicle(f"modes={modes}")
+    everything = reading_everything(stated)
+    run, other, t = start(stated), start(everything), 0.0
+    for event, passing in events:
+        t += passing
+        parsed = parse({"t": t, **event})
+        run, other = step(stated, run, parsed), step(everything, other, parsed)
+        assert run == other
+        assert reasons(run) == reasons(other)
+
+
+def reasons(run: Run) -> list[str]:
+    """Reasons take no part in the comparison of decisions."""
+    return [setting.reason for setting in run.decision.settings.values()]
+
+
+def test_a_rule_that_states_nothing_hears_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
+
+    @rules.rule(needs=["total"], gives=["total"])
+    def below_at_night(vehicle: Vehicle, state: State, draft: Any, memory: Any) -> Any:
+        return draft.but(total=min(draft.total, 111) if state.t > 10 else draft.total), memory
+
+    first, *others = TUM.modes[Mode.AUTOMATIC]
+    call = rules.RuleCall(rules.RULES["below_at_night"])
+    drive = Drive("modes=paper")
+    drive.vehicle = replace(TUM, modes={**TUM.modes, Mode.AUTOMATIC: (first, call, *others)})
+    drive.accept("bitrate_predicted", t=1, kbps=5000)
+    assert drive.total == 5000
+    drive.accept("clock_advanced", t=11)
+    assert drive.total == 111
 
 
 # --- rule lists -------------------------------------------------------------------------------------------------------

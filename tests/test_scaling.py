@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runner.model import ModelError, RateQualityModel, Roi
-from runner.scaling import as_full_image, output_size, select_range, select_scaling
+from runner.core.model import ModelError, RateQualityModel, Roi
+from runner.core.scaling import as_full_image, output_size, select_scaling
 
 FULL = Roi(0, 0, 1920, 1040)
 
@@ -40,17 +40,17 @@ factors = st.fractions(Fraction(1, 100), 1, max_denominator=1000)
     ],
 )
 def test_a_bound_takes_the_upper_factor(bitrate: str, factor: str) -> None:
-    assert select_scaling(SIDE, Fraction(bitrate)) == Fraction(factor)
+    assert select_scaling(SIDE, Fraction(bitrate))[0] == Fraction(factor)
 
 
 @given(bitrates, bitrates)
 def test_more_bitrate_never_lowers_the_factor(a: Fraction, b: Fraction) -> None:
-    assert select_scaling(SIDE, min(a, b)) <= select_scaling(SIDE, max(a, b))
+    assert select_scaling(SIDE, min(a, b))[0] <= select_scaling(SIDE, max(a, b))[0]
 
 
 @given(bitrates)
 def test_the_range_holds_the_bitrate(bitrate: Fraction) -> None:
-    r = select_range(SIDE, bitrate)
+    r = SIDE.scaling.index(select_scaling(SIDE, bitrate)[0])
     bounds = (*SIDE.b_min, Fraction(10**9))
     assert bounds[r] <= bitrate < bounds[r + 1]
 

@@ -11,11 +11,11 @@ import pytest
 from drives import EPOCH, OPERATOR_LATER_S, Lines, write_drive
 from helpers import vehicle
 
-from runner.compose import compose
+from runner.configuration.compose import compose
+from runner.core.events import CameraSwitched
 from runner.drive.read import read_drive
 from runner.drive.series import Line, counted, held, mean_held, panels, rate, sending_spans, series, spans
 from runner.errors import UserError
-from runner.events import CameraSwitched
 
 NAN = float("nan")
 
@@ -64,7 +64,7 @@ def test_panels_of_the_papers_vehicle() -> None:
 
 def test_panels_of_other_vehicles() -> None:
     robot = panels(compose(["source=test", "vehicle=delivery_robot"]).document["cameras"])
-    assert robot == (("Front and rear", ("front", "rear")), ("Mast", ("mast",)))
+    assert robot == (("Front and rear", ("front", "rear")), ("mast", ("mast",)))
     assert panels({"a_1": {}, "b_1": {}}) == (("A and b", ("a_1", "b_1")),)
     many = {f"side_{n}": {"place": {"row": 5 - n, "column": 0}} for n in range(5)}
     assert [panel.cameras for panel in panels(many)] == [("side_4", "side_3", "side_2"), ("side_1", "side_0")]
@@ -131,8 +131,27 @@ def test_clocks_that_differ_are_told(tmp_path: Path) -> None:
 
     drive = series(read_drive(write_drive(tmp_path / "drive", seconds=5, change=early)))
     (warning,) = drive.warnings
-    assert warning.startswith("latencies go down to -")
-    assert warning.endswith(" ms: the clocks of both sides differ, latencies are off by as much")
+    assert warning.startswith("the vehicle's clock was ahead of the operator's by at least ")
+    assert warning.endswith(" ms: latencies are unknown up to 10 s before and after")
+    for camera in drive.cameras.values():
+        assert camera.received is not None
+        assert not np.isfinite(camera.received.arrival_ms).any()
+        assert not np.isfinite(camera.received.latency_ms).any()
+        assert np.nanmin(camera.received.clocks_ms) < 0
+
+
+def test_latencies_are_known_long_after_a_clock_was_set_right(tmp_path: Path) -> None:
+    def early(side: str, lines: Lines) -> Lines:
+        for told in lines:
+            for camera in told["cameras"].values() if told.get("log") == "sample" and told["t"] < 5 else ():
+                camera["arrivals"] = [[t, ms - 5000] for t, ms in camera["arrivals"]]
+        return lines
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=20, change=early)))
+    received = drive.cameras["front_left"].received
+    assert received is not None
+    known = received.arrival_t[np.isfinite(received.arrival_ms)]
+    assert 14.5 < known.min() < 16.5  # the operator's log begins later
 
 
 # --- what cannot be reported ------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.config import load
+from runner.configuration.config import configuration
 from runner.errors import ConfigError
 
 LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
@@ -22,6 +22,6 @@ LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
 )
 def test_a_camera_that_the_drive_cannot_show(override: str, line: str) -> None:
     with pytest.raises(ConfigError) as told:
-        load(["source=synthetic", override])
+        configuration(["source=synthetic", override]).vehicle()
     assert str(told.value) == f"{line}\n1 problem, nothing was started"
-    load(["source=test", override])  # other sources do not mind
+    configuration(["source=test", override]).vehicle()  # other sources do not mind

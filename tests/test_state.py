@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from helpers import Drive
 
-from runner.model import Mode, Roi
+from runner.core.model import Mode, Roi
 
 CAMERAS = "front_left, front_center, front_right, rear_center, top_front, top_left, top_right, top_rear"
 LEFT = {"camera": "front_left"}

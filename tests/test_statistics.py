@@ -11,12 +11,14 @@ import pytest
 from drives import write_drive, write_model
 
 from runner.drive.read import read_drive
-from runner.drive.series import CameraSeries, Decided, Sent, series
+from runner.drive.series import CameraSeries, Decided, Received, Sent, series
 from runner.drive.statistics import (
+    CameraStatistics,
     Freeze,
     Latency,
     Model,
     RateCurve,
+    camera_statistics,
     estimate,
     freezes,
     latency,
@@ -185,6 +187,54 @@ def test_quality_between_measured_points(
 ) -> None:
     found = estimate(camera(kbps, scaling, share=share), MODEL)
     assert (found.mean, found.clamped) == (pytest.approx(quality), clamped)
+
+
+def stood_still(begin: float, end: float, kbps: float = 400, seconds: float = 25) -> CameraSeries:
+    """A camera at 10 Hz of which nothing came for a while; rates as the operator measures them, over a second."""
+    every = np.arange(1, 10 * seconds + 1) / 10
+    came = every[(every <= begin) | (every > end)]
+    t = np.arange(1, 4 * seconds + 1) / 4
+    frames = np.searchsorted(came, t, "right").astype(float)
+    rates = np.where(t < 1, NAN, (frames - np.searchsorted(came, t - 1, "right")) * kbps / 10)
+    zero, size, latency = np.zeros(t.shape), np.full(t.shape, 2.0), np.full(came.shape, 50.0)
+    received = Received(t, rates, size, size, size, frames, frames * kbps * 12.5, zero, zero, came, latency, latency)
+    decided = camera(kbps, 0.5).decided
+    return CameraSeries("one", decided, received, None)
+
+
+def test_a_picture_that_stands_still_keeps_its_quality_and_its_share_of_the_time_is_told() -> None:
+    found = camera_statistics(stood_still(10, 20), 25.0, MODEL)
+    assert found.quality is not None
+    assert found.frozen == pytest.approx(10 / 25, abs=0.02)
+    assert found.quality.moving == pytest.approx(0.8)
+    assert found.quality.mean == pytest.approx(0.8)  # an upper bound: reached where nothing moved meanwhile
+    t, quality = found.quality.line
+    assert np.isfinite(quality[(t > 10) & (t <= 20)]).all()
+    assert np.isnan(quality[(t > 20.1) & (t < 21)]).all()  # the rate of the second before holds some of the freeze
+    (column,) = [row for row in zip(*table_of(found), strict=True) if row[0].endswith("frozen")]
+    assert column[1] in ("40%", "41%")
+
+
+def test_a_frozen_share_counts_the_quality_before_it_and_not_the_mean() -> None:
+    """Poor pictures, then none, then good ones: what was seen is the last poor one."""
+    series = stood_still(10, 20)
+    assert series.received is not None
+    rates = np.where(series.received.t <= 10.5, series.received.kbps / 4, series.received.kbps)
+    found = estimate(replace(series, received=replace(series.received, kbps=rates)), MODEL, (Freeze(10.0, 10.1),))
+    t, quality = found.line
+    assert quality[(t > 10.5) & (t <= 20)] == pytest.approx(0.6)
+    assert quality[t > 21.1] == pytest.approx(0.8)
+    assert found.mean < found.moving
+
+
+def test_a_camera_that_never_came_shows_no_picture_that_could_have_quality() -> None:
+    found = estimate(stood_still(0, 25), MODEL, (Freeze(0.0, 25.0),))
+    assert np.isnan(found.mean)
+
+
+def table_of(found: CameraStatistics) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    headings, (row,) = camera_rows(SimpleNamespace(metric="mssim", cameras={"one": found}))
+    return headings, row
 
 
 def test_no_quality_without_a_picture_or_a_curve() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import pytest
@@ -9,11 +11,12 @@ from helpers import Drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner import step as step_module
-from runner.commands import wanted
-from runner.events import parse
-from runner.model import Mode
-from runner.step import Run, start, step
+from runner.core import rules
+from runner.core import step as step_module
+from runner.core.commands import wanted
+from runner.core.events import parse
+from runner.core.model import Mode
+from runner.core.step import Run, start, step
 
 PAPER = ("modes=paper",)
 
@@ -292,3 +295,84 @@ def test_whatever_happens_the_commands_lead_to_the_decision(modes: str, story: l
             assert setting.width % 2 == setting.height % 2 == 0
         assert sum(s.kbps for s in run.decision.settings.values()) <= run.decision.total
         assert step(vehicle, run, event).commands == ()
+
+
+# --- rules that fail --------------------------------------------------------------------------------------------------
+
+
+def failing(misbehave: Any, *modes: Mode) -> Drive:
+    """A drive whose modes end with a rule that misbehaves once 2000 kbit/s or less are predicted."""
+
+    def mine(vehicle: Any, state: Any, draft: Any, memory: Any) -> Any:
+        low = state.prediction is not None and state.prediction.kbps <= 2000
+        return misbehave(draft, memory) if low else (draft, memory)
+
+    rule = rules.Rule("mine", mine, frozenset(), frozenset({"total"}), frozenset({"prediction"}))
+    drive = Drive(*PAPER)
+    lists = {mode: (*calls, rules.RuleCall(rule)) for mode, calls in drive.vehicle.modes.items() if mode in modes}
+    drive.vehicle = replace(drive.vehicle, modes={**drive.vehicle.modes, **lists})
+    drive.run = start(drive.vehicle)
+    return drive
+
+
+def raises(draft: Any, memory: Any) -> Any:
+    raise ZeroDivisionError("division by zero")
+
+
+def leaves(draft: Any, memory: Any) -> Any:
+    raise SystemExit(3)
+
+
+NO_BITRATE = "must be kbit/s from 0 as an exact number (int or Fraction)"
+
+
+@pytest.mark.parametrize(
+    "misbehave, fault",
+    [
+        (raises, "rule mine failed: ZeroDivisionError: division by zero"),
+        (leaves, "rule mine failed: SystemExit: 3"),
+        (lambda draft, memory: None, "rule mine failed: TypeError: cannot unpack non-iterable NoneType object"),
+        (lambda draft, memory: ("draft", memory), "rule mine failed: it must return a Draft and the memory"),
+        (lambda d, m: (d.but(total=Fraction(-1)), m), f"rule mine failed: total Fraction(-1, 1): {NO_BITRATE}"),
+        (lambda d, m: (d.but(total=1000.0), m), f"rule mine failed: total 1000.0: {NO_BITRATE}"),
+        (lambda d, m: (d.but(total=True), m), f"rule mine failed: total True: {NO_BITRATE}"),
+        (
+            lambda d, m: (d.but(bitrate={**d.bitrate, "top_rear": float("nan")}), m),
+            f"rule mine failed: bitrate of top_rear nan: {NO_BITRATE}",
+        ),
+        (
+            lambda d, m: (d.but(scaling={}), m),
+            "rule mine failed: scaling of front_left None: must be a Fraction in ]0, 1]",
+        ),
+        (
+            lambda d, m: (d.but(demand=None), m),
+            "rule mine failed: demand None: must be a mapping by camera",
+        ),
+    ],
+)
+def test_a_rule_that_fails_leaves_the_last_decision_in_force(misbehave: Any, fault: str) -> None:
+    drive = failing(misbehave, Mode.AUTOMATIC)
+    before = drive.accept("bitrate_predicted", kbps=8000)
+    after = drive.accept("bitrate_predicted", kbps=2000)
+    assert (after.decision, after.commands, after.fault) == (before.decision, (), fault)
+    assert after.state.prediction is not None and after.state.prediction.kbps == 2000
+    assert drive.tell("position_reported", lat=1, lon=1).fault == fault  # nothing that the rules read has changed
+    again = drive.accept("bitrate_predicted", kbps=3000)
+    assert (drive.total, again.fault) == (3000, "")
+
+
+def test_a_mode_whose_rules_fail_is_not_entered() -> None:
+    drive = failing(raises, Mode.COLLECTIVE)
+    before = drive.accept("bitrate_predicted", kbps=1500)
+    after = drive.tell("mode_selected", mode="collective")
+    assert after.refused == "mode collective: rule mine failed: ZeroDivisionError: division by zero"
+    assert (after.state.mode, after.decision, after.fault) == (Mode.AUTOMATIC, before.decision, "")
+
+
+def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
+    drive = failing(lambda d, m: (d, m), Mode.AUTOMATIC)
+    first = drive.vehicle.modes[Mode.AUTOMATIC][-1].rule
+    wrong = replace(first, function=lambda vehicle, state, draft, memory: (draft.but(total=-1), memory))
+    lists = {**drive.vehicle.modes, Mode.AUTOMATIC: (*drive.vehicle.modes[Mode.AUTOMATIC][:-1], rules.RuleCall(wrong))}
+    with pytest.raises(rules.RuleFailed, match="rule mine failed: total -1: must be kbit/s"):
+        start(replace(drive.vehicle, modes=lists))

@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
-from runner import synthetic
-from runner.model import Pose
-from runner.synthetic import View, clip_path, render
+from runner import clips, synthetic
+from runner.clips import View, clip_path
+from runner.core.model import Pose
+from runner.synthetic import render
 
 np = pytest.importorskip("numpy")
 
@@ -85,7 +86,7 @@ def test_path_is_content_addressed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert path == clip_path(replace(FORWARD), 4.0, tmp_path)
     assert path.parent == tmp_path
     assert path != clip_path(FORWARD, 5, tmp_path)
-    monkeypatch.setattr(synthetic, "RENDERER_VERSION", synthetic.RENDERER_VERSION + 1)
+    monkeypatch.setattr(clips, "RENDERER_VERSION", clips.RENDERER_VERSION + 1)
     assert path != clip_path(FORWARD, 4, tmp_path)
 
 
@@ -118,7 +119,7 @@ def test_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_numba_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "find_spec", lambda name: None)
-    with pytest.raises(RuntimeError, match=r"pip install 'tod-runner\[synthetic\]'"):
+    with pytest.raises(RuntimeError, match=r"needs numba: install the extra synthetic, see docs/install\.md"):
         render([FORWARD], SECONDS, tmp_path, nothing)
 
 

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared_data import ROOT, shared
 
-from runner.events import PositionReported
-from runner.model import ModelError
+from runner.core.events import PositionReported
+from runner.core.model import ModelError
 from runner.pqos import build_pqos
 from runner.pqos.bandwidth_map import EARTH_M, offset
 from runner.pqos.route import route
@@ -191,7 +191,7 @@ def test_demo_drive_predicts_as_the_paper_shows() -> None:
         ),
         (
             {"kind": "live", "position": {"kind": "track", "file": "maps/demo_loop.csv"}},
-            f"position.file: {CONF}/maps/demo_loop.csv:1: 'lon,lat,kbps': "
+            f"position.file: {CONF}/maps/demo_loop.csv:1: no column t_s: "
             "must be a header with the columns t_s, lat, lon",
         ),
     ],

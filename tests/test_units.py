@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.units import AccessUnit, Recent, read_unit
+from runner.h264.access_unit import AccessUnit, Recent, read_unit
 
 AUD, SPS, PPS, SEI, IDR, SLICE = (bytes([0, 0, 0, 1, kind]) for kind in (0x09, 0x67, 0x68, 0x06, 0x65, 0x41))
 
@@ -156,3 +156,35 @@ def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, r
         # Nothing is missing but what lies between the IDR and the last two periods.
         since = everything[everything.index(burst[0]) + 1 :]
         assert burst[1:] == [u for u in since if u.arrived >= now - 2 * refresh_s]
+
+
+# --- H.265 ------------------------------------------------------------------------------------------------------------
+
+
+def h265(*kinds: int) -> bytes:
+    """An access unit of NAL units of some types (ITU-T H.265, table 7-1)."""
+    return b"".join(b"\0\0\0\1" + bytes([kind << 1, 1, 0xAF]) for kind in kinds)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "key"),
+    [((32, 33, 34, 19), True), ((35, 21), True), ((39, 20), True), ((1,), False), ((32, 33, 34, 39, 0), False)],
+)
+def test_a_unit_of_h265_is_key_by_its_picture_and_not_by_its_parameter_sets(kinds, key):
+    unit = read_unit(h265(*kinds), 1.0, 2.0, codec="h265")
+    assert unit is not None
+    assert (unit.key, unit.exact, unit.data) == (key, True, h265(*kinds))
+
+
+def test_damaged_units_of_h265_and_those_without_a_picture_are_of_no_use():
+    assert read_unit(h265(19), 1.0, 2.0, damaged=True, codec="h265") is None
+    assert read_unit(h265(32, 33, 34), 1.0, 2.0, codec="h265") is None
+
+
+def test_a_stream_of_h265_begins_with_its_next_key_picture():
+    recent = Recent(1.0, "h265")
+    assert recent.add(read_unit(h265(33, 1), 1.0, 1.0, codec="h265")).exact is False
+    assert recent.burst() == []
+    key = read_unit(h265(33, 19), 2.0, 2.0, codec="h265")
+    assert recent.add(key) == key
+    assert recent.burst() == [key]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+from itertools import chain, product
+from pathlib import Path
 
 import pytest
 from helpers import CONF, Command, UserConf, process
 
-from runner.compose import GROUPS
+from runner.configuration import yaml_file
+from runner.configuration.combinations import SECTIONS, Combinations, words_of
+from runner.configuration.compose import compose
+from runner.configuration.files import GROUPS, options
 
 ONE = {  # a single combination
     "vehicle": "delivery_robot",
@@ -27,14 +32,30 @@ def count(group: str) -> int:
 
 
 def test_what_is_packaged_is_valid() -> None:
-    """All graphs and vehicles; the rest of the combinations is a step of its own in `make test`."""
-    result = process("validate", "source=test", "modes=paper")
+    """All graphs, vehicles, experiments and links; every combination is a step of its own in `make test`."""
+    result = process("validate", "all=true", "source=test", "modes=paper")
     files = sum(map(count, (".", *GROUPS)))
-    combinations = count("vehicle") * count("graph")
     assert (result.status, result.err) == (0, "")
     first, *notes = result.out.splitlines()
-    assert first == f"{files} files and {combinations} combinations of vehicle, modes, graph, source are valid"
+    assert first.startswith(f"valid: {files} files, ")
+    assert int(first.split()[3]) > count("vehicle") * count("graph") + count("experiment")
     assert all(note.startswith(("not checked: ", "nothing was checked against the GStreamer")) for note in notes)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["pqos=trace"],
+        ["graph=h264_srt", "vehicle=delivery_robot"],
+        ["cameras.rear_center.weight=2"],
+        ["+experiment=driving_test"],
+    ],
+)
+def test_a_choice_meets_nothing_that_nobody_chose(words: list[str]) -> None:
+    result = process("validate", *words)
+    assert (result.status, result.err) == (0, "")
+    files = sum(map(count, (".", *GROUPS)))
+    assert result.out.splitlines()[0] == f"valid: {files} files, 1 configuration"
 
 
 def one(*every: str) -> list[str]:
@@ -48,14 +69,27 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
 
 def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
+    conf.write("cameras/front/x.yaml", "a: 1\n").write("camera/x.yaml", "a: 1\n").write("cameras.yaml", "a: 1\n")
+    conf.write("cameras/foo.yml", "a: 1\n").write("graph/a,b.yaml", "a: 1\n").write("graph/true.yaml", "a: 1\n")
+    conf.write("source/empty.yaml", "").write(".github/x.yml", "a: 1\n").write("maps/opencv.yaml", "%YAML:1.0\n")
     conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
-    groups = f"the groups are {', '.join(f'{group}/' for group in GROUPS)}"
-    assert problems(tod, conf) == [
-        "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
-        f"~/foo.yaml: belongs to no group, {groups}",
-        "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",
-        f"~/vehicel/x.yaml: belongs to no group, {groups}",
-    ]
+    folder = f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
+    name = "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
+    assert sorted(problems(tod, conf)) == sorted(
+        [
+            f"~/cameras.yaml: {folder}",
+            f"~/foo.yaml: {folder}",
+            "~/camera/x.yaml: would be ignored: no such group as camera/, did you mean cameras?",
+            "~/cameras/foo.yml: would be ignored: Hydra reads foo.yaml",
+            "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
+            "~/cameras/front/x.yaml: would be ignored: files stand in cameras/ itself, not in folders below",
+            f"~/graph/a,b.yaml: {name}",
+            f"~/graph/true.yaml: {name}",
+            "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",
+            "~/source/empty.yaml: is empty, must be a mapping",
+            "~/vehicel/x.yaml: would be ignored: no such group as vehicel/, did you mean vehicle?",
+        ]
+    )
 
 
 def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
@@ -67,11 +101,32 @@ def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
     ]
 
 
-def test_a_users_additions_are_combined_with_everything(tod: Command, conf: UserConf) -> None:
+def test_each_file_is_tried_and_each_vehicle_with_each_graph_and_source(tod: Command, conf: UserConf) -> None:
     conf.write("modes/mine.yaml", "defaults: [paper, _self_]\n")
-    result = tod("validate", conf.word, *one("modes"))
-    assert result.status == 0
-    assert f"and {count('modes') + 1} combinations" in result.out
+    result = tod("validate", conf.word)
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 1 file, 2 configurations")
+    for name in ("a", "b"):
+        conf.change("vehicle/delivery_robot.yaml", {}).change("graph/h264_rtsp.yaml", {})
+        (conf.path / "vehicle/delivery_robot.yaml").rename(conf.path / f"vehicle/{name}.yaml")
+        (conf.path / "graph/h264_rtsp.yaml").rename(conf.path / f"graph/{name}.yaml")
+    result = tod("validate", conf.word)
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 5 files, 10 configurations")
+    result = tod("validate", conf.word, "vehicle=a")
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 5 files, 4 configurations")
+
+
+def test_a_kind_of_camera_that_no_vehicle_mounts_is_tried(tod: Command, conf: UserConf) -> None:
+    conf.change("cameras/top_view.yaml", {"3000": "400"})
+    (conf.path / "cameras/top_view.yaml").rename(conf.path / "cameras/mine.yaml")
+    assert problems(tod, conf) == [
+        "~/cameras/mine.yaml: rate_quality.b_full_kbps: 400: must be above the last b_min, 400"
+    ]
+
+
+def test_a_map_of_the_user_with_the_defaults(tod: Command, conf: UserConf) -> None:
+    conf.write("maps/yard.csv", (CONF / "maps/demo_loop.csv").read_text())
+    result = tod("validate", conf.word, "pqos.file=maps/yard.csv")
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 0 files, 1 configuration")
 
 
 def test_maps_are_no_configuration(tod: Command, conf: UserConf) -> None:
@@ -101,10 +156,10 @@ def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, told: str
 @pytest.mark.parametrize(
     "old, new, told",
     [
-        ("element: x264enc", "element: x264encc", "vehicle[4].element: 'x264encc'"),
-        ("quantizer: 10", "quantiser: 10", "vehicle[4].properties.quantiser"),
-        ("quantizer: 10", "quantizer: 100", "vehicle[4].properties.quantizer"),
-        ("speed-preset: superfast", "speed-preset: superfst", "vehicle[4].properties.speed-preset"),
+        ("element: x264enc", "element: x264encc", "encoder[0].element: 'x264encc'"),
+        ("quantizer: 10", "quantiser: 10", "encoder[0].properties.quantiser"),
+        ("quantizer: 10", "quantizer: 100", "encoder[0].properties.quantizer"),
+        ("speed-preset: superfast", "speed-preset: superfst", "encoder[0].properties.speed-preset"),
         ("property: bitrate, value: kbps", "property: threads, value: kbps", "knobs.bitrate[0].property"),
         ("property: bitrate, value: kbps", "property: bitrat, value: kbps", "knobs.bitrate[0].property"),
     ],
@@ -139,3 +194,110 @@ def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> N
     (problem,) = problems(tod, conf, *one("study"))
     assert problem.startswith("~/study/paper.yaml: bitrates_kbps: [63, 50, ")
     assert problem.endswith(": must rise")
+
+
+# --- what is composed how often ---------------------------------------------------------------------------------------
+
+FLEET = Path(__file__).parent / "fleet"  # 2 vehicles, 6 kinds of camera, 4 modes, 3 graphs, 3 sources, 2 pqos
+FILES = {group: [(group, name) for name in options(group, [FLEET])] for group in GROUPS}
+
+
+@pytest.fixture
+def composed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """The words of each configuration that Hydra composes."""
+    import hydra
+
+    words: list[tuple[str, ...]] = []
+    original = hydra.compose
+
+    def counted(name: str, overrides: list[str], **options: object) -> object:
+        words.append(tuple(overrides))
+        return original(name, overrides, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(hydra, "compose", counted)
+    return words
+
+
+def test_files_that_keep_to_themselves_are_composed_and_read_once(
+    tod: Command, composed: list[tuple[str, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[object] = []
+    content = yaml_file._content
+    monkeypatch.setattr(yaml_file, "_content", lambda text: read.append(text) or content(text))
+    yaml_file._read.cache_clear()
+    result = tod("validate", f"conf={FLEET}")
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 20 files, 39 configurations")
+    assert len(composed) == 1
+    assert len(read) == len(set(read)) <= 20 + sum(map(count, (".", *GROUPS)))
+
+
+def test_what_is_put_together_is_what_hydra_composes() -> None:
+    combinations = Combinations([], FLEET, chain(*FILES.values()))
+    crossed = product(*(FILES[group] for group in ("vehicle", "graph", "source")))
+    alone = [(choice,) for group in ("cameras", *SECTIONS) for choice in FILES[group]]
+    for choices in [(), *alone, *list(crossed)[::4]]:
+        assembled = combinations.assembled(dict(choices))
+        assert assembled is not None, choices
+        assert assembled.document == compose(words_of(dict(choices)), FLEET).document, choices
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("modes/mine.yaml", "# @package _global_\nmodes: {}\nmedia: {port: 9}\n"),
+        ("modes/mine.yaml", "defaults: [paper, /pqos@pqos: constant, _self_]\n"),
+        ("source/mine.yaml", "defaults: [test, _self_]\nframe: '${graph.mtu_bytes}'\n"),
+        ("vehicle/mine.yaml", "# @package _global_\ndefaults: [tum_q7, override /modes: paper, _self_]\n"),
+        ("vehicle/mine.yaml", "# @package _global_\ndefaults: [tum_q7, _self_]\ngraph: {mtu_bytes: 900}\n"),
+        ("config.yaml", (CONF / "config.yaml").read_text() + "graph: {mtu_bytes: 900}\n"),
+        ("config.yaml", (CONF / "config.yaml").read_text().replace("port: 8554", "port: '${graph.first_port}'")),
+    ],
+)
+def test_what_reaches_into_other_groups_is_not_put_together(conf: UserConf, name: str, text: str) -> None:
+    conf.write(name, text)
+    group, _, file = name.removesuffix(".yaml").rpartition("/")
+    choices = {group: file} if group else {"modes": "paper"}
+    assert Combinations([], conf.path, choices.items()).assembled(choices) is None
+
+
+def test_a_reference_to_another_group_meets_each_file_of_it(tod: Command, conf: UserConf) -> None:
+    conf.write("pqos/mine.yaml", "defaults: [constant, _self_]\nkbps: ${graph.mtu_bytes}\n")
+    one_of_each = [f"{group}={name}" for group, name in ONE.items() if group not in ("pqos", "graph")]
+    plain = tod("validate", "all=true", *one_of_each)
+    with_mine = tod("validate", "all=true", conf.word, *one_of_each)
+    assert (plain.status, with_mine.status) == (0, 0), with_mine.err
+    before, after = (int(result.out.split()[3]) for result in (plain, with_mine))
+    assert after - before == 1 + count("graph")  # the file alone, and with each graph
+
+
+# --- FILE -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_checked_with_those_that_build_on_it(tod: Command, conf: UserConf) -> None:
+    conf.change("cameras/compact_480p.yaml", {"fps: 30": "fsp: 30"}).write("modes/broken.yaml", "a: [\n")
+    conf.write("modes/a.yaml", "defaults: [paper, _self_]\n").write("modes/b.yaml", "defaults: [a, _self_]\n")
+    result = tod("validate", str(conf.path / "modes/a.yaml"))
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 1 file, 2 configurations")
+    names = [str(conf.path / name) for name in ("modes/broken.yaml", "cameras/compact_480p.yaml")]
+    assert [problem.split(": ")[0] for problem in tod("validate", *names).problems] == sorted(names)
+
+
+def test_files_of_two_directories(tod: Command, conf: UserConf) -> None:
+    for name in ("one", "two"):
+        conf.write(f"{name}/modes/a.yaml", "defaults: [paper, _self_]\n")
+    result = tod("validate", *(str(conf.path / name / "modes/a.yaml") for name in ("one", "two")))
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 2 files, 2 configurations")
+
+
+@pytest.mark.parametrize(
+    "word, told",
+    [
+        ("{}/modes/b.yaml", "{}/modes/b.yaml: no such file"),
+        ("{}/modes", "{}/modes: must be NAME=VALUE, or a file that ends in .yaml or .yml"),
+        ("{}/../x.yaml", "{}/../x.yaml: is in no configuration directory: none above it has vehicle/, cameras/, ..."),
+    ],
+)
+def test_a_word_that_names_no_file_of_a_configuration(tod: Command, conf: UserConf, word: str, told: str) -> None:
+    conf.write("modes/a.yaml", "defaults: [paper, _self_]\n").write("../x.yaml", "a: 1\n")
+    result = tod("validate", word.format(conf.path))
+    assert (result.status, result.err) == (2, f"command line: {told.format(conf.path)}\n")

@@ -51,7 +51,7 @@ def limited_samples(drive: Series) -> list[Sample]:
     t, kbps = drive.actual
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
-        limited |= _lost(t, camera.t, camera.lost) | _waited(t, camera.arrival_t, camera.arrival_ms)
+        limited |= _lost(t, camera.t, camera.lost) | _waited(t, camera.arrival_t, camera.clocks_ms)
     lat, lon = _at(drive.positions, t)
     known = limited & np.isfinite(kbps) & np.isfinite(lat)
     return [Sample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]

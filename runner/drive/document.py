@@ -78,7 +78,14 @@ def _drive(drive: Statistics, checks: Sequence[Check]) -> dict[str, Any]:
         "rebuilt": drive.rebuilt,
         "refused": series.refused,
         "link": _link(series.link) if series.link else None,
-        "quality": {"metric": drive.metric, "mean": number(drive.quality, 5)} if drive.metric else None,
+        "quality": {
+            "metric": drive.metric,
+            "mean": number(drive.quality, 5),
+            "moving": number(drive.moving, 5),
+            "frozen_share": number(drive.frozen),
+        }
+        if drive.metric
+        else None,
         "warnings": list(series.warnings),
         "notes": list(drive.notes),
         "checks": [check._asdict() for check in checks],
@@ -126,5 +133,11 @@ def _camera(camera: CameraStatistics) -> dict[str, Any]:
         "lost": camera.lost,
         "rebuilt": camera.rebuilt,
         "quality": quality
-        and {"metric": quality.metric, "mean": number(quality.mean, 5), "clamped": number(quality.clamped)},
+        and {
+            "metric": quality.metric,
+            "mean": number(quality.mean, 5),
+            "moving": number(quality.moving, 5),
+            "frozen_share": number(camera.frozen),
+            "clamped": number(quality.clamped),
+        },
     }

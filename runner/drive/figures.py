@@ -1,169 +1,307 @@
-"""The figures of the paper's driving test (section V-B) from real drives, in a column's width, as PNG and PDF.
+"""The figures of the paper's driving test (section V-B), each defined once: what print and page draw of it. Pure.
 
-Several drives share one figure: a row of panels for each, on the same axes.
+A figure is rows of charts: a row for each drive, on the same axes, so that drives are compared by eye.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Sequence
-from itertools import zip_longest
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import matplotlib as mpl
-
-mpl.use("Agg")  # no screen
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.collections import PathCollection
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.markers import MarkerStyle
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.transforms import ScaledTranslation
 
-from runner.drive.colours import ACTUAL, ALLOCATED, DAY, LINK, PREDICTED, colours
-from runner.drive.series import Line, Panel, Positions, Series, Values, held
+from runner.drive.series import CameraSeries, Line, Panel, Positions, Series, Values, held
 from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
-from runner.files import write_whole
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from runner.model import Progress
-
-WIDTH_IN = 3.5  # a column of an IEEE paper
-FORMATS = ("png", "pdf")
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7,
-    "axes.labelsize": 7,
-    "axes.titlesize": 7,
-    "axes.titlelocation": "left",
-    "axes.linewidth": 0.6,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e2e6ea",
-    "grid.linewidth": 0.5,
-    "xtick.labelsize": 6.5,
-    "ytick.labelsize": 6.5,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "lines.linewidth": 0.9,
-    "legend.fontsize": 6.5,
-    "legend.frameon": False,
-    "legend.handlelength": 2.0,
-    "legend.columnspacing": 1.0,
-    "legend.handletextpad": 0.5,
-    "legend.borderaxespad": 0.0,
-    "text.parse_math": False,  # a drive's name may hold any character
-    "pdf.fonttype": 42,  # fonts as text, as journals want them
-    "savefig.dpi": 300,
-}
-LEGEND_IN = 0.38  # under the panel: below the numbers and the label of the time axis
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.2)), (0, (1.4, 0.9)), (0, (5, 1, 1.2, 1)))  # by place in a panel
-APART = 0.014  # of the axis, between steps that would lie on one another
 MINUTES_FROM_S = 900.0
-DECADES = 50.0  # over more than this ratio fewer latencies are numbered
-WIDE = 8.0  # latencies that spread over more than this ratio are drawn on a logarithmic axis
-SEEN = 0.006  # of the axis: the least width of a freeze that is seen
+APART = 0.014  # of the largest factor, between steps that would lie on one another
+WIDE = 8.0  # latencies that spread over more than this ratio have a logarithmic axis
+DECADES = 50.0  # over more than this ratio fewer of them are numbered
+QUANTILES = np.concatenate([np.linspace(0, 0.95, 96), np.linspace(0.951, 1, 50)])
 ARROWS = 7  # that show the direction of the drive
-METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 FLATTEST = 0.4  # shorter side of a map over the longer
 SMALLEST_TRACK_M = 20.0  # around a vehicle that stands
+METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 
-Rows = Sequence[Statistics]
+Drives = Sequence[Statistics]
 
 
-def write_figures(drives: Rows, directory: Path, progress: Progress) -> tuple[list[str], list[str]]:
-    """Write every figure that the drives have the data for.
+class Axis(NamedTuple):
+    """marks: the values that are numbered; none leaves the choice to whoever draws."""
 
-    returns  names of the figures, each written as .png and .pdf; and why others were left out
-    raises   RunError where a file cannot be written
+    title: str
+    low: float
+    high: float
+    marks: tuple[float, ...] = ()
+    log: bool = False
+    percent: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A quantity, in the units of the axes.
+
+    colour     place of a camera in the palette, or the name of a colour of the style sheet
+    dash       which of the dashes; they tell curves apart without colour
+    around     lowest and highest of the cameras that the curve is the mean of
+    steps      each value holds until the next
+    filled     down to 0, without a line
+    why        of each value, for whoever points at it
     """
-    written, left_out = [], []
-    for number, (name, draw) in enumerate(FIGURES.items()):
-        progress("figures", number / len(FIGURES))
-        with mpl.rc_context(STYLE):
-            made = draw(drives)
-            if isinstance(made, str):
-                left_out.append(f"{name}: left out, {made}")
-                continue
-            for form in FORMATS:
-                write_whole(directory / f"{name}.{form}", _rendered(made, form))
-        written.append(name)
-    progress("figures", 1.0)
-    return written, left_out
+
+    label: str
+    x: Values
+    y: Values
+    colour: int | str
+    dash: int = 0
+    width: float = 1.0
+    around: tuple[Values, Values] | None = None
+    steps: bool = False
+    filled: bool = False
+    why: tuple[str, ...] = ()
 
 
-def _rendered(figure: Figure, form: str) -> bytes:
-    buffer = io.BytesIO()
-    # Without a date in it the same drive gives the same file.
-    figure.savefig(buffer, format=form, metadata={"CreationDate": None} if form == "pdf" else None)
-    return buffer.getvalue()
+class Bars(NamedTuple):
+    """Spans of time of one camera: (from, how long), s."""
+
+    label: str
+    colour: int
+    spans: tuple[tuple[float, float], ...]
+
+
+class Strip(NamedTuple):
+    """Rows of bars below a chart, on its axis of time; and what is said where there are none."""
+
+    bars: tuple[Bars, ...]
+    none: str
+
+
+class Track(NamedTuple):
+    """Positions, m, the bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) on the way."""
+
+    way: tuple[Values, Values]
+    t: Values
+    east: Values
+    north: Values
+    kbps: Values
+    low: float
+    high: float
+    title: str
+    arrows: tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """One pair of axes.
+
+    drive   its place among the drives, None for a chart of all of them
+    unit_s  s of the unit of an axis of time
+    hover   a value, as plotly formats it
+    """
+
+    title: str
+    x: Axis
+    y: Axis
+    curves: tuple[Curve, ...] = ()
+    drive: int | None = 0
+    part: int = 0
+    unit_s: float = 1.0
+    strip: Strip | None = None
+    track: Track | None = None
+    hover: str = ""
+
+
+class Figure(NamedTuple):
+    """rows: charts that stand beside each other."""
+
+    name: str
+    heading: str
+    rows: tuple[tuple[Chart, ...], ...]
+
+
+def figures(drives: Drives) -> tuple[list[Figure], list[str]]:
+    """Every figure that the drives have the data for, and why others were left out."""
+    made, left_out = [], []
+    for name, (heading, define) in FIGURES.items():
+        rows = define(drives)
+        if isinstance(rows, str):
+            left_out.append(f"{name}: left out, {rows}")
+        else:
+            made.append(Figure(name, heading, tuple(tuple(row) for row in rows)))
+    return made, left_out
 
 
 # --- the figures ------------------------------------------------------------------------------------------------------
 
+Rows = list[list[Chart]]
 
-def bitrate_on_track(drives: Rows) -> Figure | str:
+
+def bitrate_on_track(drives: Drives) -> Rows | str:
     """Total bitrate by colour on the positions of the vehicle (paper, Fig. 5)."""
-    shown = [drive.series for drive in drives if drive.series.positions]
-    if not shown:
+    tracks = {at: on_track(drive.series) for at, drive in enumerate(drives) if drive.series.positions}
+    if not tracks:
         return "no positions were logged"
-    tracks = [_on_track(drive) for drive in shown]
-    known = np.concatenate([kbps for *_, kbps in tracks])
+    known = np.concatenate([kbps for *_, kbps in tracks.values()])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    height = sum(_height(drive.positions) for drive in shown if drive.positions)
-    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-    grid = figure.subplots(len(shown), squeeze=False)[:, 0]
-    for axes, drive, (east, north, kbps) in zip(grid, shown, tracks, strict=True):
-        points = axes.scatter(east, north, c=kbps, s=7, lw=0, cmap=_viridis(), vmin=low, vmax=high, zorder=2)
-        _mark_way(axes, drive)
-        _dress_map(axes, drive, titled=len(shown) > 1)
-        _colour_bar(figure, axes, points, drive)
-    return figure
+    rows: Rows = []
+    for at, (t, east, north, kbps) in tracks.items():
+        series = drives[at].series
+        assert series.positions is not None
+        xlim, ylim = _limits(series.positions)
+        title = f"total {series.measured or 'allocated'} in kbit/s"
+        way = (series.positions.east, series.positions.north)
+        track = Track(way, t, east, north, kbps, low, high, title, tuple(_arrows(*way)))
+        x, y = Axis("m east of the start", *xlim), Axis("m north", *ylim)
+        rows.append([Chart(_label(drives, at), x, y, drive=at, track=track)])
+    return rows
 
 
-def bitrates(drives: Rows) -> Figure | str:
+def totals(drives: Drives) -> Rows:
+    """What was predicted, allocated, and came of it."""
+
+    def curves(series: Series) -> Iterable[Curve]:
+        if series.link:
+            yield _steps("link's rate", Line(series.link.t, series.link.kbps), series, "link", filled=True)
+        yield _steps("allocated", series.allocated, series, "allocated", width=1.6)
+        yield _steps("predicted", series.predicted, series, "predicted", dash=1)
+        if series.measured:
+            yield Curve(series.measured, *series.actual, "actual", width=0.8)
+
+    found = [tuple(curves(drive.series)) for drive in drives]
+    y = Axis("total in kbit/s", 0.0, _top(found))
+    return [[_over_time(drives, at, _label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
+
+
+def bitrates(drives: Drives) -> Rows | str:
     """Actual bitrate of each camera (paper, Fig. 6)."""
-    if not any(drive.series.measured for drive in drives):
+    kinds = {drive.series.measured for drive in drives} - {""}
+    if not kinds:
         return "neither what was sent nor what was received was logged"
 
-    def draw(axes: Axes, drive: Statistics, panel: Panel) -> None:
-        for name, style in _styles(drive.series, panel):
-            line = drive.series.cameras[name].actual
-            axes.plot(line.t / _unit(drives)[0], line.y, **style)
+    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+        for dash, names in enumerate(coinciding(drive.series, panel, _allocated)):
+            lines = [drive.series.cameras[name].actual for name in names]
+            yield _mean(_named(names, panel, ": mean and range"), lines, _place(drive, names), dash)
 
-    figure, grid = _by_panel(drives, draw, f"{_measured(drives)} bitrate in kbit/s")
-    for axes in grid.flat:
-        axes.set_ylim(bottom=0)
-    return figure
+    title = f"{kinds.pop() if len(kinds) == 1 else 'actual'} bitrate in kbit/s"
+    return _by_panel(drives, curves, lambda _, found: Axis(title, 0.0, _top(found)), KBPS)
 
 
-def scaling(drives: Rows) -> Figure:
+def scaling(drives: Drives) -> Rows:
     """Resolution factor of each camera; steps that coincide are drawn side by side (paper, Fig. 7)."""
-    reach = max((max(_factors(drive, panel)) for drive in drives for panel in drive.series.panels), default=1.0)
+    factors = [{f for panel in d.series.panels for f in _factors(d, panel)} for d in drives]
+    reach = max(max(each, default=1.0) for each in factors)
 
-    def draw(axes: Axes, drive: Statistics, panel: Panel) -> None:
-        for place, (name, style) in enumerate(_styles(drive.series, panel)):
-            decided = drive.series.cameras[name].decided
-            offset = ((len(panel.cameras) - 1) / 2 - place) * APART * reach
-            values = np.where(decided.sending, decided.scaling, np.nan) + offset
-            t, y = _until(Line(decided.t, values), drive.series.end)
-            axes.step(t / _unit(drives)[0], y, where="post", **style)
+    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+        groups = coinciding(drive.series, panel, _factor)
+        used = [set(_factor(drive.series.cameras[names[0]])[1].tolist()) for names in groups]
+        meet = any(a & b for a, b in combinations(used, 2))
+        for dash, names in enumerate(groups):
+            camera = drive.series.cameras[names[0]]
+            offset = ((len(groups) - 1) / 2 - dash) * APART * reach * meet
+            label = _named(names, panel) + (f" (offset {offset:+.3f})" if offset else "")
+            curve = _steps(label, Line(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
+            why = tuple(_why(names, camera, drive.series.end))
+            yield replace(curve, y=curve.y + offset, why=why)
 
-    figure, grid = _by_panel(drives, draw, "resolution factor")
-    for number, column in enumerate(grid.T):
-        shown = [panel for drive in drives for panel in drive.series.panels[number : number + 1]]
-        marks = sorted({f for drive in drives for panel in shown for f in _factors(drive, panel)})
-        column[0].yaxis.set_major_locator(FixedLocator(marks))
-        column[0].yaxis.set_major_formatter(FuncFormatter(lambda factor, _: f"{factor:g}"))
-        column[0].set_ylim(max(0.0, marks[0] - 0.2 * reach), marks[-1] + 0.1 * reach)
-    return figure
+    def axis(part: int, _: Sequence[Sequence[Curve]]) -> Axis:
+        panels = [(drive, panel) for drive in drives for panel in drive.series.panels[part : part + 1]]
+        marks = tuple(sorted({f for drive, panel in panels for f in _factors(drive, panel)}))
+        return Axis("resolution factor", max(0.0, marks[0] - 0.2 * reach), marks[-1] + 0.1 * reach, marks)
+
+    return _by_panel(drives, curves, axis, "")
+
+
+def latency(drives: Drives) -> Rows | str:
+    """Latency over time with freezes, and how it is distributed."""
+    seconds = {at: per_second(drive.series) for at, drive in enumerate(drives) if latencies(drive.series)[1].size}
+    if not seconds:
+        return "no latency was logged: that takes an operator's log"
+    everything = np.concatenate([np.concatenate([each.median, each.p95]) for each in seconds.values()])
+    y = _spread("latency in ms", everything[np.isfinite(everything)])
+    rows: Rows = []
+    for at, each in seconds.items():
+        curves = (Curve("95th percentile", each.t, each.p95, "late"), Curve("median", each.t, each.median, "allocated"))
+        title = _label(drives, at) or "each second" + (", all cameras" if len(drives[at].cameras) > 1 else "")
+        rows.append([_over_time(drives, at, title, y, curves, _freezes(drives[at]), hover="%{y:.0f} ms")])
+    return [*rows, [_distribution(drives, list(seconds))]]
+
+
+def quality(drives: Drives) -> Rows | str:
+    """Quality of each camera as its rate-quality model says."""
+    metrics = sorted({each.quality.metric for drive in drives for each in drive.cameras.values() if each.quality})
+    if not metrics:
+        return "no rate-quality models were found"
+
+    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+        for dash, name in enumerate(panel.cameras):
+            estimate = drive.cameras[name].quality
+            if estimate and estimate.metric == metrics[0]:
+                yield Curve(name, *estimate.line, _place(drive, (name,)), dash)
+
+    def axis(_: int, found: Sequence[Sequence[Curve]]) -> Axis:
+        values = np.concatenate([np.empty(0), *(curve.y for each in found for curve in each)])
+        known = values[np.isfinite(values)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+        room = 0.05 * (high - low or 1.0)
+        return Axis(f"estimated {METRICS.get(metrics[0], metrics[0])}", low - room, high + room)
+
+    return _by_panel(drives, curves, axis, "%{y:.4~g}", shared=True)
+
+
+FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
+    "bitrate_on_track": ("Total bitrate on the track", bitrate_on_track),
+    "bitrates": ("Camera bitrates over time", bitrates),
+    "scaling": ("Resolution factors over time", scaling),
+    "totals": ("Predicted, allocated and actual total", totals),
+    "latency": ("Latency and freezes", latency),
+    "quality": ("Estimated quality over time", quality),
+}
+
+
+# --- cameras and panels -----------------------------------------------------------------------------------------------
+
+KBPS = "%{y:,.0f} kbit/s"
+
+
+def coinciding(
+    drive: Series, panel: Panel, key: Callable[[CameraSeries], tuple[Values, Values]]
+) -> list[tuple[str, ...]]:
+    """The cameras of a panel in groups whose quantity is the same at all times."""
+    groups: dict[tuple[bytes, bytes], list[str]] = {}
+    for name in panel.cameras:
+        t, values = key(drive.cameras[name])
+        groups.setdefault((t.tobytes(), values.tobytes()), []).append(name)
+    return [tuple(names) for names in groups.values()]
+
+
+def _allocated(camera: CameraSeries) -> tuple[Values, Values]:
+    return camera.decided.t, np.where(camera.decided.sending, camera.decided.kbps, np.nan)
+
+
+def _factor(camera: CameraSeries) -> tuple[Values, Values]:
+    return camera.decided.t, np.where(camera.decided.sending, camera.decided.scaling, np.nan)
+
+
+def _named(names: Sequence[str], panel: Panel, more: str = "") -> str:
+    if len(names) == 1:
+        return names[0]
+    return (f"all {len(names)} cameras" if len(names) == len(panel.cameras) else ", ".join(names)) + more
+
+
+def _place(drive: Statistics, names: Sequence[str]) -> int:
+    return list(drive.series.cameras).index(names[0])
+
+
+def _mean(label: str, lines: Sequence[Line], colour: int, dash: int) -> Curve:
+    """Mean of lines at the times of the first, with the lowest and the highest."""
+    if len(lines) == 1 or not lines[0].t.size:
+        return Curve(label, *lines[0], colour, dash)
+    t = lines[0].t
+    values = np.array([np.interp(t, *line) if line.t.size else np.full(t.shape, np.nan) for line in lines])
+    return Curve(label, t, values.mean(axis=0), colour, dash, around=(values.min(axis=0), values.max(axis=0)))
 
 
 def _factors(drive: Statistics, panel: Panel) -> set[float]:
@@ -174,173 +312,124 @@ def _factors(drive: Statistics, panel: Panel) -> set[float]:
     return {float(factor) for each in (*ladders, *used) for factor in each if factor} or {1.0}
 
 
-def totals(drives: Rows) -> Figure:
-    """What was predicted, allocated, and came of it."""
-    unit, label = _unit(drives)
-    figure, grid = _rows(drives, 1, 1.5, sharey=True)
-    for axes, drive in zip(grid[:, 0], drives, strict=True):
-        series = drive.series
-        if series.link:
-            axes.fill_between(
-                series.link.t / unit, series.link.kbps, step="post", color=LINK, alpha=0.45, lw=0, label="link's rate"
-            )
-        for line, text, style in (
-            (series.predicted, "predicted", {"color": PREDICTED, "ls": DASHES[1], "zorder": 3}),
-            (series.allocated, "allocated", {"color": ALLOCATED, "lw": 1.4}),
-        ):
-            t, y = _until(line, series.end)
-            axes.step(t / unit, y, where="post", label=text, **style)
-        if series.measured:
-            axes.plot(series.actual.t / unit, series.actual.y, color=ACTUAL, lw=0.7, label=f"{series.measured}")
-        axes.set_ylabel("total in kbit/s")
-        if len(drives) > 1:
-            axes.set_title(series.label)
-        axes.set_ylim(bottom=0)
-    grid[-1, 0].set_xlabel(label)
-    _legend(grid[-1, 0], grid[:, 0], columns=4)
-    return figure
-
-
-def latency(drives: Rows) -> Figure | str:
-    """Latency over time with freezes, and how it is distributed."""
-    drives = [drive for drive in drives if has_latency(drive)]
-    if not drives:
-        return "no latency was logged: that takes an operator's log"
-    unit, label = _unit(drives)
-    heights = [height for drive in drives for height in (1.15, _strip_height(drive))]
-    titles = 0.12 * (len(drives) > 1) * len(drives)
-    size = (WIDTH_IN, sum(heights) + 1.45 + 0.75 + titles)
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(len(heights) + 1, height_ratios=[*heights, 1.45])
-    seconds = [per_second(drive.series) for drive in drives]
-    everything = np.concatenate([np.concatenate([each.median, each.p95]) for each in seconds])
-    for number, (drive, each) in enumerate(zip(drives, seconds, strict=True)):
-        axes, strip = grid[2 * number], grid[2 * number + 1]
-        axes.sharex(grid[0])
-        strip.sharex(grid[0])
-        axes.sharey(grid[0])
-        axes.plot(each.t / unit, each.p95, color=DAY[5], label="95th percentile")
-        axes.plot(each.t / unit, each.median, color=ALLOCATED, label="median")
-        _latency_axis(axes.set_yscale, axes.set_ylim, axes.yaxis, everything[np.isfinite(everything)])
-        axes.set_ylabel("latency in ms")
-        axes.tick_params(labelbottom=False)
-        axes.set_title(drive.series.label if len(drives) > 1 else "(a) Over time")
-        _draw_freezes(strip, drive, unit)
-    grid[0].set_xlim(0, max(drive.series.end for drive in drives) / unit)
-    grid[0].legend(loc="lower right", bbox_to_anchor=(1, 1.03), ncols=2)
-    grid[-2].set_xlabel(label)
-    _draw_distribution(grid[-1], drives)
-    return figure
-
-
-def quality(drives: Rows) -> Figure | str:
-    """Quality of each camera as its rate-quality model says."""
-    metrics = {each.quality.metric for drive in drives for each in drive.cameras.values() if each.quality}
-    if not metrics:
-        return "no rate-quality models were found, see `tod-runner model --help`; models=DIR names where they are"
-    metric = sorted(metrics)[0]
-    drives = [drive for drive in drives if has_quality(drive)]
-
-    def draw(axes: Axes, drive: Statistics, panel: Panel) -> None:
-        for name, style in _styles(drive.series, panel):
-            estimate = drive.cameras[name].quality
-            if estimate and estimate.metric == metric:
-                axes.plot(estimate.line.t / _unit(drives)[0], estimate.line.y, **style)
-
-    figure, _ = _by_panel(drives, draw, f"estimated {METRICS.get(metric, metric)}", sharey=True)
-    return figure
-
-
-def has_latency(drive: Statistics) -> bool:
-    return bool(latencies(drive.series)[1].size)
-
-
-def has_quality(drive: Statistics) -> bool:
-    return any(camera.quality for camera in drive.cameras.values())
-
-
-FIGURES: dict[str, Callable[[Rows], Figure | str]] = {
-    "bitrate_on_track": bitrate_on_track,
-    "bitrates": bitrates,
-    "scaling": scaling,
-    "totals": totals,
-    "latency": latency,
-    "quality": quality,
-}
-
-
-# --- rows and panels --------------------------------------------------------------------------------------------------
-
-
-def _rows(drives: Rows, columns: int, height: float, sharey: Any) -> tuple[Figure, Any]:
-    """A row for each drive, on the same time axis."""
-    figure = Figure(figsize=(WIDTH_IN, height * len(drives) + 0.45), layout="constrained")
-    grid = figure.subplots(len(drives), columns, squeeze=False, sharex=True, sharey=sharey)
-    grid[0, 0].set_xlim(0, max(drive.series.end for drive in drives) / _unit(drives)[0])
-    grid[0, 0].xaxis.set_major_locator(MaxNLocator(4 if columns > 1 else 8, steps=[1, 2, 2.5, 5, 10]))
-    return figure, grid
+def _why(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
+    """Of each step of a factor, the time, the factor and the reason."""
+    decided = camera.decided
+    told = [
+        f"{', '.join(names)} from {t:.1f} s: {'off' if np.isnan(factor) else f'{factor:g}'}\n{reason}"
+        for t, factor, reason in zip(*_factor(camera), decided.reason, strict=True)
+    ]
+    return told + told[-1:] if told and decided.t[-1] < end else told
 
 
 def _by_panel(
-    drives: Rows, draw: Callable[[Axes, Statistics, Panel], None], label: str, sharey: Any = "col"
-) -> tuple[Figure, Any]:
-    """A row for each drive, a column for each panel of cameras, legends below."""
-    columns = max(len(drive.series.panels) for drive in drives)
-    figure, grid = _rows(drives, columns, 1.55, sharey)
-    above: Sequence[Panel] = ()
-    for row, drive in zip(grid, drives, strict=True):
-        for number, (axes, panel) in enumerate(zip_longest(row, drive.series.panels)):
-            if panel is None:
-                axes.set_axis_off()
-                continue
-            draw(axes, drive, panel)
-            if drive.series.panels != above:
-                axes.set_title(f"({chr(ord('a') + number)}) {panel.title}" if columns > 1 else panel.title)
-        above = drive.series.panels
-        row[0].set_ylabel(label if len(drives) == 1 else f"{drive.series.label}\n{label}")
-    for number in range(columns):
-        grid[-1, number].set_xlabel(_unit(drives)[1])
-        _legend(grid[-1, number], grid[:, number], columns=2 if columns > 1 else 4)
-    return figure, grid
+    drives: Drives,
+    curves: Callable[[Statistics, Panel], Iterable[Curve]],
+    axis: Callable[[int, Sequence[Sequence[Curve]]], Axis],
+    hover: str,
+    *,
+    shared: bool = False,
+) -> Rows:
+    """A row for each drive, a chart for each panel of cameras; those below one another share an axis, or all do."""
+    found = {
+        (at, part): tuple(curves(drive, panel))
+        for at, drive in enumerate(drives)
+        for part, panel in enumerate(drive.series.panels)
+    }
+    rows: Rows = [[] for _ in drives]
+    for (at, part), each in found.items():
+        y = axis(part, [those for (_, other), those in found.items() if shared or other == part])
+        title = ": ".join(filter(None, (_label(drives, at), drives[at].series.panels[part].title)))
+        rows[at].append(_over_time(drives, at, title, y, each, part=part, hover=hover))
+    return rows
 
 
-def _styles(drive: Series, panel: Panel) -> Iterable[tuple[str, dict[str, Any]]]:
-    """By camera of a panel, how its curve looks: colours are those of the page, dashes tell them apart without."""
-    own = colours(drive.cameras)
-    for place, name in enumerate(panel.cameras):
-        yield name, {"color": own[name], "ls": DASHES[place % len(DASHES)], "label": name}
+# --- time -------------------------------------------------------------------------------------------------------------
 
 
-def _legend(below: Axes, of: Iterable[Axes], columns: int) -> None:
-    """One legend under a column of panels, for all that is drawn in it."""
-    handles = {label: handle for axes in of for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    down = below.transAxes + ScaledTranslation(0, -LEGEND_IN, below.figure.dpi_scale_trans)
-    below.legend(
-        handles.values(),
-        handles.keys(),
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0),
-        bbox_transform=down,
-        ncols=columns,
-    )
+def _label(drives: Drives, at: int) -> str:
+    """What tells a drive from others."""
+    return drives[at].series.label if len(drives) > 1 else ""
 
 
-def _unit(drives: Rows) -> tuple[float, str]:
+def _unit(drives: Drives) -> tuple[float, str]:
     """s of the unit of the time axis, and how it is labelled."""
     long = max(drive.series.end for drive in drives) > MINUTES_FROM_S
     return (60.0, "time in min") if long else (1.0, "time in s")
 
 
-def _until(line: Line, end: float) -> Line:
+def _over_time(
+    drives: Drives, at: int, title: str, y: Axis, curves: Iterable[Curve], strip: Strip | None = None, **more: Any
+) -> Chart:
+    """A chart of one drive, from curves and bars over s."""
+    unit, label = _unit(drives)
+    x = Axis(label, 0.0, max(drive.series.end for drive in drives) / unit)
+    if strip:
+        bars = (each._replace(spans=tuple((t / unit, s / unit) for t, s in each.spans)) for each in strip.bars)
+        strip = strip._replace(bars=tuple(bars))
+    scaled = tuple(replace(curve, x=curve.x / unit) for curve in curves)
+    return Chart(title, x, y, scaled, drive=at, unit_s=unit, strip=strip, **more)
+
+
+def _steps(label: str, line: Line, series: Series, colour: int | str, **more: Any) -> Curve:
     """A quantity whose values hold until the next, up to the end of the drive."""
-    if not line.t.size or line.t[-1] >= end:
-        return line
-    return Line(np.append(line.t, end), np.append(line.y, line.y[-1]))
+    t, y = line
+    if t.size and t[-1] < series.end:
+        t, y = np.append(t, series.end), np.append(y, y[-1])
+    return Curve(label, t, y, colour, steps=True, **more)
 
 
-def _measured(drives: Rows) -> str:
-    kinds = {drive.series.measured for drive in drives} - {""}
-    return kinds.pop() if len(kinds) == 1 else "actual"
+def _top(found: Iterable[Iterable[Curve]]) -> float:
+    """The largest value of curves of all drives, with some room."""
+    tops = [each.around[1] if each.around else each.y for curves in found for each in curves]
+    known = np.concatenate([np.zeros(1), *tops])
+    return float(np.nanmax(known)) * 1.05 or 1.0
+
+
+# --- latency ----------------------------------------------------------------------------------------------------------
+
+
+def _spread(title: str, shown: Values) -> Axis:
+    """An axis that holds some latencies: logarithmic where they spread and none is below 0."""
+    low, high = float(shown.min()), float(shown.max())
+    if low <= 0 or high / low <= WIDE:
+        return Axis(title, min(0.0, low), high * 1.05)
+    digits = (1, 3) if high > DECADES * low else (1, 2, 5)
+    marks = (digit * 10.0**power for power in range(-1, 6) for digit in digits)
+    return Axis(title, low * 0.95, high * 1.05, tuple(each for each in marks if low <= each <= high), log=True)
+
+
+def _freezes(drive: Statistics) -> Strip:
+    """A row for each camera that froze."""
+    frozen = [(place, camera) for place, camera in enumerate(drive.cameras.values()) if camera.freezes]
+    bars = (Bars(camera.name, place, tuple(camera.freezes or ())) for place, camera in frozen)
+    none = "arrivals were not logged: freezes are not known" if drive.freezes is None else "no freezes"
+    return Strip(tuple(bars), none)
+
+
+def _distribution(drives: Drives, known: Sequence[int]) -> Chart:
+    """Share of frames that are at most so late: of each camera, or of each drive where there are several."""
+    title, curves = "distribution", []
+    if len(drives) == 1:
+        series = drives[0].series
+        each = [(name, latencies(series, name)[1], place) for place, name in enumerate(series.cameras)]
+        curves = [_shares(name, values, place) for name, values, place in each if values.size]
+        if len(curves) > 1:
+            curves.append(_shares("all cameras", latencies(series)[1], "text", dash=1, width=1.6))
+    else:
+        title = "distribution, all cameras"
+        for number, at in enumerate(known):
+            series = drives[at].series
+            curves.append(_shares(series.label, latencies(series)[1], number, dash=number, width=1.4))
+    arrived = any(to_arrival(drives[at].series) for at in known)
+    everything = np.concatenate([curve.x[:-1] for curve in curves])  # the last thousandth would squeeze all others
+    x = _spread(f"latency from capture to {'arrival' if arrived else 'decode'} in ms", everything)
+    y = Axis("share of frames", 0.0, 1.01, (0.0, 0.25, 0.5, 0.75, 0.95), percent=True)
+    return Chart(title, x, y, tuple(curves), drive=None, part=1, hover="%{x:.0f} ms or less: %{y:.1%} of the frames")
+
+
+def _shares(label: str, values: Values, colour: int | str, **more: Any) -> Curve:
+    return Curve(label, np.quantile(values, QUANTILES), QUANTILES, colour, **more)
 
 
 # --- the map ----------------------------------------------------------------------------------------------------------
@@ -357,22 +446,6 @@ def on_track(drive: Series) -> tuple[Values, Values, Values, Values]:
     return t, np.interp(t, places.t, places.east), np.interp(t, places.t, places.north), kbps
 
 
-def _on_track(drive: Series) -> tuple[Values, Values, Values]:
-    return on_track(drive)[1:]
-
-
-def _viridis() -> ListedColormap:
-    """Without its lightest end, which is not seen on white."""
-    return ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.93, 256)))
-
-
-def _height(places: Positions | None) -> float:
-    """Of a map that fills the column's width, in."""
-    assert places is not None
-    (left, right), (bottom, top) = _limits(places)
-    return 2.4 * (top - bottom) / (right - left) + 0.6
-
-
 def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]]:
     """Of the map, m east and north: room around the track, and no side too short for the colour bar."""
     spans = [float(np.ptp(each)) for each in (places.east, places.north)]
@@ -385,109 +458,10 @@ def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]
     return found[0], found[1]
 
 
-def _mark_way(axes: Axes, drive: Series) -> None:
-    """Where the drive begins, where it ends, and arrows along it."""
-    places = drive.positions
-    assert places is not None
-    x, y = places.east, places.north
+def _arrows(x: Values, y: Values) -> Iterable[tuple[float, float, float]]:
+    """Along the way, at even distances."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     for share in np.arange(1, ARROWS + 1) / (ARROWS + 1) if way[-1] > SMALLEST_TRACK_M else ():
         at = int(np.searchsorted(way, share * way[-1]))
         before = int(np.searchsorted(way, share * way[-1] - 0.01 * way[-1]))
-        angle = np.degrees(np.arctan2(y[at] - y[before], x[at] - x[before]))
-        arrow = MarkerStyle(">").rotated(deg=float(angle))
-        axes.plot(x[at], y[at], marker=arrow, ms=5, mfc="white", mec="black", mew=0.6, zorder=4)
-    ends = (("start", 0, "o"), ("end", -1, "s"))
-    axes.plot(x, y, color=LINK, lw=1.2, zorder=1)  # also where no bitrate is known
-    for text, at, marker in ends:
-        axes.plot(x[at], y[at], marker=marker, ms=5.5, mfc="white", mec="black", mew=1.0, zorder=5, ls="", label=text)
-
-
-def _dress_map(axes: Axes, drive: Series, *, titled: bool) -> None:
-    axes.set_aspect("equal")
-    assert drive.positions is not None
-    xlim, ylim = _limits(drive.positions)
-    axes.set(xlim=xlim, ylim=ylim)
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    axes.set_xlabel("m east of the start")
-    axes.set_ylabel("m north")
-    if titled:
-        axes.set_title(drive.label)
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1.01), ncols=2)
-
-
-def _colour_bar(figure: Figure, axes: Axes, points: PathCollection, drive: Series) -> None:
-    # Inside the axes' own box, which the equal aspect shrinks.
-    bar = figure.colorbar(points, cax=axes.inset_axes((1.02, 0, 0.035, 1)))
-    bar.set_label(f"total {drive.measured or 'allocated'} in kbit/s")
-    bar.outline.set_linewidth(0.5)
-
-
-# --- latency ----------------------------------------------------------------------------------------------------------
-
-
-def _latency_axis(set_scale: Callable[[str], None], set_limits: Callable[..., Any], axis: Any, shown: Values) -> None:
-    """An axis that holds some latencies: logarithmic where they spread and none is below 0."""
-    low, high = float(shown.min()), float(shown.max())
-    if low > 0 and high / low > WIDE:
-        set_scale("log")
-        set_limits(low * 0.95, high * 1.05)
-        axis.set_major_locator(LogLocator(10, (1, 3) if high > DECADES * low else (1, 2, 5)))
-        axis.set_minor_formatter(NullFormatter())
-    else:
-        set_limits(min(0.0, low), high * 1.05)
-    axis.set_major_formatter(FuncFormatter(lambda ms, _: f"{ms:g}"))
-
-
-def _strip_height(drive: Statistics) -> float:
-    frozen = sum(bool(camera.freezes) for camera in drive.cameras.values())
-    return 0.1 + 0.11 * max(frozen, 1)
-
-
-def _draw_freezes(axes: Axes, drive: Statistics, unit: float) -> None:
-    """A row for each camera that froze."""
-    own = colours(drive.cameras)
-    frozen = [camera for camera in drive.cameras.values() if camera.freezes]
-    least = SEEN * drive.series.end
-    for row, camera in enumerate(frozen):
-        bars = [(f.t / unit, max(f.seconds, least) / unit) for f in camera.freezes or ()]
-        axes.broken_barh(bars, (row - 0.4, 0.8), color=own[camera.name], lw=0)
-    axes.set_yticks(range(len(frozen)), [camera.name for camera in frozen], fontsize=5.5)
-    axes.set_ylim(max(len(frozen), 1) - 0.5, -0.5)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(axis="y", visible=False)
-    if frozen:
-        axes.text(1.0, 1.04, "freezes", transform=axes.transAxes, ha="right", va="bottom", fontsize=6)
-        return
-    text = "arrivals were not logged" if drive.freezes is None else "no freezes"
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=6)
-
-
-def _draw_distribution(axes: Axes, drives: Rows) -> None:
-    """Share of frames that are at most so late: of each camera, or of each drive where there are several."""
-    curves: list[tuple[str, Values, dict[str, Any]]] = []
-    if len(drives) == 1:
-        series = drives[0].series
-        own = colours(series.cameras)
-        curves = [(name, latencies(series, name)[1], {"color": own[name], "lw": 0.8}) for name in series.cameras]
-        curves.append(("all cameras", latencies(series)[1], {"color": "black", "lw": 1.5, "ls": DASHES[1]}))
-    else:
-        for number, drive in enumerate(drives):
-            style = {"color": DAY[number % len(DAY)], "ls": DASHES[number % len(DASHES)], "lw": 1.2}
-            curves.append((drive.series.label, latencies(drive.series)[1], style))
-    known = [(name, np.sort(values), style) for name, values, style in curves if values.size]
-    for name, values, style in known:
-        axes.plot(values, np.arange(1, len(values) + 1) / len(values), label=name, **style)
-    everything = np.concatenate([values for _, values, _ in known])
-    # The last thousandth would squeeze all others.
-    _latency_axis(axes.set_xscale, axes.set_xlim, axes.xaxis, np.percentile(everything, (0, 99.9)))
-    axes.set_ylim(0, 1.01)
-    for share in (0.5, 0.95):
-        axes.axhline(share, color="#8b949e", lw=0.5, ls=":", zorder=1)
-    axes.set_yticks((0, 0.25, 0.5, 0.75, 0.95), ("0", "25 %", "50 %", "75 %", "95 %"))
-    axes.set_ylabel("share of frames")
-    arrived = any(to_arrival(drive.series) for drive in drives)
-    axes.set_xlabel(f"latency from capture to {'arrival' if arrived else 'decode'} in ms")
-    axes.set_title("(b) Distribution" if len(drives) == 1 else "Distribution, all cameras")
-    _legend(axes, [axes], columns=3 if len(drives) == 1 else 2)
+        yield float(x[at]), float(y[at]), float(np.degrees(np.arctan2(y[at] - y[before], x[at] - x[before])))

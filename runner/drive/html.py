@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
-from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,46 +15,37 @@ import numpy as np
 from runner.drive.checks import Check
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
-from runner.drive.figures import METRICS, has_latency, has_quality, on_track
-from runner.drive.series import CameraSeries, Line, Series, Values
-from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
+from runner.drive.figures import Chart, Curve, Figure, Track
+from runner.drive.series import Series, Values
+from runner.drive.statistics import Statistics
 from runner.drive.tables import MEANING, VERDICTS, camera_rows, drive_rows, shown
-from runner.errors import RunError
+from runner.system.files import plotly_script
 
 STATIC = Path(__file__).parent / "static"
 MOST_POINTS = 2000  # of a curve; longer ones are thinned
-QUANTILES = np.concatenate([np.linspace(0, 0.95, 96), np.linspace(0.951, 1, 50)])
 LAST_REASONS = 200
-HEADINGS = {
-    "bitrate_on_track": "Total bitrate on the track",
-    "totals": "Predicted, allocated and actual total",
-    "bitrates": "Camera bitrates over time",
-    "scaling": "Resolution factors over time",
-    "latency": "Latency and freezes",
-    "quality": "Estimated quality over time",
-}
-
+ORDER = ("bitrate_on_track", "totals", "bitrates", "scaling", "latency", "quality")
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
 def page(
     drives: Sequence[Statistics],
     checks: Mapping[str, Sequence[Check]],
-    figures: Sequence[str],
+    figures: Sequence[Figure],
     left_out: Sequence[str],
 ) -> str:
     """The whole page.
 
     checks   by label of a drive
-    figures  names of those that lie beside the page as .png and .pdf
+    figures  those that lie beside the page as .png and .pdf
     raises   RunError where plotly is not installed
     """
     title = " and ".join(drive.series.label for drive in drives)
     parts = {
         "title": escape(title),
         "style": (STATIC / "report.css").read_text(encoding="utf-8"),
-        "plotly": _in_script(_plotly()),
-        "data": _json(_data(drives)),
+        "plotly": _in_script(plotly_script("report").read_text(encoding="utf-8")),
+        "data": _json(_data(figures)),
         "script": (STATIC / "report.js").read_text(encoding="utf-8"),
         "made": escape(f"tod-runner {version('tod-runner')} report"),
         "body": "\n".join(_body(drives, checks, figures, left_out)),
@@ -63,14 +54,6 @@ def page(
     head, *rest = text.split("{{")
     # One pass: nothing that was filled in is looked at again.
     return head + "".join(parts[key] + tail for key, tail in (each.split("}}", 1) for each in rest))
-
-
-def _plotly() -> str:
-    """The script that plotly's wheel brings."""
-    spec = find_spec("plotly")
-    if spec is None or spec.origin is None:
-        raise RunError("the Python module plotly is not installed: pip install 'tod-runner[report]'")
-    return (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
 def _in_script(code: str) -> str:
@@ -90,11 +73,13 @@ def _json(document: Any) -> str:
 def _body(
     drives: Sequence[Statistics],
     checks: Mapping[str, Sequence[Check]],
-    figures: Sequence[str],
+    figures: Sequence[Figure],
     left_out: Sequence[str],
 ) -> Iterable[str]:
     several = len(drives) > 1
     yield from (_about(drive, several=several) for drive in drives)
+    if notes := _notes(drives, left_out):
+        yield f"<section>{notes}</section>"
     if several:
         yield _section("Drives beside each other", _table("One row for each drive", drive_rows(drives)))
     for drive in drives:
@@ -104,14 +89,40 @@ def _body(
             heading = f"What the paper reports and what came out{_of(drive, several)}"
             yield _section(heading, _table("Claims", (("claim", "came out", "holds"), rows)))
     yield f'<div class="figures{"" if several else " single"}">'
-    yield from (_figure(name, drives) for name in HEADINGS if name in figures)
+    yield from (_figure(figure) for figure in _shown(figures))
     yield "</div>"
-    if left_out:
-        yield "".join(f'<p class="muted">{escape(each)}</p>' for each in left_out)
-    meaning = f'<p class="muted">{escape(MEANING)}</p>'
     for drive in drives:
-        yield _section(f"Cameras{_of(drive, several)}", _table("Statistics by camera", camera_rows(drive)) + meaning)
-        yield _reasons(drive, _of(drive, several))
+        yield _section(f"Cameras{_of(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
+    yield f'<p class="muted">{escape(MEANING)}</p>'
+    yield from (_reasons(drive, _of(drive, several)) for drive in drives)
+    versions = _once((each, f"{side}{_of(drive, several)}") for drive in drives for side, each in _versions(drive))
+    yield _section("Versions", _list((", ".join(labels), each) for each, labels in versions.items()))
+
+
+def _shown(figures: Sequence[Figure]) -> list[Figure]:
+    """In the order of the page."""
+    return sorted(figures, key=lambda figure: ORDER.index(figure.name))
+
+
+def _notes(drives: Sequence[Statistics], left_out: Sequence[str]) -> str:
+    """What to know of the drives, each note once."""
+    noted = _once((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
+    told = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
+    items = "".join(f"<li>{escape(each)}</li>" for each in (*told, *left_out))
+    return f'<ul class="warnings" aria-label="What to know">{items}</ul>' if items else ""
+
+
+def _once(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Each text once, with the labels of what it is said of."""
+    found: dict[str, list[str]] = {}
+    for text, label in said:
+        found.setdefault(text, []).append(label)
+    return found
+
+
+def _list(facts: Iterable[tuple[str, str]]) -> str:
+    listed = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in facts)
+    return f"<dl>{listed}</dl>"
 
 
 def _of(drive: Statistics, several: bool) -> str:
@@ -155,11 +166,7 @@ def _about(drive: Statistics, *, several: bool) -> str:
     ]
     if series.link:
         facts.append(("dropped on the link", f"{series.link.dropped[-1]:.0f} packets"))
-    facts += [(heading, ", ".join(f"{k} {v}" for k, v in each.items())) for heading, each in _versions(series)]
-    listed = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts)
-    told = "".join(f"<li>{escape(each)}</li>" for each in (*series.warnings, *drive.notes))
-    notes = f'<ul class="warnings" aria-label="What to know">{told}</ul>' if told else ""
-    return _section(series.label if several else "Drive", f"<dl>{listed}</dl>{notes}")
+    return _section(series.label if several else "Drive", _list(facts))
 
 
 def _rules(series: Series) -> str:
@@ -169,43 +176,21 @@ def _rules(series: Series) -> str:
     return "; ".join(f"{mode}: {', '.join(known[mode])}" for mode in used if mode in known) or "-"
 
 
-def _versions(series: Series) -> list[tuple[str, Mapping[str, str]]]:
-    """By heading, for each side, or once where all are the same."""
-    sides = [(side, each) for side, each in series.versions.items() if each]
-    if sides and all(each == sides[0][1] for _, each in sides):
-        return [("versions", sides[0][1])]
-    return [(f"versions, {side}", each) for side, each in sides]
+def _versions(drive: Statistics) -> Iterable[tuple[str, str]]:
+    """By side, what it ran."""
+    for side, versions in drive.series.versions.items():
+        yield side, ", ".join(f"{name} {version}" for name, version in versions.items()) or "-"
 
 
-def _figure(name: str, drives: Sequence[Statistics]) -> str:
-    links = " ".join(f'<a href="{name}.{form}" download>{form.upper()}</a>' for form in ("png", "pdf"))
+def _figure(figure: Figure) -> str:
+    links = " ".join(f'<a href="{figure.name}.{form}" download>{form.upper()}</a>' for form in ("png", "pdf"))
     charts = "".join(
-        f'<figure><figcaption>{escape(caption)}</figcaption><div class="chart {name}" data-figure="{name}" '
-        f'data-drive="{index}" data-part="{part}"></div></figure>'
-        for index, part, caption in _charts(name, drives)
+        f'<figure><figcaption>{escape(chart.title)}</figcaption><div class="chart {figure.name}" '
+        f'data-figure="{figure.name}" data-drive="{chart.drive or 0}" data-part="{chart.part}"></div></figure>'
+        for chart in chain.from_iterable(figure.rows)
     )
-    heading = f'<div class="head"><h2>{HEADINGS[name]}</h2><span class="files">{links}</span></div>'
-    return f'<section class="figure" id="{name}">{heading}<div class="charts">{charts}</div></section>'
-
-
-def _charts(name: str, drives: Sequence[Statistics]) -> Iterable[tuple[int, int, str]]:
-    """Drive, part and caption of each chart of a figure."""
-    several = len(drives) > 1
-    for index, drive in enumerate(drives):
-        label = drive.series.label if several else ""
-        if (name == "latency" and not has_latency(drive)) or (name == "quality" and not has_quality(drive)):
-            continue
-        if name in ("bitrates", "scaling", "quality"):
-            for part, panel in enumerate(drive.series.panels):
-                yield index, part, ": ".join(filter(None, (label, panel.title)))
-        elif name == "latency":
-            yield index, 0, ": ".join(filter(None, (label, "each second, all cameras")))
-            if not several:
-                yield index, 1, "distribution"
-        elif name != "bitrate_on_track" or drive.series.positions:
-            yield index, 0, label
-    if name == "latency" and several:
-        yield 0, 1, "distribution, all cameras"
+    heading = f'<div class="head"><h2>{figure.heading}</h2><span class="files">{links}</span></div>'
+    return f'<section class="figure" id="{figure.name}">{heading}<div class="charts">{charts}</div></section>'
 
 
 def _reasons(drive: Statistics, of: str) -> str:
@@ -223,100 +208,46 @@ def _reasons(drive: Statistics, of: str) -> str:
 # --- data of the charts -----------------------------------------------------------------------------------------------
 
 
-def _data(drives: Sequence[Statistics]) -> dict[str, Any]:
-    metrics = sorted({camera.quality.metric for d in drives for camera in d.cameras.values() if camera.quality})
+def _data(figures: Sequence[Figure]) -> dict[str, Any]:
+    charts = [_chart(chart) for figure in _shown(figures) for chart in chain.from_iterable(figure.rows)]
+    return {"day": DAY, "night": NIGHT, "charts": charts}
+
+
+def _chart(chart: Chart) -> dict[str, Any]:
     return {
-        "day": DAY,
-        "night": NIGHT,
-        "end": max(drive.series.end for drive in drives),
-        "metric": METRICS.get(metrics[0], metrics[0]) if metrics else "",
-        "drives": [_drive(drive, metrics[0] if metrics else "") for drive in drives],
+        "x": chart.x._asdict(),
+        "y": chart.y._asdict(),
+        "drive": chart.drive,
+        "unit_s": chart.unit_s,
+        "hover": chart.hover,
+        "curves": [_curve(curve) for curve in chart.curves],
+        "strip": chart.strip and {"bars": [bars._asdict() for bars in chart.strip.bars], "none": chart.strip.none},
+        "track": chart.track and _track(chart.track),
     }
 
 
-def _drive(drive: Statistics, metric: str) -> dict[str, Any]:
-    series = drive.series
-    seconds = per_second(series)
-    frozen = [(camera.name, f) for camera in drive.cameras.values() for f in camera.freezes or ()]
-    return {
-        "label": series.label,
-        "measured": series.measured,
-        "panels": [list(panel.cameras) for panel in series.panels],
-        "cameras": {name: _camera(camera, drive, metric) for name, camera in series.cameras.items()},
-        "predicted": _steps(series.predicted, series.end),
-        "allocated": _steps(series.allocated, series.end),
-        "actual": _points(series.actual),
-        "link": _steps(Line(series.link.t, series.link.kbps), series.end) if series.link else None,
-        "latency": {
-            "of": "arrival" if to_arrival(series) else "decode",
-            "t": _rounded(seconds.t, 1),
-            "median": _rounded(seconds.median, 1),
-            "p95": _rounded(seconds.p95, 1),
-            "all": _quantiles(latencies(series)[1]),
-            "watched": drive.freezes is not None,
-            "freezes": [{"camera": name, "t": number(f.t, 3), "s": number(f.seconds, 3)} for name, f in frozen],
-        },
-        "shares": _rounded(QUANTILES, 4),
-        "track": _track(series),
-    }
+def _curve(curve: Curve) -> dict[str, Any]:
+    """Thinned; steps where they change, and at their end."""
+    keys = ("label", "colour", "dash", "width", "steps", "filled")
+    x, y = curve.x, curve.y
+    kept = np.zeros(x.shape, dtype=bool)
+    kept[:: 1 + len(x) // MOST_POINTS] = True
+    if curve.steps and x.size:
+        changed = np.append(True, ~np.isclose(y[1:], y[:-1], equal_nan=True))
+        kept = changed | (kept if curve.why else False)
+        kept[-1] = True
+    around = curve.around and [_rounded(side[kept]) for side in curve.around]
+    why = [curve.why[at] for at in np.flatnonzero(kept)] if curve.why else None
+    points = {"x": _rounded(x[kept]), "y": _rounded(y[kept]), "around": around, "why": why}
+    return {key: getattr(curve, key) for key in keys} | points
 
 
-def _camera(camera: CameraSeries, drive: Statistics, metric: str) -> dict[str, Any]:
-    quality = drive.cameras[camera.name].quality
-    return {
-        "actual": _points(camera.actual),
-        "allocated": _steps(Line(camera.decided.t, camera.decided.kbps), drive.series.end),
-        "factor": _factor(camera, drive.series.end),
-        "latency": _quantiles(latencies(drive.series, camera.name)[1]),
-        "quality": _points(quality.line, 4) if quality and quality.metric == metric else None,
-    }
+def _track(track: Track) -> dict[str, Any]:
+    each, every = 1 + len(track.t) // MOST_POINTS, 1 + len(track.way[0]) // MOST_POINTS
+    columns = {key: _rounded(getattr(track, key)[::each]) for key in ("t", "east", "north", "kbps")}
+    way = [_rounded(side[::every]) for side in track.way]
+    return columns | {"way": way, "low": track.low, "high": track.high, "title": track.title, "arrows": track.arrows}
 
 
-def _factor(camera: CameraSeries, end: float) -> dict[str, Any]:
-    """Steps with the reason in force; changes of the factor are kept however many there are."""
-    decided = camera.decided
-    values = np.where(decided.sending, decided.scaling, np.nan)
-    before = np.concatenate([[-1.0], values[:-1]])
-    kept = ~((values == before) | (np.isnan(values) & np.isnan(before)))
-    kept[:: _stride(len(values))] = True
-    at = np.flatnonzero(kept)
-    t, reason = np.append(decided.t[at], end), [decided.reason[i] for i in [*at, at[-1]]] if at.size else []
-    y = np.append(values[at], values[at[-1]]) if at.size else values
-    return {"t": _rounded(t if at.size else decided.t, 2), "y": _rounded(y, 4), "why": reason}
-
-
-def _track(series: Series) -> dict[str, Any] | None:
-    if series.positions is None:
-        return None
-    t, east, north, kbps = on_track(series)
-    places = series.positions
-    each, every = _stride(len(t)), _stride(len(places.t))
-    way = {"x": _rounded(places.east[::every], 1), "y": _rounded(places.north[::every], 1)}
-    columns = {"t": (t, 2), "x": (east, 1), "y": (north, 1), "kbps": (kbps, 0)}
-    return {key: _rounded(values[::each], digits) for key, (values, digits) in columns.items()} | {"way": way}
-
-
-def _quantiles(values: Values) -> list[float | None]:
-    return _rounded(np.quantile(values, QUANTILES), 1) if values.size else []
-
-
-def _points(line: Line, digits: int = 1) -> dict[str, Any]:
-    each = _stride(len(line.t))
-    return {"t": _rounded(line.t[::each], 2), "y": _rounded(line.y[::each], digits)}
-
-
-def _steps(line: Line, end: float) -> dict[str, Any]:
-    """Where a quantity whose values hold until the next changes, and its end."""
-    if not line.t.size:
-        return {"t": [], "y": []}
-    kept = np.append(True, ~np.isclose(line.y[1:], line.y[:-1], equal_nan=True))
-    t, y = np.append(line.t[kept], max(end, line.t[-1])), np.append(line.y[kept], line.y[-1])
-    return {"t": _rounded(t, 2), "y": _rounded(y, 1)}
-
-
-def _stride(count: int) -> int:
-    return 1 + count // MOST_POINTS
-
-
-def _rounded(values: Values, digits: int) -> list[float | None]:
-    return [number(value, digits) for value in values.tolist()]
+def _rounded(values: Values) -> list[float | None]:
+    return [number(float(f"{value:.6g}"), 6) for value in values.tolist()]

@@ -5,33 +5,55 @@ from __future__ import annotations
 import json
 import os
 import platform
+import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from runner.errors import UserError
-from runner.events import Event, describe, to_json
-from runner.step import Run
+from runner.core.events import Event, describe, to_json
+from runner.core.step import Run
+from runner.errors import RunError, UserError
+from runner.records import (
+    Began,
+    DecisionMade,
+    Ended,
+    Json,
+    LinesDropped,
+    LinkSample,
+    Note,
+    Record,
+    Telemetry,
+    VideoBegan,
+    line_to_json,
+)
+from runner.redact import redacted
 
 FORMAT = 1
 WITHOUT_LOG = "the drive goes on without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
+QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
+# Records of numbers and of the rules' own words; looking through a decision takes twenty times as long as making it.
+WITHOUT_ADDRESSES = (DecisionMade, LinkSample, Telemetry)
+RETRY_S = 1.0  # time between attempts to write to a disk that is full
+CLOSE_S = 5.0  # a disk that takes nothing for so long keeps no process from ending
 
 
 class Log:
-    """One side's file in the directory of a drive. May be used from any thread.
+    """One side's file in the directory of a drive. May be used from any thread; a slow disk holds up none of them.
 
     directory  None: nothing is kept
-    config     the composed configuration
+    config     the composed configuration; passwords in addresses are not kept
     versions   of what the drive is made with, by name
-    report     told once, if the file cannot be written any further: the drive goes on without its log
+    report     called, from a thread of the log, when the file cannot be written, and when it can again
     raises     UserError where the directory holds a drive already, or cannot be written
 
-    Every line is one write to the system, so that a killed process loses at most the last one.
-    What comes before `begin` is kept until then.
+    Lines wait in a bounded queue for a thread that writes each with one system call, so that a killed process loses at
+    most what was queued. Lines that find the queue full are dropped, and a line of kind "dropped" counts them.
+    Lines written before `begin` are kept until then.
     """
 
     def __init__(
@@ -42,14 +64,14 @@ class Log:
         versions: Mapping[str, str],
         report: Callable[[str], None],
     ) -> None:
-        self._path = None if directory is None else directory / FILES[side]
-        self._fd = -1 if directory is None else _create(directory, side)
+        self._file = None if directory is None else _File(directory / FILES[side], _create(directory, side))
         self._side, self._config, self._versions, self._report = side, config, versions, report
         self._lock = threading.Lock()
         self._began: float | None = None
         self._past: float | None = None  # of a drive of the past, the time of its last line
         self.time = 0.0  # of the beginning, s since 1970
-        self._early: list[Mapping[str, Any]] = []
+        self._early: list[Json] = []
+        self._writer: _Writer | None = None
 
     def begin(self, at: float | None = None) -> None:
         """Time 0 of the drive.
@@ -57,19 +79,14 @@ class Log:
         at  s since 1970, of a drive of the past whose lines bring their times; None: now
         """
         self.time = time.time() if at is None else at
-        first = {
-            "t": 0.0,
-            "log": "began",
-            "side": self._side,
-            "format": FORMAT,
-            "time": self.time,
-            "versions": {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions},
-            "config": self._config,
-        }
+        versions = {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions}
+        first = Began(0.0, self._side, FORMAT, self.time, versions, redacted(self._config))
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
-            failed = [self._append(line) for line in (first, *self._early)]
-        self._tell_failed(*failed)
+            if self._file and at is None:
+                self._writer = _Writer(self._file, self._dropped, self._report)
+            for line in (line_to_json(first), *self._early):
+                self._put(line)
 
     def now(self) -> float:
         """Time since the beginning, s."""
@@ -77,64 +94,149 @@ class Log:
             return self._past or 0.0
         return round(time.monotonic() - self._began, 6)
 
-    def write(self, line: Mapping[str, Any]) -> None:
-        """One line: an event, or what a key `log` names."""
+    def event(self, event: Event) -> None:
+        """One line: an event.
+
+        raises  RunError where a drive of the past cannot be written
+        """
+        self._write(to_json(event))
+
+    def record(self, record: Record) -> None:
+        """One line: a record; raises as `event`."""
+        line = line_to_json(record)
+        self._write(line if isinstance(record, WITHOUT_ADDRESSES) else redacted(line))
+
+    def note(self, text: str) -> None:
+        """One line: what a person should know, now."""
+        self.record(Note(self.now(), text))
+
+    def _write(self, line: Json) -> None:
         with self._lock:
             if self._began is None:
                 self._early.append(line)
                 return
             if self._past is not None:
                 self._past = line["t"]
-            failed = self._append(line)
-        self._tell_failed(failed)
-
-    def tell(self, kind: str, **keys: Any) -> None:
-        """One line of a kind, at this moment."""
-        self.write({"t": self.now(), "log": kind, **keys})
+            self._put(line)
 
     def video(self, camera: str, file: str, captured: float) -> None:
         """A video file has its first frame, captured then (s since 1970)."""
-        self.tell("video", camera=camera, file=file, captured=captured)
+        self.record(VideoBegan(self.now(), camera, file, captured))
 
     def close(self) -> None:
         """The clean end; a drive that never began leaves nothing."""
+        ended = line_to_json(Ended(self.now()))
         with self._lock:
-            if self._began is not None:
-                self._append({"t": self.now(), "log": "ended"})
-            self._end(keep=self._began is not None)
+            if self._past is not None:
+                self._put(ended)
+            writer, self._writer = self._writer, None
+            file, self._file = self._file, None
+        if writer:
+            writer.close(_encoded(ended))
+        elif file:
+            file.close(keep=self._began is not None)
 
     def discard(self) -> None:
-        """Give up a log that did not come to its end."""
+        """Give up the log of a drive of the past that did not come to its end."""
         with self._lock:
-            self._end(keep=False)
+            if self._file:
+                self._file.close(keep=False)
+            self._file = None
 
-    def _end(self, keep: bool) -> None:
-        if self._fd < 0:
-            return
-        os.close(self._fd)
-        self._fd = -1
-        if self._path and not keep:
-            self._path.unlink(missing_ok=True)
+    def _put(self, line: Mapping[str, Any]) -> None:
+        if self._writer:
+            self._writer.put(_encoded(line))
+        elif self._file and (why := self._file.append(_encoded(line))):
+            raise RunError(f"{self._file.path}: cannot be written: {why}")
 
-    def _append(self, line: Mapping[str, Any]) -> str:
-        """Write a line; returns why there will be no more, or ""."""
-        if self._fd < 0:
-            return ""
-        # Half of a surrogate pair, as a request or a file's name may hold, is written as JSON has it.
-        data = (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
+    def _dropped(self, lines: int) -> bytes:
+        return _encoded(line_to_json(LinesDropped(self.now(), lines)))
+
+
+def _encoded(line: Mapping[str, Any]) -> bytes:
+    # Half of a surrogate pair, as a request or a file's name may hold, is written as JSON has it.
+    return (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
+
+
+class _File:
+    """A file that holds whole lines only: a line that did not fit is taken back."""
+
+    def __init__(self, path: Path, fd: int) -> None:
+        self.path, self._fd = path, fd
+        self._size = 0
+
+    def append(self, data: bytes) -> str:
+        """Write a line; returns why it was not written, or ""."""
         try:
             if os.write(self._fd, data) == len(data):
+                self._size += len(data)
                 return ""
             why = "no space left on device"
         except OSError as error:
             why = (error.strerror or str(error)).lower()
-        self._end(keep=True)
-        return f"{WITHOUT_LOG}: {FILES[self._side]}: {why}"
+        with suppress(OSError):
+            os.ftruncate(self._fd, self._size)
+        return why
 
-    def _tell_failed(self, *failed: str) -> None:
-        """Outside the lock: who is told may write a line of its own."""
-        for why in filter(None, failed):
-            self._report(why)
+    def close(self, keep: bool) -> None:
+        os.close(self._fd)
+        if not keep:
+            self.path.unlink(missing_ok=True)
+
+
+class _Writer:
+    """Writes lines in a thread of its own, so that no disk holds up the thread that has something to log.
+
+    dropped  makes the line that counts lines which found the queue full
+    report   called when the file cannot be written, and when it can again
+    """
+
+    def __init__(self, file: _File, dropped: Callable[[int], bytes], report: Callable[[str], None]) -> None:
+        self._file, self._dropped, self._report = file, dropped, report
+        self._queue: queue.Queue[bytes | None] = queue.Queue(QUEUED_LINES)
+        self._lost = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._thread.start()
+
+    def put(self, data: bytes) -> None:
+        """Queue a line; to be called by one thread at a time."""
+        if self._lost and self._queue.maxsize - self._queue.qsize() > 1:
+            lost, self._lost = self._lost, 0
+            self._queue.put_nowait(self._dropped(lost))
+        try:
+            self._queue.put_nowait(data)
+        except queue.Full:
+            self._lost += 1
+
+    def close(self, last: bytes) -> None:
+        """Write what is queued and a last line, within a limit."""
+        until = time.monotonic() + CLOSE_S
+        self._closing.set()
+        with suppress(queue.Full):
+            for data in (self._dropped(self._lost) if self._lost else b"", last, None):
+                self._queue.put(data, timeout=max(0.0, until - time.monotonic()))
+        self._thread.join(max(0.0, until - time.monotonic()))
+        if waiting := sum(bool(data) for data in self._queue.queue):
+            self._report(f"{self._file.path.name}: {waiting} lines were not written")
+
+    def _run(self) -> None:
+        while (data := self._queue.get()) is not None:
+            if not self._written(data):
+                break
+        self._file.close(keep=True)
+
+    def _written(self, data: bytes) -> bool:
+        """Write a line, however often that takes; False where the log is closed before it is written."""
+        why = self._file.append(data)
+        if not why:
+            return True
+        self._report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
+        while self._file.append(data):
+            if self._closing.wait(RETRY_S):
+                return False
+        self._report(f"the log is written again: {self._file.path.name}")
+        return True
 
 
 def check_free(directory: Path, side: str) -> None:
@@ -163,10 +265,8 @@ def _refused(directory: Path, rule: str) -> UserError:
     return UserError("command line", "log", repr(str(directory)), rule)
 
 
-def run_lines(event: Event, before: Run, after: Run) -> Iterable[dict[str, Any]]:
-    """What a drive log says of one event: the event, and what was decided where that changed."""
-    yield to_json(event)
+def log_run(log: Log, event: Event, before: Run, after: Run) -> None:
+    """Log an event, and what was decided where that changed."""
+    log.event(event)
     if after.commands or after.decision != before.decision:
-        commands = [command.to_json() for command in after.commands]
-        decision = after.decision.to_json()
-        yield {"t": after.state.t, "log": "decision", "cause": describe(event), **decision, "commands": commands}
+        log.record(DecisionMade.of(after.state.t, describe(event), after.decision, after.commands))

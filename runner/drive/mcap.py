@@ -6,16 +6,21 @@ import heapq
 import json
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
-from runner.drive.read import Drive, Line, Side
+from msgspec import UNSET
+
+from runner.core.events import NAMES, Event, PositionReported
+from runner.core.events import to_json as event_to_json
+from runner.drive.read import Drive, Side
 from runner.errors import RunError
-from runner.schema import schema_document
+from runner.records import KINDS, Json, Note, Position, Record, Sample, VideoBegan, line_to_json
+from runner.schema import referred
 
 if TYPE_CHECKING:
-    from runner.gst.video_reader import Unit
+    from runner.apply import Unit
 
 SECOND_NS = 1_000_000_000
 # A frame of the file and one of the log that are further apart are not the same; less than most cameras' gap.
@@ -69,7 +74,7 @@ def write_mcap(
     with foxglove.open_mcap(out, context=context, writer_options=options) as writer:
         channels = _Channels(context, _cameras(drive))
         for name, side in drive.sides.items():
-            writer.write_metadata(f"{name} began", _texts(side.began))
+            writer.write_metadata(f"{name} began", _texts(line_to_json(side.began)))
         first, last = _span(drive)
         for message in heapq.merge(*_streams(drive, channels, read_video, warn), key=lambda m: m.ns):
             message.write()
@@ -119,28 +124,28 @@ class _Channels:
         self._context, self._cameras = context, list(cameras)
         self._made: dict[str, Any] = {}
 
-    def tell(self, topic: str, schema: str, definition: str, line: Line, ns: int) -> None:
+    def tell(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
         """A line of JSON, with the definition that it keeps to."""
         if topic not in self._made:
             self._made[topic] = self._json_channel(topic, schema, definition)
         self._made[topic].log(json.dumps(line, ensure_ascii=False).encode(), log_time=ns)
 
-    def fix(self, position: Mapping[str, Any], ns: int) -> None:
+    def fix(self, position: Position, ns: int) -> None:
         from foxglove.channels import LocationFixChannel
         from foxglove.messages import LocationFix, Vector3
 
         velocity, angle = None, None
-        if "heading_deg" in position:
-            angle = math.radians(position["heading_deg"])
-            speed = position.get("speed_mps", 0.0)
-            velocity = Vector3(x=speed * math.sin(angle), y=speed * math.cos(angle), z=0.0)
+        speed = None if position.speed_mps is UNSET else position.speed_mps
+        if position.heading_deg is not UNSET:
+            angle = math.radians(position.heading_deg)
+            velocity = Vector3(x=(speed or 0.0) * math.sin(angle), y=(speed or 0.0) * math.cos(angle), z=0.0)
         fix = LocationFix(
             timestamp=_timestamp(ns),
             frame_id="gps",
-            latitude=position["lat"],
-            longitude=position["lon"],
+            latitude=position.lat,
+            longitude=position.lon,
             heading=angle,
-            velocity=velocity if "speed_mps" in position else None,
+            velocity=None if speed is None else velocity,
         )
         self._typed("/position", LocationFixChannel).log(fix, log_time=ns)
 
@@ -166,21 +171,23 @@ class _Channels:
     def _json_channel(self, topic: str, schema: str, definition: str) -> Any:
         import foxglove
 
-        document = schema_document(schema)
-        text = json.dumps(standalone(document["$defs"][definition], document["$defs"], self._cameras))
+        text = json.dumps(standalone({"$ref": f"#/$defs/{definition}"}, schema, self._cameras))
         known = foxglove.Schema(name=f"tod_runner.{definition}", encoding="jsonschema", data=text.encode())
         return foxglove.Channel(topic, schema=known, message_encoding="json", context=self._context)
 
 
-def standalone(schema: Any, definitions: Mapping[str, Any], cameras: Iterable[str]) -> Any:
-    """A schema without references, and with the cameras by name: Foxglove then offers each number for plots."""
+def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
+    """A schema without references, and with the cameras by name: Foxglove then offers each number for plots.
+
+    home  name of the schema that it is a part of
+    """
     if isinstance(schema, list):
-        return [standalone(part, definitions, cameras) for part in schema]
+        return [standalone(part, home, cameras) for part in schema]
     if not isinstance(schema, dict):
         return schema
     if "$ref" in schema:
-        return standalone(definitions[schema["$ref"].removeprefix("#/$defs/")], definitions, cameras)
-    whole = {key: standalone(part, definitions, cameras) for key, part in schema.items()}
+        return standalone(*referred(schema["$ref"], home), cameras)
+    whole = {key: standalone(part, home, cameras) for key, part in schema.items()}
     by_camera = whole.get("properties", {}).get("cameras")
     if by_camera and isinstance(by_camera.get("additionalProperties"), dict):
         each = by_camera["additionalProperties"]
@@ -201,35 +208,37 @@ def _streams(
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[Message]:
-    began = round(side.began["time"] * SECOND_NS)
+    began = round(side.began.time * SECOND_NS)
     for line in side.lines:
-        ns = began + round(line["t"] * SECOND_NS)
+        ns = began + round(line.t * SECOND_NS)
         for write in _writers(name, line, channels, positions, ns):
             yield Message(ns, write)
 
 
-def _writers(name: str, line: Line, channels: _Channels, positions: bool, ns: int) -> Iterator[Callable[[], None]]:
+def _writers(
+    name: str, line: Event | Record, channels: _Channels, positions: bool, ns: int
+) -> Iterator[Callable[[], None]]:
     """What becomes of one line."""
-    if "event" in line:
-        event = line["event"]
-        yield lambda: channels.tell(f"/events/{event}", "event", event, line, ns)
-        if event == "position_reported":
-            yield lambda: channels.fix(line, ns)
+    if isinstance(line, Event):
+        event = NAMES[type(line)]
+        yield lambda: channels.tell(f"/events/{event}", "event", event, event_to_json(line), ns)
+        if isinstance(line, PositionReported):
+            yield lambda: channels.fix(Position.of(line), ns)
         return
-    kind = line["log"]
-    if kind == "note":
-        yield lambda: channels.note(name, line["text"], ns)
+    kind = KINDS[type(line)]
+    if isinstance(line, Note):
+        yield lambda: channels.note(name, line.text, ns)
     elif kind in TOPICS:
-        yield lambda: channels.tell(TOPICS[kind], "drive", kind, line, ns)
-    if kind == "sample" and positions and line["position"] is not None:
-        yield lambda: channels.fix(line["position"], ns)
+        yield lambda: channels.tell(TOPICS[kind], "drive", kind, line_to_json(line), ns)
+    if isinstance(line, Sample) and positions and (position := line.position):
+        yield lambda: channels.fix(position, ns)
 
 
-def _files(side: Side) -> dict[str, list[Line]]:
-    """By camera, the lines that tell of its video files, by the time of their first frames."""
-    files: dict[str, list[Line]] = {}
-    for line in sorted((line for line in side.lines if line.get("log") == "video"), key=lambda line: line["captured"]):
-        files.setdefault(line["camera"], []).append(line)
+def _files(side: Side) -> dict[str, list[VideoBegan]]:
+    """By camera, its video files, by the time of their first frames."""
+    files: dict[str, list[VideoBegan]] = {}
+    for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
+        files.setdefault(line.camera, []).append(line)
     return files
 
 
@@ -237,7 +246,7 @@ def _pictures(
     directory: Path,
     topic: str,
     camera: str,
-    files: list[Line],
+    files: list[VideoBegan],
     known: Sequence[int],
     channels: _Channels,
     read_video: ReadVideo,
@@ -250,13 +259,13 @@ def _pictures(
     topic = topic.format(camera=camera)
     last = -1
     for line in files:
-        first = round(line["captured"] * SECOND_NS)
-        if Path(line["file"]).is_absolute() or ".." in Path(line["file"]).parts:
-            warn(f"{line['file']}: lies outside the drive and was left out")
+        first = round(line.captured * SECOND_NS)
+        if Path(line.file).is_absolute() or ".." in Path(line.file).parts:
+            warn(f"{line.file}: lies outside the drive and was left out")
             continue
         try:
             offset = 0
-            for unit in read_video(directory / line["file"]):
+            for unit in read_video(directory / line.file):
                 offset = follow(known, first + unit.after_ns, offset)
                 # A pipeline that was built anew begins after the one before has ended, but clocks may be set.
                 last = max(first + unit.after_ns + offset, last + 1)
@@ -267,9 +276,9 @@ def _pictures(
 
 def _captures(side: Side, camera: str) -> list[int]:
     """When the frames that came of a camera were captured, ns since 1970, rising; nothing where the log has no word."""
-    samples = (line["cameras"].get(camera, {}) for line in side.lines if line.get("log") == "sample")
-    arrivals = (arrival for sample in samples for arrival in sample.get("arrivals", ()))
-    began = side.began["time"]
+    samples = (sample.cameras[camera] for sample in side.of(Sample) if camera in sample.cameras)
+    arrivals = (arrival for sample in samples for arrival in sample.arrivals)
+    began = side.began.time
     return sorted(
         round((began + t - latency_ms / 1000) * SECOND_NS) for t, latency_ms in arrivals if latency_ms is not None
     )
@@ -292,18 +301,18 @@ def follow(known: Sequence[int], ns: int, offset: int) -> int:
 
 
 def _cameras(drive: Drive) -> list[str]:
-    named = (camera for side in drive.sides.values() for camera in side.began["config"].get("cameras", {}))
+    named = (camera for side in drive.sides.values() for camera in side.began.config.get("cameras", {}))
     return list(dict.fromkeys(named))
 
 
 def _span(drive: Drive) -> tuple[int, int]:
     """From when to when the drive was, ns since 1970."""
-    began = [side.began["time"] for side in drive.sides.values()]
-    ended = [side.began["time"] + line["t"] for side in drive.sides.values() for line in side.lines[-1:]]
+    began = [side.began.time for side in drive.sides.values()]
+    ended = [side.began.time + line.t for side in drive.sides.values() for line in side.lines[-1:]]
     return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)
 
 
-def _texts(began: Line) -> dict[str, str]:
+def _texts(began: Json) -> dict[str, str]:
     """Metadata holds texts only."""
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in began.items()}
 

@@ -6,28 +6,40 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
 from runner.errors import UserError
+from runner.records import Began, Ended, Json, LinesDropped, Record, from_json, line_from_json
 from runner.schema import event_problem, log_problem, read_json
 
-Line = dict[str, Any]
-PASSED_OVER = ("decision", "telemetry", "note", "video", "ended")  # where the vehicle's events alone are wanted
+T = TypeVar("T")
+PASSED_OVER = (
+    "decision",
+    "telemetry",
+    "note",
+    "video",
+    "dropped",
+    "ended",
+)  # where the vehicle's events alone are wanted
 
 
 @dataclass(frozen=True)
 class Side:
     """What one side wrote.
 
-    began  its first line: time (s since 1970), versions, config
-    lines  all others but the end, in their order
+    lines  events and records between its first line and the end, in their order
     ended  whether it came to a clean end
     """
 
-    began: Line
-    lines: list[Line]
+    began: Began
+    lines: list[Event | Record]
     ended: bool
+
+    def of(self, kind: type[T]) -> Iterator[T]:
+        """Its lines of a kind."""
+        return (line for line in self.lines if isinstance(line, kind))
 
 
 @dataclass(frozen=True)
@@ -71,15 +83,19 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
     except OSError as error:
         raise UserError(str(path), "", None, (error.strerror or str(error)).lower()) from None
     began = check_began(lines[0] if lines else None, str(path))
-    if began["side"] != side:
-        raise UserError(f"{path}: line 1", "side", repr(began["side"]), f"must be {side}")
-    ended = lines[-1].get("log") == "ended"
+    if began.side != side:
+        raise UserError(f"{path}: line 1", "side", repr(began.side), f"must be {side}")
+    records = [line_from_json(line) if is_log(line) else parse(line) for line in lines[1:]]
+    ended = bool(records) and isinstance(records[-1], Ended)
     if not ended:
         warnings.append(f"{path}: has no end; the process was killed, or still runs")
-    return Side(began, lines[1 : -1 if ended else None], ended)
+    found = Side(began, records[:-1] if ended else records, ended)
+    if dropped := sum(line.lines for line in found.of(LinesDropped)):
+        warnings.append(f"{path}: {dropped} lines were dropped, since the disk was too slow")
+    return found
 
 
-def check_began(line: Line | None, name: str) -> Line:
+def check_began(line: Json | None, name: str) -> Began:
     """The first line of a drive's file.
 
     raises  UserError where it is another
@@ -90,12 +106,12 @@ def check_began(line: Line | None, name: str) -> Line:
         raise UserError(f"{name}: line 1", "", None, "is no beginning of a drive: must be a file that log= wrote")
     if line["format"] != FORMAT:
         raise UserError(f"{name}: line 1", "format", str(line["format"]), f"this version reads format {FORMAT}")
-    return line
+    return from_json(Began, line)
 
 
 def read_lines(
     lines: Iterable[str], name: str, warnings: list[str], *, events: bool = False
-) -> Iterator[tuple[int, Line]]:
+) -> Iterator[tuple[int, Json]]:
     """The lines of a drive's file with their numbers, each checked against its schema.
 
     events  give events only, and the beginning; what else a side wrote is not looked at
@@ -120,12 +136,10 @@ def read_lines(
         yield number, line
 
 
-def read_line(text: str) -> tuple[Line, str]:
+def read_line(text: str) -> tuple[Json, str]:
     """The JSON of a line, and what is wrong with it as JSON and as an event, or ""."""
     try:
         line = read_json(text.rstrip())
-    except RecursionError:
-        return {}, "not JSON: nested too deeply"
     except json.JSONDecodeError as error:
         return {}, f"not JSON: {error.msg} (column {error.pos + 1})"
     except ValueError as error:

@@ -8,24 +8,39 @@ epoch time in their first lines, so that clocks that differ shift the sides agai
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.core.events import BitratePredicted, Event, PositionReported
 from runner.drive.read import Drive, Side
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
+from runner.records import (
+    CameraDecision,
+    CameraSample,
+    CameraTelemetry,
+    DecisionMade,
+    LinkSample,
+    Note,
+    Position,
+    Record,
+    Sample,
+    Telemetry,
+    VehicleState,
+)
+from runner.system.clocks import CLOCKS_APART_MS, TRUSTED_AGAIN_S
 
 Values = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
 DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
 PANEL_CAMERAS = 4  # as many curves are told apart in one panel; more are split where the mounting gives no groups
-CLOCKS_APART_MS = -1.0  # a latency below it tells of clocks that differ
 
 
 class Line(NamedTuple):
@@ -60,10 +75,11 @@ class Received:
     t                        s, of each sample
     kbps                     over the second before
     width, height            px of the picture, 0 before the first
-    latency_ms               capture to decode of the last sampled frame
+    latency_ms               capture to decode of the last sampled frame, nan where it is not known
     frames, bytes            counters at each sample
     lost, rebuilt            packets, counters at each sample
-    arrival_t, arrival_ms    when each access unit came, s, and its latency from capture to arrival
+    arrival_t, arrival_ms    when each access unit came, s, and its latency from capture to arrival, likewise
+    clocks_ms                time of arrival by the operator's clock less time of capture by the vehicle's
     """
 
     t: Values
@@ -77,6 +93,7 @@ class Received:
     rebuilt: Values
     arrival_t: Values
     arrival_ms: Values
+    clocks_ms: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,13 +204,9 @@ def series(drive: Drive, label: str = "") -> Series:
     """A drive's quantities over time.
 
     label   what it is called beside others, its name where that is enough
-    raises  UserError where nothing was logged but the beginning, nothing was decided yet, or lines are of another form
+    raises  UserError where nothing was logged but the beginning, or nothing was decided yet
     """
-    try:
-        return _series(drive, label or drive.name)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        rule = f"has lines of another form than this tod-runner writes ({type(error).__name__}: {error})"
-        raise UserError(str(drive.path), "", None, rule) from None
+    return _series(drive, label or drive.name)
 
 
 def held(line: Line, at: Values) -> Values:
@@ -232,33 +245,31 @@ def sending_spans(decided: Decided, end: float) -> list[tuple[float, float]]:
 
 
 class _Shifted(NamedTuple):
-    """The lines of a side with `t` on the drive's axis."""
+    """The lines of a side, to be read with `t` on the drive's axis."""
 
-    lines: Sequence[Mapping[str, Any]]
+    lines: Sequence[Event | Record]
     shift: float
 
-    def of(self, log: str) -> list[tuple[float, Mapping[str, Any]]]:
-        return [(line["t"] + self.shift, line) for line in self.lines if line.get("log") == log]
-
-    def events(self, name: str) -> list[tuple[float, Mapping[str, Any]]]:
-        return [(line["t"] + self.shift, line) for line in self.lines if line.get("event") == name]
+    def of(self, kind: type[T]) -> list[tuple[float, T]]:
+        return [(line.t + self.shift, line) for line in self.lines if isinstance(line, kind)]
 
 
 def _series(drive: Drive, label: str) -> Series:
     leading = drive.sides.get("vehicle") or drive.sides["operator"]
-    began, end = float(leading.began["time"]), max((float(line["t"]) for line in leading.lines), default=0.0)
+    began, end = leading.began.time, max((line.t for line in leading.lines), default=0.0)
     if end <= 0:
         raise UserError(str(drive.path), "", None, "has no length: nothing was logged but its beginning")
-    sides = {name: _Shifted(side.lines, float(side.began["time"]) - began) for name, side in drive.sides.items()}
+    sides = {name: _Shifted(side.lines, side.began.time - began) for name, side in drive.sides.items()}
     vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
-    decisions = vehicle.of("decision") or [at for at in operator.of("state") if at[1].get("online")]
+    decisions: Sequence[tuple[float, DecisionMade | VehicleState]]
+    decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
     if not decisions:
         raise UserError(str(drive.path), "", None, "has no decision yet: there is nothing to report")
-    config = leading.began.get("config") or {}
-    samples = [at for at in operator.of("sample") if 0 <= at[0] <= end]
-    telemetry = vehicle.of("telemetry")
-    names = list(config.get("cameras") or decisions[0][1]["cameras"])
-    cameras = {name: _camera(name, config, decisions, samples, telemetry) for name in names}
+    config = leading.began.config
+    samples = [at for at in operator.of(Sample) if 0 <= at[0] <= end]
+    telemetry = vehicle.of(Telemetry)
+    names = list(config.get("cameras") or decisions[0][1].cameras)
+    cameras = _with_known_latencies({name: _camera(name, config, decisions, samples, telemetry) for name in names})
     return Series(
         label=label,
         path=str(drive.path),
@@ -268,17 +279,17 @@ def _series(drive: Drive, label: str) -> Series:
         cameras=cameras,
         panels=panels(config.get("cameras") or {name: {} for name in names}),
         predicted=_predicted(vehicle, telemetry, samples),
-        allocated=_line((t, sum(camera["kbps"] for camera in line["cameras"].values())) for t, line in decisions),
+        allocated=_line((t, sum(camera.kbps for camera in line.cameras.values())) for t, line in decisions),
         actual=_total(samples, cameras),
         measured="received" if samples else "sent" if telemetry else "",
-        link=_link([at for at in link.of("link") if 0 <= at[0] <= end]),
+        link=_link([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
         positions=_positions(vehicle, samples),
         modes=tuple(_modes(decisions)),
         reasons=tuple(_reasons(decisions)),
-        notes=tuple(sorted((t, str(line["text"])) for side in sides.values() for t, line in side.of("note"))),
-        refused=int(max((line.get("refused", 0) for _, line in (telemetry or samples)), default=0)),
+        notes=tuple(sorted((t, note.text) for side in sides.values() for t, note in side.of(Note))),
+        refused=max((line.refused for _, line in (telemetry or samples)), default=0),
         warnings=(*drive.warnings, *_warnings(drive.sides, samples, cameras)),
-        versions={name: dict(side.began.get("versions") or {}) for name, side in drive.sides.items()},
+        versions={name: side.began.versions for name, side in drive.sides.items()},
         ended={name: side.ended for name, side in drive.sides.items()},
         config=config,
     )
@@ -288,10 +299,13 @@ def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mappin
     """What looks wrong about the clocks of the two sides."""
     if {"vehicle", "operator"} <= sides.keys() and not samples:
         yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
-    latencies = [c.received.arrival_ms for c in cameras.values() if c.received and c.received.arrival_ms.size]
-    lowest = min((float(np.nanmin(each)) for each in latencies if np.isfinite(each).any()), default=0.0)
-    if lowest < CLOCKS_APART_MS:
-        yield f"latencies go down to {lowest:.0f} ms: the clocks of both sides differ, latencies are off by as much"
+    received = [camera.received for camera in cameras.values() if camera.received]
+    lowest = min((float(np.nanmin(got.clocks_ms)) for got in received if np.isfinite(got.clocks_ms).any()), default=0.0)
+    told = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
+    ahead_ms = max(-lowest, told)
+    if ahead_ms > -CLOCKS_APART_MS:
+        rule = f"latencies are unknown up to {TRUSTED_AGAIN_S:g} s before and after"
+        yield f"the vehicle's clock was ahead of the operator's by at least {ahead_ms:.0f} ms: {rule}"
 
 
 def _line(points: Iterable[tuple[float, float | None]]) -> Line:
@@ -302,17 +316,17 @@ def _line(points: Iterable[tuple[float, float | None]]) -> Line:
 
 def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> Line:
     """Predictions as they came, or what the samples say was in force."""
-    events = vehicle.events("bitrate_predicted")
+    events = vehicle.of(BitratePredicted)
     if events:
-        return _line((t, line["kbps"]) for t, line in events)
-    return _line((t, line.get("predicted_kbps")) for t, line in (telemetry or samples))
+        return _line((t, float(event.kbps)) for t, event in events)
+    return _line((t, line.predicted_kbps) for t, line in (telemetry or samples))
 
 
 def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Line:
     """Measured total; unknown before the first second of video, whose rate is taken over a window yet to fill."""
     received = [camera.received for camera in cameras.values() if camera.received]
     if received:
-        t, y = _line((t, line["actual_kbps"]) for t, line in samples)
+        t, y = _line((t, sample.actual_kbps) for t, sample in samples)
         return Line(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
     return Line(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
@@ -321,7 +335,7 @@ def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Line:
 def _link(lines: Sequence[Any]) -> Link | None:
     if not lines:
         return None
-    rows = np.array([(t, line["kbps"], line["queue_ms"], line["dropped"]) for t, line in lines], dtype=float)
+    rows = np.array([(t, line.kbps, line.queue_ms, line.dropped) for t, line in lines], dtype=float)
     return Link(*rows.T)
 
 
@@ -330,11 +344,11 @@ def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
 
     Metres by equirectangular projection around the first place, right for some km.
     """
-    known = [(t, line) for t, line in vehicle.events("position_reported")]
-    known = known or [(t, line["position"]) for t, line in samples if line.get("position")]
+    known: list[tuple[float, PositionReported | Position]] = [*vehicle.of(PositionReported)]
+    known = known or [(t, sample.position) for t, sample in samples if sample.position]
     if not known:
         return None
-    t, lat, lon = np.array([(t, place["lat"], place["lon"]) for t, place in known], dtype=float).T
+    t, lat, lon = np.array([(t, place.lat, place.lon) for t, place in known], dtype=float).T
     around = np.remainder(lon - lon[0] + 180, 360) - 180  # also where the drive crosses the 180th meridian
     east = np.radians(around) * np.cos(np.radians(lat[0])) * EARTH_M
     return Positions(t, lat, lon, east, np.radians(lat - lat[0]) * EARTH_M)
@@ -343,20 +357,20 @@ def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
 def _modes(decisions: Sequence[Any]) -> Iterator[tuple[float, str]]:
     last = None
     for t, line in decisions:
-        if line["mode"] != last:
-            last = line["mode"]
+        if line.mode != last:
+            last = line.mode
             yield t, str(last)
 
 
 def _reasons(decisions: Sequence[Any]) -> Iterator[Reason]:
     """Each change of factor or sending, as the vehicle reports them while it drives."""
-    last: Mapping[str, Any] = {}
+    last: Mapping[str, CameraDecision] = {}
     for t, line in decisions:
-        for name, now in line["cameras"].items():
-            was = last.get(name, {})
-            if (was.get("scaling"), was.get("sending")) != (now["scaling"], now["sending"]):
-                yield Reason(t, str(line.get("cause", "")), name, str(now.get("reason", "")))
-        last = line["cameras"]
+        for name, now in line.cameras.items():
+            was = last.get(name)
+            if was is None or (was.scaling, was.sending) != (now.scaling, now.sending):
+                yield Reason(t, line.cause, name, now.reason)
+        last = line.cameras
 
 
 # --- cameras ----------------------------------------------------------------------------------------------------------
@@ -371,37 +385,36 @@ def _camera(
 ) -> CameraSeries:
     described = (config.get("cameras") or {}).get(name, {})
     full = described.get("width_px", 0) * described.get("height_px", 0)
-    decided = [(t, line["cameras"][name]) for t, line in decisions if name in line["cameras"]]
-    received = [(t, t - line["t"], line["cameras"][name]) for t, line in samples if name in line["cameras"]]
-    sent = [(t, line["cameras"][name]) for t, line in telemetry if name in line["cameras"]]
+    decided = [(t, line.cameras[name]) for t, line in decisions if name in line.cameras]
+    received = [(t, t - line.t, line.cameras[name]) for t, line in samples if name in line.cameras]
+    sent = [(t, line.cameras[name]) for t, line in telemetry if name in line.cameras]
     return CameraSeries(
         name, _decided(decided, full), _received(received) if received else None, _sent(sent) if sent else None
     )
 
 
-def _decided(decided: Sequence[tuple[float, Mapping[str, Any]]], full: int) -> Decided:
+def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> Decided:
     def column(key: str) -> Values:
-        return np.array([camera[key] for _, camera in decided], dtype=float)  # None becomes nan
+        return np.array([getattr(camera, key) for _, camera in decided], dtype=float)  # None becomes nan
 
-    regions = [camera.get("roi") for _, camera in decided]
-    shares = [roi["width"] * roi["height"] / full if roi and full else 1.0 for roi in regions]
+    shares = [camera.roi.pixels / full if full else 1.0 for _, camera in decided]
     return Decided(
         t=np.array([t for t, _ in decided], dtype=float),
-        sending=np.array([camera["sending"] for _, camera in decided], dtype=bool),
+        sending=np.array([camera.sending for _, camera in decided], dtype=bool),
         kbps=column("kbps"),
         scaling=column("scaling"),
         width=column("width"),
         height=column("height"),
         roi_share=np.array(shares, dtype=float),
-        reason=tuple(str(camera.get("reason", "")) for _, camera in decided),
+        reason=tuple(camera.reason for _, camera in decided),
     )
 
 
-def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Received:
+def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received:
     def column(key: str) -> Values:
-        return np.array([camera[key] for *_, camera in received], dtype=float)
+        return np.array([getattr(camera, key) for *_, camera in received], dtype=float)
 
-    came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.get("arrivals") or ()]
+    came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.arrivals]
     arrivals = np.array(came, dtype=float).reshape(-1, 2)
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
@@ -416,12 +429,34 @@ def _received(received: Sequence[tuple[float, float, Mapping[str, Any]]]) -> Rec
         **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
         arrival_t=arrivals[:, 0],
         arrival_ms=arrivals[:, 1],
+        clocks_ms=arrivals[:, 1],
     )
 
 
-def _sent(sent: Sequence[tuple[float, Mapping[str, Any]]]) -> Sent:
+def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, CameraSeries]:
+    """Without the latencies around those that are negative: all cameras of a vehicle have its clock."""
+    received = {name: camera.received for name, camera in cameras.items() if camera.received}
+    ahead = [got.arrival_t[got.clocks_ms < CLOCKS_APART_MS] for got in received.values()]
+    ahead += [got.t[got.latency_ms < CLOCKS_APART_MS] for got in received.values()]
+    apart = np.sort(np.concatenate([np.empty(0), *ahead]))
+    known = dict(cameras)
+    for name, got in received.items():
+        arrival_ms = _known(got.arrival_t, got.arrival_ms, apart)
+        latency_ms = _known(got.t, got.latency_ms, apart)
+        known[name] = replace(cameras[name], received=replace(got, arrival_ms=arrival_ms, latency_ms=latency_ms))
+    return known
+
+
+def _known(t: Values, ms: Values, apart: Values) -> Values:
+    """Latencies, nan where one is negative or was, or will be, within `TRUSTED_AGAIN_S`."""
+    near = np.searchsorted(apart, t + TRUSTED_AGAIN_S, "right") > np.searchsorted(apart, t - TRUSTED_AGAIN_S)
+    return np.where(near | (ms < 0), np.nan, ms)
+
+
+def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:
     t = np.array([t for t, _ in sent], dtype=float)
-    frames, sizes = (counted(np.array([c[key] for _, c in sent], dtype=float)) for key in ("frames", "bytes"))
+    frames = counted(np.array([camera.frames for _, camera in sent], dtype=float))
+    sizes = counted(np.array([camera.bytes for _, camera in sent], dtype=float))
     return Sent(t, frames, sizes, rate(t, sizes))
 
 
@@ -477,7 +512,9 @@ def _tile(camera: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _panel(names: Iterable[str]) -> Panel:
-    """Called after what the names begin with."""
+    """Called after what the names begin with, or after its only camera."""
     cameras = tuple(names)
+    if len(cameras) == 1:
+        return Panel(cameras[0], cameras)
     kinds = list(dict.fromkeys(name.partition("_")[0] for name in cameras))
     return Panel(" and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds).capitalize(), cameras)

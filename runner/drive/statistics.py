@@ -13,7 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from runner.drive.series import CameraSeries, Line, Received, Series, Values, held, mean_held, sending_spans, spans
+from runner.drive.series import (
+    RATE_WINDOW_S,
+    CameraSeries,
+    Flags,
+    Line,
+    Received,
+    Series,
+    Values,
+    held,
+    mean_held,
+    sending_spans,
+    spans,
+)
 
 FREEZE_GAPS = 30  # gaps that the mean is taken over (W3C webrtc-stats, freezeCount)
 FREEZE_FACTOR = 3.0  # of the mean gap
@@ -64,15 +76,21 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Estimated quality of one camera over time.
+    """Estimated quality of one camera over time, of each picture against the scene that it shows.
 
-    line     in units of the metric; nan while nothing came or the factor was not measured
-    clamped  share of the known values at bitrates outside the measured ones, where the nearest one stands in
+    While a picture stands still it keeps the quality it had. What it lacks against the scene as it is by then is not in
+    it: that would take the pictures. So `mean` is an upper bound, reached where nothing moves, and says little without
+    the share of the time in which pictures stood still (`CameraStatistics.frozen`).
+
+    line     in units of the metric; nan while nothing was shown, the rate is not known or the factor was not measured
+    moving   mean of the time in which pictures moved
+    clamped  share of the values while pictures moved at bitrates outside the measured ones, where the nearest stands in
     unknown  factors that were in force and are not in the model
     """
 
     metric: str
     line: Line
+    moving: float
     clamped: float
     unknown: tuple[float, ...]
 
@@ -91,6 +109,7 @@ class CameraStatistics:
     sizes             share of the time by size of the picture, px
     arrival, decode   latency from capture to arrival, and to decode, ms
     freezes           None where arrivals were not logged
+    frozen            share of `sending_s` in which the picture stood still; nan where arrivals were not logged
     lost, rebuilt     packets; None where no operator logged
     quality           None without a rate-quality model
     """
@@ -107,6 +126,7 @@ class CameraStatistics:
     arrival: Latency
     decode: Latency
     freezes: tuple[Freeze, ...] | None
+    frozen: float
     lost: int | None
     rebuilt: int | None
     quality: Estimate | None
@@ -129,8 +149,10 @@ class Statistics:
     frozen_s: float | None
     lost: int | None
     rebuilt: int | None
+    frozen: float
     metric: str
     quality: float
+    moving: float
     notes: tuple[str, ...]
 
 
@@ -161,10 +183,12 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Stat
         decode=latency(together(got.latency_ms for got in received)),
         freezes=len(frozen) if watched else None,
         frozen_s=sum(freeze.seconds for freeze in frozen) if watched else None,
+        frozen=ratio(sum(freeze.seconds for freeze in frozen), sum(c.sending_s for c in each if c.freezes is not None)),
         lost=_sum(camera.lost for camera in each),
         rebuilt=_sum(camera.rebuilt for camera in each),
-        metric=metrics.pop() if len(metrics) == 1 else "",
-        quality=mean(np.array([e.mean for e in estimates])) if len({e.metric for e in estimates}) == 1 else NAN,
+        metric=next(iter(metrics)) if len(metrics) == 1 else "",
+        quality=mean(np.array([e.mean for e in estimates])) if len(metrics) == 1 else NAN,
+        moving=mean(np.array([e.moving for e in estimates])) if len(metrics) == 1 else NAN,
         notes=tuple(_notes(drive, cameras)),
     )
 
@@ -177,6 +201,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
     frames = float(source.frames[-1] - source.frames[0]) if source else NAN
     kbps = ratio(float(source.bytes[-1] - source.bytes[0]) * 8 / 1000, until - begin) if source else NAN
     allocated = mean_held(Line(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
+    stood = tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None
     return CameraStatistics(
         name=camera.name,
         frames=int(source.frames[-1]) if source else 0,
@@ -189,10 +214,11 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         sizes=size_shares(camera, begin, until),
         arrival=latency(got.arrival_ms) if got else Latency(),
         decode=latency(got.latency_ms) if got else Latency(),
-        freezes=tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None,
+        freezes=stood,
+        frozen=NAN if stood is None else ratio(sum(freeze.seconds for freeze in stood), sending_s),
         lost=int(got.lost[-1]) if got else None,
         rebuilt=int(got.rebuilt[-1]) if got else None,
-        quality=estimate(camera, model) if model else None,
+        quality=estimate(camera, model, stood or ()) if model else None,
     )
 
 
@@ -208,6 +234,10 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     if drive.positions is None:
         yield "no positions were logged: it is not on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
+    frozen = ", ".join(f"{name} {_part(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
+    if frozen:
+        rule = "a picture that stands still counts as what it was, whatever moves meanwhile: at most as good as told"
+        yield f"estimated quality: {rule}; frozen {frozen} of the time"
     clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
         yield f"estimated quality: bitrates not measured, where the nearest one stands in: {clamped} of the time"
@@ -335,11 +365,13 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
     return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
 
 
-def estimate(camera: CameraSeries, model: Model) -> Estimate:
+def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -> Estimate:
     """Quality that the pictures of a camera have by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
     bits per pixel (paper, left side of Eq. 4), linear between measured points in log bitrate.
+
+    stood  when the picture stood still: it keeps the quality it had before, see `Estimate`
     """
     t, kbps = camera.actual
     decided = camera.decided
@@ -354,8 +386,25 @@ def estimate(camera: CameraSeries, model: Model) -> Estimate:
         curve = model.curves[factor]
         quality[at] = np.interp(np.log(full[at]), np.log(curve.kbps), curve.quality)
         outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
-    known = np.isfinite(quality)
-    return Estimate(model.metric, Line(t, quality), ratio(int(outside.sum()), int(known.sum())), tuple(unknown))
+    moving = np.ones(t.shape, dtype=bool)
+    for freeze in stood:
+        _hold(quality, moving, t, freeze)
+    known = np.isfinite(quality) & moving
+    clamped = ratio(int((outside & known).sum()), int(known.sum()))
+    return Estimate(model.metric, Line(t, quality), mean(quality[moving]), clamped, tuple(unknown))
+
+
+def _hold(quality: Values, moving: Flags, t: Values, freeze: Freeze) -> None:
+    """Let a picture that stands still keep the quality it had; where there was none before, there is none.
+
+    Rates are those of a second, which for as long after a freeze holds some of it, or what had piled up meanwhile.
+    """
+    end = freeze.t + freeze.seconds
+    during = (t > freeze.t) & (t <= end)
+    before = np.flatnonzero(np.isfinite(quality) & (t <= freeze.t) & (t > freeze.t - 2 * RATE_WINDOW_S))
+    quality[during] = quality[before[-1]] if before.size else NAN
+    quality[(t > end) & (t < end + RATE_WINDOW_S)] = NAN
+    moving[during] = False
 
 
 # --- small things -----------------------------------------------------------------------------------------------------

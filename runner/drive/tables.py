@@ -12,7 +12,8 @@ VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
 MEANING = (
     "Arrival and decode: latency since capture. Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
-    " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer."
+    " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
+    " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
 )
 SIZES = 3  # as many sizes of pictures are told, those seen longest
 
@@ -22,7 +23,7 @@ def camera_rows(drive: Statistics) -> tuple[Row, list[Row]]:
     kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
     headings: Row = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
     headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
-    headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind)
+    headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind, "of the time\nfrozen")
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
 
@@ -32,6 +33,7 @@ def drive_rows(drives: Sequence[Statistics]) -> tuple[Row, list[Row]]:
         "drive",
         "s",
         "quality estimated",
+        "of the time frozen",
         "latency ms (median, p95, p99)",
         "freezes",
         "frozen s",
@@ -61,6 +63,7 @@ def _camera(camera: CameraStatistics) -> Row:
         counted(camera.lost),
         counted(camera.rebuilt),
         shown(camera.quality.mean, 3) if camera.quality else NOTHING,
+        percent(camera.frozen),
     )
 
 
@@ -70,6 +73,7 @@ def _drive(drive: Statistics) -> Row:
         drive.series.label,
         shown(drive.series.end, 1),
         f"{shown(drive.quality, 3)} {drive.metric.upper()}" if drive.metric else NOTHING,
+        percent(drive.frozen),
         _latency(arrived),
         counted(drive.freezes),
         shown(drive.frozen_s, 2),

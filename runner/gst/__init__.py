@@ -1,20 +1,53 @@
-"""Everything that touches GStreamer, behind the one door `runner/apply.py`."""
+"""Everything that touches GStreamer, behind the one door `runner/apply.py`.
+
+raises  MissingBindings on import, with all that does not load
+"""
 
 import ctypes
 from contextlib import suppress
+from importlib import import_module
+
+from runner.errors import MissingBindings
 
 # GStreamer brings libunwind, whose functions stand in for those of libgcc in all that is loaded later: the next C++
 # exception, in Matplotlib or OpenCV, ends the process. What is loaded first, is found first.
 with suppress(OSError):
     ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
 
-import gi
+TYPELIBS = {  # Debian package by typelib
+    "Gst": "gir1.2-gstreamer-1.0",
+    "GstPbutils": "gir1.2-gst-plugins-base-1.0",
+    "GstRtp": "gir1.2-gst-plugins-base-1.0",
+    "GstRtsp": "gir1.2-gst-plugins-base-1.0",
+    "GstSdp": "gir1.2-gst-plugins-base-1.0",
+    "GstVideo": "gir1.2-gst-plugins-base-1.0",
+    "GstRtspServer": "gir1.2-gst-rtsp-server-1.0",
+}
 
-for _name in ("Gst", "GstPbutils", "GstRtp", "GstRtsp", "GstRtspServer", "GstSdp", "GstVideo"):
-    gi.require_version(_name, "1.0")
+
+def _load() -> None:
+    """Load PyGObject and the typelibs: one that is installed may still not load."""
+    try:
+        gi = import_module("gi")
+    except Exception as error:  # a half installed one raises what it likes
+        how = "apt-get install python3-gi, and a virtual environment that sees it"
+        raise MissingBindings({"Python module gi": f"{error}; {how}"}) from None
+    missing = {}
+    for name, package in TYPELIBS.items():
+        try:
+            gi.require_version(name, "1.0")
+            import_module(f"gi.repository.{name}")
+        except Exception as error:  # ValueError, ImportError, GLib.Error: of the loader, of the file
+            why = str(error).partition("\n")[0]
+            missing[f"typelib {name}"] = f"{why}; apt-get install {package}"
+    if missing:
+        raise MissingBindings(missing)
+
+
+_load()
 
 from gi.repository import GLib, Gst  # noqa: E402
 
-__all__ = ["GLib", "Gst"]
+__all__ = ["TYPELIBS", "GLib", "Gst"]
 
 Gst.init(None)

@@ -7,6 +7,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+from gi.repository import GLib, Gst
+
 QUANTIZER = 28  # constant: 37 dB and more, far above what is sent of it, and half as dear to decode as 20
 FRAMES_IN_FLIGHT = 3
 
@@ -21,18 +23,11 @@ def write_clip(
 
     The stream is made for cheap decoding: no B-frames, no CABAC, no deblocking, a keyframe every second.
     """
-    import gi
-
-    gi.require_version("Gst", "1.0")
-    from gi.repository import Gst
-
-    Gst.init(None)
     caps = (
         f"video/x-raw,format=I420,width={width},height={height},framerate={fps.numerator}/{fps.denominator},"
         "pixel-aspect-ratio=1/1,interlace-mode=progressive,colorimetry=bt709,chroma-site=mpeg2"
     )
     pipeline = _parse(
-        Gst,
         f"appsrc name=frames caps={caps} format=time max-bytes=0 "
         f"! x264enc pass=quant quantizer={quantizer} speed-preset=ultrafast bframes=0 threads=1 "
         f"key-int-max={max(1, round(fps))} ! h264parse ! mp4mux ! filesink name=file",
@@ -40,20 +35,20 @@ def write_clip(
     pipeline.get_by_name("file").set_property("location", str(path))
     try:
         pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
-        _push(Gst, pipeline, frames, fps)
-        _wait(Gst, pipeline, Gst.CLOCK_TIME_NONE, Gst.MessageType.EOS)
+        _push(pipeline, frames, fps)
+        _wait(pipeline, Gst.CLOCK_TIME_NONE, Gst.MessageType.EOS)
     finally:
         pipeline.set_state(Gst.State.NULL)
 
 
-def _parse(gst: Any, description: str) -> Any:
+def _parse(description: str) -> Any:
     try:
-        return gst.parse_launch(description)
-    except Exception as error:  # GLib.Error, which cannot be named before gi is there
-        raise RuntimeError(f"writing the clip: {error}") from None
+        return Gst.parse_launch(description)
+    except GLib.Error as error:
+        raise RuntimeError(f"writing the clip: {error.message}") from None
 
 
-def _push(gst: Any, pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> None:
+def _push(pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> None:
     """Feed all frames with exact times, then the end of the stream.
 
     The queue is watched here and not left to `block=true`: behind a pipeline that failed, a blocked push never returns.
@@ -61,17 +56,17 @@ def _push(gst: Any, pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> No
     source = pipeline.get_by_name("frames")
     for number, frame in enumerate(frames):
         while source.get_property("current-level-bytes") >= FRAMES_IN_FLIGHT * len(frame):
-            _wait(gst, pipeline, gst.MSECOND, gst.MessageType.ERROR)
-        buffer = gst.Buffer.new_wrapped(frame)
-        start, end = (int(count * gst.SECOND / fps) for count in (number, number + 1))
+            _wait(pipeline, Gst.MSECOND, Gst.MessageType.ERROR)
+        buffer = Gst.Buffer.new_wrapped(frame)
+        start, end = (int(count * Gst.SECOND / fps) for count in (number, number + 1))
         buffer.pts, buffer.duration = start, end - start
         source.emit("push-buffer", buffer)
     source.emit("end-of-stream")
 
 
-def _wait(gst: Any, pipeline: Any, nanoseconds: int, for_what: Any) -> None:
+def _wait(pipeline: Any, nanoseconds: int, for_what: Any) -> None:
     """Wait for a message or that long; an error is raised."""
-    message = pipeline.get_bus().timed_pop_filtered(nanoseconds, for_what | gst.MessageType.ERROR)
-    if message and message.type == gst.MessageType.ERROR:
+    message = pipeline.get_bus().timed_pop_filtered(nanoseconds, for_what | Gst.MessageType.ERROR)
+    if message and message.type == Gst.MessageType.ERROR:
         error, _ = message.parse_error()
         raise RuntimeError(f"writing the clip: {error.message}")

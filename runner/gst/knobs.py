@@ -8,9 +8,9 @@ from typing import Any
 
 from gi.repository import Gst
 
-from runner.commands import KnobValue
+from runner.core.commands import KnobValue
+from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
-from runner.model import Camera
 
 
 class Knobs:

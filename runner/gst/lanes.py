@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RunError
 from runner.gst.pipeline import counted
-from runner.rate_quality.lanes import FRAMES, LaneSet
+from runner.lanes import FRAMES, LaneSet
 
 Luma = NDArray[np.uint8]  # height x width
 POLL_NS = 200 * 1_000_000

@@ -7,10 +7,11 @@ from typing import Any
 
 from gi.repository import Gst, GstRtp
 
-from runner.commands import KnobValue
+from runner.core.commands import KnobValue
 from runner.graph import Plan
 from runner.gst.knobs import Knobs
 from runner.gst.source import loop_clip
+from runner.gst.watched import WatchedSource
 
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
@@ -21,12 +22,18 @@ class CameraPipeline:
 
     wanted  where the knobs are to be
     turned  called, from any thread, when knobs were set
+    source  the source where it is watched
     """
 
     def __init__(
-        self, pipeline: Gst.Bin, plan: Plan, wanted: Mapping[str, KnobValue], turned: Callable[[], None]
+        self,
+        pipeline: Gst.Bin,
+        plan: Plan,
+        wanted: Mapping[str, KnobValue],
+        turned: Callable[[], None],
+        source: WatchedSource | None = None,
     ) -> None:
-        self._pipeline, self._plan = pipeline, plan
+        self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted = wanted
         self.knobs = Knobs(pipeline, plan.camera, turned)
         if plan.loops:
@@ -37,6 +44,12 @@ class CameraPipeline:
         self._stamp(last.get_parent_element())
         self.knobs.set_now(self._allowed(wanted))
         last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
+        last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
+
+    @property
+    def source_fault(self) -> str:
+        """What is wrong with a source that delivers nothing and is being replaced; "" while it delivers."""
+        return self._source.outage.reason if self._source else ""
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
         """Take the knobs to where they are wanted; `changed` is what is new."""
@@ -51,6 +64,17 @@ class CameraPipeline:
         A gate that is closed from the start lets no caps through, and a client's DESCRIBE would wait for them in vain.
         """
         return values if self._started else {knob: value for knob, value in values.items() if knob != "sending"}
+
+    @property
+    def paused(self) -> bool:
+        """Whether the gate was read back as shut."""
+        return self.knobs.applied.get("sending") is False
+
+    @property
+    def kbps(self) -> int:
+        """The encoder's bitrate as it was read back, 0 before it was set."""
+        bitrate = self.knobs.applied.get("bitrate", 0)
+        return bitrate if isinstance(bitrate, int) else 0
 
     def push(self, frame: Any) -> bool:
         """Hand one frame to the source, which must be an appsrc.
@@ -92,6 +116,16 @@ def _keep_below(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     """
     wanted = info.get_event().type != Gst.EventType.RECONFIGURE
     return Gst.PadProbeReturn.OK if wanted else Gst.PadProbeReturn.DROP
+
+
+def _refuse_seeks(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    """A camera cannot be sought; a query that is answered as it was asked says so.
+
+    The RTSP server believes what a source says. It would seek a clip or a test picture for every PLAY with a Range, a
+    Scale or a Speed: flush what others watch, and wait for a frame that a closed gate never lets through.
+    """
+    seeking = info.get_query().type == Gst.QueryType.SEEKING
+    return Gst.PadProbeReturn.HANDLED if seeking else Gst.PadProbeReturn.OK
 
 
 def counted(identity: Gst.Element) -> tuple[int, int]:

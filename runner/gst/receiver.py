@@ -9,14 +9,17 @@ from dataclasses import dataclass, replace
 
 from gi.repository import GObject, Gst, GstSdp
 
-from runner.graph import Plan
+from runner.graph import Plan, video_codec
 from runner.gst.pipeline import counted
+from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
 from runner.gst.video_files import VideoFile, VideoFiles
-from runner.units import AccessUnit, read_unit
+from runner.gst.viewers import user_agent
+from runner.h264.access_unit import AccessUnit, read_unit
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
-STALL_S = 2.0  # a camera that should send and is silent for longer is built anew
+STALL_S = 2.0  # a camera that should send, and neither sends nor answers for longer, is built anew
+GRACE_S = 0.75  # a camera that is known to send only now may take so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +30,10 @@ class Received:
     bytes       their payload
     decoded     frames that reached the sink
     lost        RTP packets that never came
+    foreign     RTP and RTCP packets that came from elsewhere than the vehicle and were dropped
     width, height  px of the decoded picture, 0 before the first
     latency_ms  capture to decode of the last sampled frame; None before the first
-    rebuilt     how often the pipeline was built anew
+    rebuilt     how often a pipeline that had received frames was built anew
     arrivals    of each access unit since the sample before, where wanted: when it came and when it was captured,
                 s since 1970 by this machine's and by the vehicle's clock
     """
@@ -38,6 +42,7 @@ class Received:
     bytes: int = 0
     decoded: int = 0
     lost: int = 0
+    foreign: int = 0
     width: int = 0
     height: int = 0
     latency_ms: float | None = None
@@ -61,6 +66,7 @@ class Receiver:
     arrivals    keep when each access unit came
     video       where what comes is kept; the plan has `video` then
     Without these no Python runs per frame.
+    operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
     """
 
     def __init__(
@@ -71,32 +77,44 @@ class Receiver:
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
         video: VideoFiles | None = None,
+        operator: str = "",
     ) -> None:
-        self._report, self._video = report, video
+        self._report, self._video, self._operator = report, video, operator
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
+        self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
         self._before = Received()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
-        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
-        self.should_send = False
+        self._told_foreign = False
+        self._filter: SenderFilter | None = None
+        self._built = False
+        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
+        self._silent = time.monotonic()  # when it was last not known that the camera should send
+        self.should_send: bool | None = None  # None: nobody knows, as the vehicle is not heard
 
     def start(self) -> None:
         self._supervised.start()
 
     def stop(self) -> None:
         self._supervised.stop()
+        self._close_filter()
 
     def sample(self) -> Received:
         """What has come so far; asks for the latency of the next frame."""
         received = replace(self._count(), arrivals=self._arrived())
+        if received.foreign and not self._told_foreign:
+            self._told_foreign = True
+            self._report(self._name, "packets that do not come from the vehicle are dropped")
         now = time.monotonic()
-        if received.frames != self._moved[0] or not self.should_send:
+        if not self.should_send:
+            self._silent = now
+        if received.frames != self._moved[0] or self.should_send is False:
             self._moved = (received.frames, now)
-        elif now - self._moved[1] > STALL_S:
+        elif self.should_send and now - self._moved[1] > STALL_S and now - self._silent > GRACE_S:
             self._moved = (received.frames, now)
             self._supervised.restart(f"no frame for {STALL_S:g} s")
         else:
@@ -105,30 +123,59 @@ class Receiver:
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
 
-    def _on_built(self, pipeline: Gst.Pipeline) -> None:
-        self._before = self._count() if self._supervised.rebuilt else Received()
+    def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
+        self._before = self._count() if self._built else Received()
+        self._built = True
+        self._close_filter()
+        self._moved = (self._before.frames, time.monotonic())
+        pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
         self._received = pipeline.get_by_name("received")
         self._begun = False
         self._jitter_buffers: list[Gst.Element] = []
         pipeline.connect("deep-element-added", self._on_element)
-        client = pipeline.get_by_name(self._client_name)
-        if GObject.signal_lookup("select-stream", client):
-            take_feedback(client)
+        self._client = pipeline.get_by_name(self._client_name)
+        if GObject.signal_lookup("select-stream", self._client):
+            take_feedback(self._client)
+        if self._operator and self._client.find_property("user-agent"):
+            self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
             VideoFile(self._video, self._name, "operator", _came, self._report).follow(pipeline)
-        if self._on_unit:
-            self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_access_unit)
-        if self._arrivals is not None:
+        if self._on_unit or self._arrivals is not None:
             self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
+        return self._received.get_static_pad("src")
+
+    def _on_progress(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
+        """The client connects, and the server answers: over a slow link that takes time."""
+        self._moved = (self._moved[0], time.monotonic())
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
             # Frames come in bursts: the packet that is guessed to be next is the next frame's, and not missing.
             element.set_property("rtx-next-seqnum", False)
             self._jitter_buffers.append(element)
+        if element.find_property("used-socket") and element.get_static_pad("src"):
+            self._filter_senders(element)
+
+    def _filter_senders(self, source: Gst.Element) -> None:
+        """Let a socket of the client take what the vehicle sends, and nothing else. From the client's thread."""
+        taken = source.get_property("used-socket")
+        if taken is None:
+            return
+        try:
+            if self._filter is None:
+                location = self._client.get_property("location")
+                self._filter = SenderFilter(Gst.Uri.from_string(location).get_host())
+            self._filter.attach(taken.get_fd())
+        except OSError as error:
+            self._report(self._name, f"packets of others than the vehicle are not dropped: {error}")
+
+    def _close_filter(self) -> None:
+        if self._filter:
+            self._filter.close()
+            self._filter = None
 
     def _count(self) -> Received:
         before = self._before
@@ -139,6 +186,7 @@ class Receiver:
             frames=before.frames + frames,
             bytes=before.bytes + size,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
+            foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
             lost=before.lost + sum(b.get_property("stats").get_value("num-lost") for b in self._jitter_buffers),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
@@ -153,23 +201,26 @@ class Receiver:
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        self._arrivals.append((time.time(), capture_time(info.get_buffer())))  # type: ignore[union-attr]
+        """An access unit has come: page and log share its times."""
+        arrived, buffer = time.time(), info.get_buffer()
+        captured = capture_time(buffer)
+        if self._arrivals is not None:
+            self._arrivals.append((arrived, captured))
+        if self._on_unit:
+            self._pass_on(buffer, captured, arrived, self._on_unit)
         return Gst.PadProbeReturn.OK
+
+    def _pass_on(self, buffer: Gst.Buffer, captured: float | None, arrived: float, on_unit: OnUnit) -> None:
+        data = buffer.extract_dup(0, buffer.get_size())
+        # The depayloader marks the first unit of all, and each that packets are missing of.
+        damaged, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
+        if unit := read_unit(data, captured, arrived, damaged=damaged, codec=self._codec):
+            on_unit(self._name, unit)
 
     def _arrived(self) -> tuple[tuple[float, float | None], ...]:
         """What has arrived since the last call; more may come meanwhile."""
         arrivals = self._arrivals or ()
         return tuple(self._arrivals.popleft() for _ in range(len(arrivals)))  # type: ignore[union-attr]
-
-    def _on_access_unit(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        arrived, buffer = time.time(), info.get_buffer()
-        data = buffer.extract_dup(0, buffer.get_size())
-        # The depayloader marks the first unit of all, and each that packets are missing of.
-        damaged, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
-        unit = read_unit(data, capture_time(buffer), arrived, damaged=damaged)
-        if unit:
-            self._on_unit(self._name, unit)  # type: ignore[misc]
-        return Gst.PadProbeReturn.OK
 
     def _on_sample(self, sink: Gst.Element) -> Gst.FlowReturn:
         sample = sink.emit("pull-sample")

@@ -11,7 +11,7 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 from runner.gst.clocks import unix_time
 from runner.gst.pipeline import counted
-from runner.gst.source import loop_clip
+from runner.gst.source import fixed_rate, loop_clip
 
 CHECK_MS = 100
 SILENT_S = 10.0  # a source that delivers nothing for so long has failed
@@ -73,7 +73,7 @@ class Recorder:
         self._end: tuple[int, int] | None = None  # ns of running time at which the recording is cut, frames until then
         self._counting_down = self._finishing = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
-        self._rated = _fixed_rate(self._pipeline) if not plan.loops else []
+        self._rated = fixed_rate(self._pipeline) if not plan.loops else []
 
     def start(self) -> None:
         """Begin; what cannot begin is FAILED at the next look."""
@@ -213,9 +213,3 @@ class Recorder:
             self._close(Stage.FAILED, "its source ended before its first frame")
         else:
             self._close(Stage.FINISHED)
-
-
-def _fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
-    """The elements that repeat frames and leave some out to keep a rate, and count them."""
-    counts = ("duplicate", "drop", "skip-to-first")
-    return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]

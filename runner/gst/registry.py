@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from functools import cache
+from functools import cache, lru_cache
 
 from gi.repository import GLib, GObject, Gst
 
-from runner.commands import KnobValue
+from runner.core.commands import KnobValue
+from runner.core.model import Element, ModelError, Value, suggest
 from runner.graph import Plan, assignments, text
-from runner.model import Element, ModelError, Value, suggest
 
 PACKAGES = {  # Debian package that brings an element; `doctor` and missing plugins name it
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
-    " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux matroskamux",
+    " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay rtpvp8depay",
     "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink"
     " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
@@ -23,6 +23,7 @@ PACKAGES = {  # Debian package that brings an element; `doctor` and missing plug
     "gstreamer1.0-x": "textoverlay",
     "nvidia-l4t-gstreamer": "nvvidconv nvv4l2h264enc",
 }
+HARDWARE = {"vah264enc": "va", "nvh264enc": "nvcodec"}  # plugin by element that is there only beside its hardware
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
 
 
@@ -38,11 +39,14 @@ def missing_recorders(plan: Plan) -> list[str]:
 
 def _missing(elements: Iterable[Element]) -> list[str]:
     names = dict.fromkeys(element.factory for element in elements)
-    return [
-        f"the GStreamer element {name} is not installed; on Debian: apt-get install {PACKAGE_OF[name]}"
-        for name in names
-        if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None
-    ]
+    return [_why_missing(name) for name in names if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None]
+
+
+def _why_missing(name: str) -> str:
+    plugin = HARDWARE.get(name)
+    if plugin and Gst.Registry.get().find_plugin(plugin):
+        return f"the GStreamer element {name} needs hardware and a driver that its plugin {plugin} does not find here"
+    return f"the GStreamer element {name} is not installed; on Debian: apt-get install {PACKAGE_OF[name]}"
 
 
 def versions(elements: Iterable[Element]) -> dict[str, str]:
@@ -108,9 +112,14 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
             rule = _objection(factory, key, filled)
             if rule:
                 yield ModelError(f"{path}.property", repr(key), rule)
-            elif not int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING:
-                rule = f"{factory} cannot change {key} while playing, so that no knob can turn it"
+            elif not _may_change(element, key) and (name, key) not in camera.graph.mutable:
+                rule = f"{factory} does not say that {key} may change while playing; if it may, list it under mutable"
                 yield ModelError(f"{path}.property", repr(key), rule)
+
+
+def _may_change(element: Gst.Element, key: str) -> bool:
+    """Whether an element says of a property that it may change while PLAYING."""
+    return bool(int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING)
 
 
 def _check_links(plan: Plan) -> list[ModelError]:
@@ -120,13 +129,22 @@ def _check_links(plan: Plan) -> list[ModelError]:
     if plan.recorder and not missing_recorders(plan):
         lines.append(("recording.elements", plan.recording("/dev/null")))
     for where, line in lines:
-        try:
-            Gst.parse_launch(line)
-        except GLib.Error as error:
-            errors.append(ModelError(where, None, error.message))
+        if message := _unlinkable(line):
+            errors.append(ModelError(where, None, message))
     return errors
 
 
+@cache
+def _unlinkable(line: str) -> str | None:
+    """What GStreamer says of a line whose neighbours cannot be linked."""
+    try:
+        Gst.parse_launch(line)
+    except GLib.Error as error:
+        return str(error.message)
+    return None
+
+
+@lru_cache(maxsize=None, typed=True)
 def _objection(factory: str, key: str, value: Value) -> str:
     """Why an element does not take this value for this property; "" if it does."""
     element = _template(factory)

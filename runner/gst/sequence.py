@@ -9,7 +9,7 @@ from pathlib import Path
 from gi.repository import GLib, Gst, GstPbutils
 
 from runner.errors import UserError
-from runner.files import why_no_file
+from runner.system.files import why_no_file
 
 TIMEOUT_S = 20
 # Caps of codecs that keep every sample, as far as they are told from their caps alone.

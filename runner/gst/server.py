@@ -1,85 +1,474 @@
-"""The vehicle's RTSP server: one shared factory per camera, its settings written again whenever it is built anew."""
+"""The vehicle's RTSP server: one shared factory per camera, its settings written again whenever it is built anew.
+
+Each client has a thread of the server library, so that one that waits holds up nobody else: what the library calls
+here comes from any of them, and whatever they share is behind one lock.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum, auto
 
-from gi.repository import Gst, GstRtsp, GstRtspServer
+from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 
+from runner.core.model import Media
 from runner.errors import RunError
-from runner.graph import Plan
+from runner.graph import Plan, rtsp_url
+from runner.gst.connections import Connection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
-from runner.model import Endpoint
-from runner.ports import check_port_free
+from runner.gst.viewers import admit
+from runner.system.ports import check_port_free
 
 Report = Callable[[str, str], None]  # camera, what happened
+
+OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for who asks again
+HELD_S = 5.0  # how long one that is open waits for who asks again
+GONE_S = 5.0  # how long one that is opened again waits for the end of the pipeline before
+QUEUE_BYTES = 2_000_000  # more than a viewer may lag by at any bitrate
+LAG_S = 1.0  # a TCP viewer that is behind by more is closed
+WATCH_MS = 200
+SESSIONS_EVERY_S = 1.0
+METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
+OK, REFUSED, UNAVAILABLE, MOVED = (
+    GstRtsp.RTSPStatusCode.OK,
+    GstRtsp.RTSPStatusCode.NOT_ENOUGH_BANDWIDTH,
+    GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
+    GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
+)
+
+
+class _Stage(Enum):
+    """Where a camera's pipeline stands."""
+
+    NONE = auto()
+    BUILT = auto()  # and has delivered nothing yet
+    OPEN = auto()
+    ENDING = auto()
+
+
+class _Factory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
+    """A camera's factory. It has one media, whatever URL leads there: another port, a slash or a query at its end."""
+
+    def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
+        return "media"
+
+
+class _Opening:
+    """An attempt to open a camera, in a thread of its own.
+
+    held  set when a client holds what was opened
+    """
+
+    def __init__(self) -> None:
+        self.held = threading.Event()
+        self.over = self.failed = False
+
+
+class _Camera:
+    """One mount point and its pipeline, if there is one."""
+
+    def __init__(self, plan: Plan, factory: _Factory, url: str) -> None:
+        self.plan, self.factory = plan, factory
+        self.name = plan.camera.name
+        self.url = GstRtsp.RTSPUrl.parse(url)[1]
+        self.media: GstRtspServer.RTSPMedia | None = None
+        self.stage = _Stage.NONE
+        self.bus: Gst.Bus | None = None
+        self.opening: _Opening | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return self.stage is _Stage.OPEN
 
 
 class CameraServer:
     """RTSP server with one mount point per camera.
 
     build   makes a `CameraPipeline` of each that was built
-    report  told of pipelines that come and go
+    report  told of pipelines that come and go, and of viewers that are closed
+
+    `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Endpoint, build: Build, report: Report) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, report: Report) -> None:
         check_port_free(media)
-        self._build, self._report = build, report
+        self._media, self._build, self._report = media, build, report
+        self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
+        self._changed = threading.Condition()  # a camera's stage; also guards all that clients' threads share
+        self._connections: dict[GstRtspServer.RTSPClient, Connection] = {}
+        self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
+        self._left: set[str] = set()  # cameras that a viewer has left lately
+        self._stopped = threading.Event()
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
         self._server.set_service(str(media.port))
-        for plan in plans:
-            self._server.get_mount_points().add_factory(f"/{plan.camera.name}", self._factory(plan))
+        self._threads = GstRtspServer.RTSPThreadPool()
+        self._threads.set_max_threads(-1)  # one per client
+        self._server.set_thread_pool(self._threads)
+        self._server.connect("client-connected", self._on_connected)
+        self._addresses = _address_pool(media)
+        self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
+        for name, camera in self._cameras.items():
+            self._server.get_mount_points().add_factory(f"/{name}", camera.factory)
         self._attached = self._server.attach(None)
         if not self._attached:
             raise RunError(f"the RTSP server cannot listen on {media.host}:{media.port}; choose another media.port")
+        self._watch = GLib.timeout_add(WATCH_MS, self._watch_connections)
+        threading.Thread(target=self._expire_sessions, name="rtsp-sessions", daemon=True).start()
 
     def stop(self) -> None:
-        from gi.repository import GLib
-
+        self._stopped.set()
+        GLib.source_remove(self._watch)
         self._server.client_filter(lambda *_: GstRtspServer.RTSPFilterResult.REMOVE)
         GLib.source_remove(self._attached)
 
-    def _factory(self, plan: Plan) -> GstRtspServer.RTSPMediaFactory:
+    # --- cameras ------------------------------------------------------------------------------------------------------
+
+    def _camera(self, plan: Plan) -> _Camera:
+        camera = _Camera(plan, self._factory(plan), rtsp_url(self._media, plan.camera.name))
+        camera.factory.connect("media-configure", self._on_configure, camera)
+        return camera
+
+    def _factory(self, plan: Plan) -> _Factory:
         settings = plan.camera.graph.settings
-        factory = GstRtspServer.RTSPMediaFactory()
+        factory = _Factory()
         factory.set_launch(plan.server)
         factory.set_shared(True)  # else a second viewer takes the pipeline from the first
         factory.set_latency(0)
+        if self._addresses:
+            factory.set_address_pool(self._addresses)
         if int(settings.get("dscp", -1)) >= 0:
             factory.set_dscp_qos(int(settings["dscp"]))
         if int(settings.get("retransmission_ms", 0)):
             factory.set_retransmission_time(int(settings["retransmission_ms"]) * Gst.MSECOND)
             factory.set_do_retransmission(True)
             factory.set_profiles(GstRtsp.RTSPProfile.AVPF | GstRtsp.RTSPProfile.AVP)
-        factory.connect("media-configure", self._on_configure, plan)
         return factory
 
-    def _on_configure(self, _factory: object, media: GstRtspServer.RTSPMedia, plan: Plan) -> None:
-        name = plan.camera.name
+    def _on_configure(self, _factory: object, media: GstRtspServer.RTSPMedia, camera: _Camera) -> None:
         element = media.get_element()
-        element.get_parent().connect("deep-element-added", _on_element)
-        bus = element.get_parent().get_bus()
+        pipeline = element.get_parent()
+        pipeline.connect("deep-element-added", _on_element)
+        bus = pipeline.get_bus()
         bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
-        bus.connect("sync-message::error", self._on_error, name)
-        self.pipelines[name] = self._build(element, plan)
-        media.connect("unprepared", self._on_unprepared, name, self.pipelines[name])
-        self._report(name, "pipeline built")
+        bus.connect("sync-message::error", self._on_error, camera)
+        built = self._build(element, camera.plan)
+        with self._changed:
+            camera.media, camera.bus, camera.stage = media, bus, _Stage.BUILT
+            self.pipelines[camera.name] = built
+        media.connect("prepared", self._on_stage, camera, _Stage.OPEN)
+        media.connect("target-state", self._on_target_state, camera)
+        # Only after the factory's own handler, which forgets the media, is another one built.
+        media.connect_after("unprepared", self._on_unprepared, camera, built)
+        self._report(camera.name, "pipeline built")
 
-    def _on_error(self, _bus: Gst.Bus, message: Gst.Message, name: str) -> None:
-        if not concerns_file(message):  # that ends the file, and not the stream
-            self._report(name, message.parse_error()[0].message)
+    def _on_stage(self, media: GstRtspServer.RTSPMedia, camera: _Camera, stage: _Stage) -> None:
+        with self._changed:
+            if camera.media is media:
+                camera.stage = stage
+                self._changed.notify_all()
 
-    def _on_unprepared(self, _media: object, name: str, pipeline: CameraPipeline) -> None:
-        if self.pipelines.get(name) is pipeline:
-            del self.pipelines[name]
-        self._report(name, "pipeline gone")
+    def _on_target_state(self, media: GstRtspServer.RTSPMedia, state: int, camera: _Camera) -> None:
+        if state == Gst.State.NULL:
+            self._on_stage(media, camera, _Stage.ENDING)
+
+    def _on_unprepared(self, media: GstRtspServer.RTSPMedia, camera: _Camera, pipeline: CameraPipeline) -> None:
+        with self._changed:
+            if camera.media is media:
+                camera.media = None
+            if self.pipelines.get(camera.name) is pipeline:
+                del self.pipelines[camera.name]
+                camera.stage = _Stage.NONE
+                self._changed.notify_all()
+        self._report(camera.name, "pipeline gone")
+
+    def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
+        if concerns_file(message):
+            return  # that ends the file, and not the stream
+        self._report(camera.name, message.parse_error()[0].message)
+        with self._changed:
+            if camera.bus is bus:
+                camera.stage = _Stage.ENDING
+        # The library lets nobody else in to a pipeline that failed, and ends it when its last viewer has left.
+        for connection in self._watching(camera.name):
+            connection.close()
+
+    def _hold(self, client: GstRtspServer.RTSPClient, camera: _Camera) -> bool:
+        """Keep a camera open for a client until its DESCRIBE is answered; False where it delivers nothing by OPEN_S.
+
+        The library would open it in the client's thread and answer after 20 s only. Here it is opened in a thread of
+        its own, so that a camera that is slow to start is open for a client that asks again.
+        """
+        end = time.monotonic() + OPEN_S
+        while True:
+            with self._changed:
+                if not camera.is_open and camera.opening is None:
+                    camera.opening = _Opening()
+                    threading.Thread(target=self._open, args=(camera, camera.opening), daemon=True).start()
+                opening = camera.opening
+                left = max(0.0, end - time.monotonic())
+                self._changed.wait_for(lambda o=opening: camera.is_open or o.over, left)  # type: ignore[misc]
+                media = camera.media if camera.is_open else None
+            if media is not None and media.prepare(None):
+                with self._changed:
+                    self._holds.append((time.monotonic(), client, media))
+                if opening:
+                    opening.held.set()
+                return True
+            if (opening and opening.failed) or time.monotonic() >= end:
+                return False
+            # Else its last viewer has just left, and it is ending.
+
+    def _release(self, wanted: Callable[[float, GstRtspServer.RTSPClient], bool]) -> None:
+        """Hold no longer what was held since a time, for a client, as `wanted` tells."""
+        with self._changed:
+            released = [media for since, client, media in self._holds if wanted(since, client)]
+            self._holds = [hold for hold in self._holds if not wanted(*hold[:2])]
+        for media in released:
+            media.unprepare()
+
+    def _open(self, camera: _Camera, opening: _Opening) -> None:
+        """Build a camera's pipeline, wait for what it delivers, and keep it until somebody holds it."""
+        try:
+            with self._changed:
+                self._changed.wait_for(lambda: camera.stage is not _Stage.ENDING, GONE_S)
+            thread = self._threads.get_thread(GstRtspServer.RTSPThreadType.MEDIA, GstRtspServer.RTSPContext())
+            media = camera.factory.construct(camera.url)
+            opening.failed = media is None or not media.prepare(thread)
+            if media is not None and not opening.failed:
+                opening.held.wait(HELD_S)
+                media.unprepare()
+        finally:
+            with self._changed:
+                opening.over, camera.opening = True, None
+                self._changed.notify_all()
+
+    # --- clients ------------------------------------------------------------------------------------------------------
+
+    def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
+        try:
+            connection = Connection(client, self._media.session_timeout_s)
+        except OSError:  # it has gone already, or there are no descriptors left: it may not watch
+            return
+        with self._changed:
+            self._connections[client] = connection
+        client.connect("closed", self._on_closed)
+        client.connect("new-session", self._on_session)
+        for method in METHODS:
+            client.connect(f"{method}-request", self._on_answered)
+        client.connect("pre-describe-request", self._on_describe)
+        client.connect("describe-request", self._on_described)
+        client.connect("pre-setup-request", self._on_setup)
+        client.connect("setup-request", self._on_set_up)
+        client.connect("play-request", self._on_playing)
+        client.connect("teardown-request", self._on_teardown)
+
+    def _on_closed(self, client: GstRtspServer.RTSPClient) -> None:
+        with self._changed:
+            connection = self._connections.pop(client, None)
+            if connection:
+                self._left |= connection.cameras.keys()
+                connection.forget()
+
+    def _on_session(self, _client: object, session: GstRtspServer.RTSPSession) -> None:
+        session.set_timeout(self._media.session_timeout_s)
+
+    def _on_answered(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
+        connection = self._connection(client)
+        if connection:
+            connection.heard = time.monotonic()
+
+    def _on_describe(
+        self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
+    ) -> GstRtsp.RTSPStatusCode:
+        camera = self._cameras.get(_path(context))
+        if camera is None:
+            return OK  # which the library answers with 404
+        if _has_query(context):
+            self._redirect(client, context)
+            return MOVED
+        return OK if self._hold(client, camera) else UNAVAILABLE
+
+    def _redirect(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
+        """Answer with the URL that is right: with a query the library would find the camera here, but not in PLAY."""
+        uri = context.uri
+        _, message = GstRtsp.rtsp_message_new_response(MOVED, GstRtsp.rtsp_status_as_text(MOVED), context.request)
+        message.add_header(GstRtsp.RTSPHeaderField.LOCATION, f"rtsp://{uri.host}:{uri.port}/{_path(context)}")
+        message.add_header(GstRtsp.RTSPHeaderField.CONNECTION, "close")
+        client.send_message(None, message)
+        connection = self._connection(client)
+        if connection:
+            connection.close()  # the library would answer as well, without a Location
+
+    def _on_described(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
+        self._release(lambda _, holder: holder is client)
+
+    def _on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
+        """Let a viewer in, or refuse it where its copy of the stream would overload the uplink."""
+        camera = next((c for c in self._cameras.values() if c.media is context.media), None)
+        with self._changed:
+            newcomer = self._connections.get(client)
+            if camera is None or newcomer is None:
+                return UNAVAILABLE
+            newcomer.identify(_user_agent(context))
+            if camera.name in newcomer.cameras:
+                return OK
+            there = [c for c in self._connections.values() if camera.name in c.cameras]
+            leaving = admit([c.viewer for c in there], newcomer.viewer, self._media.max_viewers, self.controller)
+            if leaving is None:
+                return REFUSED
+            newcomer.cameras[camera.name] = None
+        for connection in there:
+            if connection.viewer in leaving:
+                self._close(connection, f"the operator in control watches from {newcomer.viewer.address}")
+        return OK
+
+    def _on_set_up(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
+        connection = self._connection(client)
+        if connection is None:
+            return
+        connection.cameras[_camera_name(context)] = context.trans
+        if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
+            connection.carry_video()
+
+    def _on_playing(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
+        self._wake({_camera_name(context)})
+
+    def _wake(self, cameras: Iterable[str]) -> None:
+        """Let the library look again which interleaved viewers are ready.
+
+        It stops a camera's interleaved stream while none is, and looks again when one of them has taken something.
+        Nothing makes it look when the one that it waits for leaves, or a ready one joins.
+        """
+        for name in cameras:
+            for connection in self._watching(name):
+                transport = connection.cameras[name]
+                if transport:
+                    transport.message_sent()
+
+    def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
+        connection = self._connection(client)
+        if connection:
+            connection.cameras.pop(_camera_name(context), None)
+            self._left.add(_camera_name(context))
+
+    def _connection(self, client: GstRtspServer.RTSPClient) -> Connection | None:
+        with self._changed:
+            return self._connections.get(client)
+
+    def _watching(self, camera: str) -> list[Connection]:
+        with self._changed:
+            return [connection for connection in self._connections.values() if camera in connection.cameras]
+
+    def _close(self, connection: Connection, why: str) -> None:
+        for camera in sorted(connection.cameras):
+            self._report(camera, f"closed the viewer at {connection}: {why}")
+        connection.close()
+
+    def _watch_connections(self) -> bool:
+        """Close readers that lag, and connections on which no request is completed."""
+        with self._changed:
+            connections = list(self._connections.items())
+            lags = {connection: self._lag(connection) for _, connection in connections if connection.interleaved}
+            left, self._left = self._left, set()
+        self._wake(left)
+        now = time.monotonic()
+        for client, connection in connections:
+            if lags.get(connection, 0) > LAG_S:
+                self._close(connection, f"it lags by more than {LAG_S:g} s")
+            elif now - connection.heard > self._media.session_timeout_s and not client.session_filter(None):
+                connection.close()
+        return True
+
+    def _lag(self, connection: Connection) -> float:
+        there = (other for other in self._connections.values() if other is not connection)
+        shared = any(other.cameras.keys() & connection.cameras.keys() for other in there)
+        pipelines = [pipeline for name in connection.cameras if (pipeline := self.pipelines.get(name))]
+        return connection.lag(sum(pipeline.kbps for pipeline in pipelines), shared)
+
+    def _expire_sessions(self) -> None:
+        """End sessions whose viewer sends neither requests nor RTCP any more.
+
+        In a thread of its own, since the end of the last one takes the pipeline down.
+        """
+        pool = self._server.get_session_pool()
+        while not self._stopped.wait(SESSIONS_EVERY_S):
+            self._keep_silent()
+            pool.cleanup()
+            # What a client was refused after all is not described to it.
+            old = time.monotonic() - OPEN_S
+            self._release(lambda since, _, old=old: since < old)  # type: ignore[misc]
+
+    def _keep_silent(self) -> None:
+        """Let no session expire for silence on a camera that is paused, or whose source is being replaced.
+
+        Nothing is sent there, and players such as ffmpeg send nothing in return. Who has left is noticed by TCP.
+        """
+        with self._changed:
+            watching = [(client, list(connection.cameras)) for client, connection in self._connections.items()]
+        for client, cameras in watching:
+            if cameras and all(map(self._is_silent, cameras)):
+                for session in client.session_filter(None):
+                    session.touch()
+
+    def _is_silent(self, camera: str) -> bool:
+        pipeline = self.pipelines.get(camera)
+        return pipeline is not None and (pipeline.paused or bool(pipeline.source_fault))
 
 
-def _on_element(_bin: Gst.Bin, _parent: Gst.Bin, element: Gst.Element) -> None:
+def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool | None:
+    """Addresses for RTP and RTCP: the server's own. None where it listens on all."""
+    address = socket.gethostbyname(media.host)
+    if address == "0.0.0.0":
+        return None
+    first, last = media.rtp_ports
+    pool = GstRtspServer.RTSPAddressPool()
+    pool.add_range(address, address, first, last, 0)
+    return pool
+
+
+def _camera_name(context: GstRtspServer.RTSPContext) -> str:
+    """The camera that a request's URL names, or what it has in its place; SETUP has a stream below the camera."""
+    return _path(context).partition("/")[0]
+
+
+def _path(context: GstRtspServer.RTSPContext) -> str:
+    """The path of a request's URL without slashes at its ends; "" where path or host is not text."""
+    try:
+        return str(context.uri.abspath).strip("/") if isinstance(context.uri.host, str) else ""
+    except UnicodeDecodeError:
+        return ""
+
+
+def _has_query(context: GstRtspServer.RTSPContext) -> bool:
+    try:
+        return context.uri.query is not None
+    except UnicodeDecodeError:
+        return True
+
+
+def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:
+    try:
+        agent: str | None = context.request.get_header(GstRtsp.RTSPHeaderField.USER_AGENT, 0)[1]
+    except UnicodeDecodeError:
+        return None
+    return agent
+
+
+def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element) -> None:
     """Settle what the server library makes by itself around a pipeline."""
+    if parent is pipeline and element.get_factory().get_name() == "queue":
+        # In front of its sinks, where it has several. One that takes nothing must not hold up the others. Not limited
+        # by time: the first packet after a pause would seem to be as old as the pause, and be dropped for the second.
+        element.set_property("leaky", "downstream")
+        element.set_property("max-size-buffers", 0)
+        element.set_property("max-size-time", 0)
+        element.set_property("max-size-bytes", QUEUE_BYTES)
     if element.find_property("processing-deadline"):
         # Sinks of a live pipeline hold packets back for 20 ms: here pure latency.
         element.set_property("processing-deadline", 0)

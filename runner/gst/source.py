@@ -113,6 +113,12 @@ class _Pace:
         return True
 
 
+def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
+    """The elements that repeat frames and leave some out to keep a rate, and count them."""
+    counts = ("duplicate", "drop", "skip-to-first")
+    return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]
+
+
 def _born_on_release(pad: Gst.Pad) -> None:
     """A frame of a clip is captured when it is released: decoding ahead of time is no latency."""
 

@@ -1,44 +1,60 @@
-"""Vehicle pipelines that bring their own network sink: they run by themselves and are built anew when they fail."""
+"""Pipelines that bring their own network elements: they run by themselves and are built anew when they fail."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.aside import HUNG, set_state_aside
+from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline
 
-RETRY_MS = 500
+RETRY_S = 1.0  # between the beginnings of two attempts, at least
+STOPPED_S = 2.0  # how long the next pipeline waits for the end of the one before, whose port it needs
+PATIENCE_S = 5.0  # the other side may start later: who waits for it reports nothing for so long
 
 
 class SupervisedPipeline:
     """A pipeline that is torn down and built anew when it fails or ends; it is never repaired in place.
 
-    on_built  told of each new pipeline before it starts
-    report    told what happened
+    All methods are called in the thread of GLib's main loop. State changes run in threads of their own: an element that
+    locks up holds up nobody else.
+
+    on_built  told of each new pipeline before it starts; returns the pad whose first buffer shows that it works
+    report    told what happened: each reason once, until the pipeline works again
+    rebuilt   how often a pipeline that had worked was built anew
     """
 
-    def __init__(self, launch: str, on_built: Callable[[Gst.Pipeline], None], report: Callable[[str], None]) -> None:
+    def __init__(self, launch: str, on_built: Callable[[Gst.Pipeline], Gst.Pad], report: Callable[[str], None]) -> None:
         self._launch, self._on_built, self._report = launch, on_built, report
         self._pipeline: Gst.Pipeline | None = None
+        self._change: threading.Thread | None = None  # the last change of state of the last pipeline
         self._retry = 0
-        self.rebuilt = -1
+        self._attempt = 0
+        self._begun = time.monotonic()  # the last attempt
+        self._lost = self._begun  # since when nothing has worked
+        self._works = self._worked = False  # this pipeline, any pipeline
+        self._outage = Outage(report)
+        self.rebuilt = 0
 
     def start(self) -> None:
-        self.rebuilt += 1
         pipeline = Gst.parse_launch(self._launch)
         if not isinstance(pipeline, Gst.Pipeline):  # a single element comes without one
             element, pipeline = pipeline, Gst.Pipeline.new(None)
             pipeline.add(element)
-        self._pipeline = pipeline
+        self._pipeline, self._begun, self._works = pipeline, time.monotonic(), False
+        self._attempt += 1
         bus = pipeline.get_bus()
         bus.add_signal_watch()
         bus.connect("message::error", self._on_failed)
         bus.connect("message::eos", self._on_failed)
-        self._on_built(pipeline)
-        pipeline.set_state(Gst.State.PLAYING)
+        self._on_built(pipeline).add_probe(Gst.PadProbeType.BUFFER, self._on_first_buffer, self._attempt)
+        self._change = set_state_aside(pipeline, Gst.State.PLAYING)
 
     def stop(self) -> None:
         if self._retry:
@@ -46,18 +62,26 @@ class SupervisedPipeline:
             self._retry = 0
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
-            self._pipeline.set_state(Gst.State.NULL)
+            self._change = set_state_aside(self._pipeline, Gst.State.NULL, lambda: self._report(HUNG), self._change)
             self._pipeline = None
 
     def restart(self, why: str) -> None:
         """Tear down now, build anew soon."""
         if self._retry:
             return
-        self._report(why)
+        now = time.monotonic()
+        if self._works:
+            self.rebuilt += 1
+            self._lost = now
+        if self._worked or now - self._lost > PATIENCE_S:
+            self._outage.failed(why, self._lost)
         self.stop()
-        self._retry = GLib.timeout_add(RETRY_MS, self._again)
+        self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._again)
 
     def _again(self) -> bool:
+        if self._change and self._change.is_alive() and time.monotonic() - self._begun < RETRY_S + STOPPED_S:
+            self._retry = GLib.timeout_add(100, self._again)
+            return False
         self._retry = 0
         self.start()
         return False
@@ -65,6 +89,17 @@ class SupervisedPipeline:
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
         failed = message.type == Gst.MessageType.ERROR
         self.restart(message.parse_error()[0].message if failed else "the stream ended")
+
+    def _on_first_buffer(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo, attempt: int) -> Gst.PadProbeReturn:
+        """From a streaming thread."""
+        GLib.idle_add(self._on_working, attempt)
+        return Gst.PadProbeReturn.REMOVE
+
+    def _on_working(self, attempt: int) -> bool:
+        if attempt == self._attempt and self._pipeline is not None:
+            self._works = self._worked = True
+            self._outage.over(time.monotonic())
+        return False
 
 
 class CameraCaller:
@@ -86,5 +121,6 @@ class CameraCaller:
         self.pipeline = None
         self._supervised.stop()
 
-    def _on_built(self, pipeline: Any) -> None:
+    def _on_built(self, pipeline: Any) -> Gst.Pad:
         self.pipeline = self._build(pipeline, self._plan)
+        return pipeline.get_by_name(self._plan.vehicle[-1].name).get_static_pad("sink")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.errors import RunError
-from runner.files import why_no_file
+from runner.system.files import why_no_file
 
 WAIT_NS = 100 * Gst.MSECOND
 SILENT = 100  # waits without a unit, an end or an error, after which the file is given up

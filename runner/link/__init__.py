@@ -4,7 +4,7 @@ What arrives, what is lost and what is late is then measured and not assumed. Tw
 limits real network devices) and `relay` (no root; a process between the two). Both limit everything that goes from the
 vehicle to the operator in one queue; the other way is free.
 
-with limited_link("relay", limit, vehicle.media, vehicle.control, log.write) as link, private_broker(link.broker):
+with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):
     ...  # [*link.vehicle_command, python, ..., *link.vehicle_overrides] and [python, ..., *link.operator_overrides]
     link.start(time.time())
 """
@@ -13,39 +13,39 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
+from runner.core.model import Endpoint, suggest
 from runner.errors import RunError
 from runner.link.ends import Ends
 from runner.link.limit import Counters, Limit
 from runner.link.netns import namespaced
 from runner.link.relayed import relayed
-from runner.model import Endpoint, suggest
+from runner.records import LinkSample
 
 __all__ = ["KINDS", "Limit", "LimitedLink", "limited_link"]
 
 KINDS = {"netns": namespaced, "relay": relayed}
 LOG_S = 0.1  # between two lines of the log
 LOOK_S = 0.02  # how late a change of the rate may be
-STOP_S = 2.0
+STOP_S = 0.5  # how long the last line of the log may take
 
-Write = Callable[[Mapping[str, Any]], None]
+Record = Callable[[LinkSample], None]
 
 
 class LimitedLink:
     """A link that exists. Its rate is that of the start until `start` says when the drive begins.
 
-    write  told each line of the log from a thread of the link
+    record  called with each sample from a thread of the link
 
     `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
     """
 
-    def __init__(self, limit: Limit, ends: Ends, write: Write) -> None:
+    def __init__(self, limit: Limit, ends: Ends, record: Record) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
-        self._limit, self._shaper, self._write = limit, ends.shaper, write
+        self._limit, self._shaper, self._record = limit, ends.shaper, record
         self._stopped = threading.Event()
         self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -66,6 +66,7 @@ class LimitedLink:
             raise self._failure
         if self._failure:
             raise RunError(f"the limited link stopped: {self._failure!r}") from self._failure
+        self._shaper.check()
 
     def stop(self) -> None:
         """Write the last line of the log; the rate stays."""
@@ -90,36 +91,35 @@ class LimitedLink:
                 in_force, counters = kbps, self._shaper.limit(kbps)
             if logs:
                 line = int(t / LOG_S) + 1
-                self._write(_line(t, kbps, counters))
+                self._record(_sample(t, kbps, counters))
 
 
-def _line(t: float, kbps: float, counters: Counters) -> dict[str, Any]:
-    return {
-        "t": round(t, 3),
-        "log": "link",
-        "kbps": round(kbps, 3),
-        "queue_ms": round(counters.queue_ms, 1),
-        "bytes": counters.bytes,
-        "packets": counters.packets,
-        "dropped": counters.dropped,
-    }
+def _sample(t: float, kbps: float, counters: Counters) -> LinkSample:
+    return LinkSample(
+        t=round(t, 3),
+        kbps=round(kbps, 3),
+        queue_ms=round(counters.queue_ms, 1),
+        bytes=counters.bytes,
+        packets=counters.packets,
+        dropped=counters.dropped,
+    )
 
 
 @contextmanager
-def limited_link(kind: str, limit: Limit, media: Endpoint, control: Endpoint, write: Write) -> Iterator[LimitedLink]:
+def limited_link(kind: str, limit: Limit, media: Endpoint, control: Endpoint, record: Record) -> Iterator[LimitedLink]:
     """The link while it is needed; everything that belongs to it is gone at the end.
 
     kind            netns or relay
     limit           what it does
     media, control  RTSP server and broker as the configuration states them
-    write           told {"t", "log": "link", "kbps", "queue_ms", "bytes", "packets", "dropped"} 10 times a second,
-                    from a thread, once the link is started; bytes, packets and dropped count since the link was made
+    record          called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
+                    since the link was made
     raises          RunError where it cannot be made, with what to do; at the end, where it has failed meanwhile
     """
     if kind not in KINDS:
         raise RunError(f"link={kind}: unknown kind, {suggest(kind, KINDS)}")
     with KINDS[kind](limit, media, control) as ends:
-        link = LimitedLink(limit, ends, write)
+        link = LimitedLink(limit, ends, record)
         try:
             yield link
         finally:

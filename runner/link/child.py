@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
+import select
 import subprocess
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from runner.errors import RunError
+from runner.system import children, signals
 
-END_S = 5.0  # how long it may take to end once nobody asks any more
+ANSWER_S = 5.0  # one that has not answered by then never will
+END_S = 0.5  # how long it may take to end once nobody asks any more
+LOOK_MS = 50  # how soon a signal to this process is noticed
 
 
 class Child:
     """Asked through its standard input; everything that it says and that is not JSON is a complaint.
 
     name     for people
-    command  ends when its standard input does, as it does with this process, however that ends
+    command  ends when its standard input does; it is killed with the thread that makes this
     """
 
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -24,14 +31,16 @@ class Child:
         pipe = subprocess.PIPE
         # A session of its own: Ctrl-C ends whoever asks, not who is to count until the end.
         self._process = subprocess.Popen(
-            command,
+            children.bound(command),
             stdin=pipe,
             stdout=pipe,
             stderr=subprocess.STDOUT,
-            text=True,
             env=environment,
             start_new_session=True,
         )
+        assert self._process.stdout
+        self._out = self._process.stdout.fileno()
+        self._rest = b""
 
     def ask(self, *lines: str) -> Any:
         """Send lines and wait for one answer.
@@ -40,7 +49,7 @@ class Child:
         """
         assert self._process.stdin
         try:
-            self._process.stdin.write("".join(f"{line}\n" for line in lines))
+            self._process.stdin.write("".join(f"{line}\n" for line in lines).encode())
             self._process.stdin.flush()
         except OSError:
             pass  # it is gone; what it has said follows
@@ -48,9 +57,8 @@ class Child:
 
     def answer(self) -> Any:
         """The next answer. raises RunError as `ask`"""
-        assert self._process.stdout
         complaints: list[str] = []
-        for line in self._process.stdout:
+        for line in self._lines():
             if line[:1] in ("{", "["):
                 if complaints:
                     break
@@ -59,15 +67,41 @@ class Child:
         else:
             # Of a traceback the last line says it all.
             complaints = complaints[-1:] if complaints[:1] == ["Traceback (most recent call last):"] else complaints
-            complaints.append(f"it ended with status {self._process.wait()}")
+            complaints.append(f"it ended: {children.ending(self._process.wait(END_S))}")
         raise RunError(f"{self._name}: {'; '.join(complaints)}")
+
+    def check(self) -> None:
+        """raises RunError where it has ended"""
+        status = self._process.poll()
+        if status is not None:
+            raise RunError(f"{self._name}: it ended: {children.ending(status)}")
 
     def end(self) -> None:
         """Let it end, by force if need be."""
-        with self._process as process:
-            assert process.stdin
-            try:
-                process.stdin.close()
-                process.wait(END_S)
-            except (OSError, subprocess.TimeoutExpired):
-                process.kill()
+        assert self._process.stdin and self._process.stdout
+        with suppress(OSError):  # it is gone, with what was not written yet
+            self._process.stdin.close()
+        children.end(self._process, END_S)
+        self._process.stdout.close()
+
+    def _lines(self) -> Iterator[str]:
+        """What it says, until it has nothing more to say.
+
+        raises  RunError where it neither speaks nor ends
+        """
+        until, ready = time.monotonic() + ANSWER_S, select.poll()
+        ready.register(self._out, select.POLLIN)
+        while time.monotonic() < until:
+            while b"\n" in self._rest:
+                line, _, self._rest = self._rest.partition(b"\n")
+                yield line.decode(errors="replace")
+            signals.check()
+            if ready.poll(LOOK_MS):
+                data = os.read(self._out, 65_536)
+                if not data:
+                    break
+                self._rest += data
+        else:
+            raise RunError(f"{self._name}: it has not answered for {ANSWER_S:g} s")
+        if self._rest:
+            yield self._rest.decode(errors="replace")

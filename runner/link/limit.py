@@ -54,6 +54,9 @@ class Shaper(Protocol):
     def limit(self, kbps: float) -> Counters:
         """Set the rate; what has passed so far. raises RunError where the link is gone"""
 
+    def check(self) -> None:
+        """raises RunError where the link is gone"""
+
 
 def burst_bytes(kbps: float) -> int:
     """Size of the token bucket: two full frames, or 2 ms of the rate."""

@@ -20,21 +20,23 @@ import shutil
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link.child import Child
 from runner.link.ends import Ends, overrides
 from runner.link.limit import Counters, Limit, burst_bytes, queue_bytes
-from runner.model import Endpoint
+from runner.system.signals import urgent
 
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
 LINK, IN, OUT = "link0", "in0", "out0"  # devices of vehicle and router
 RUN = Path("/run/netns")  # where ip keeps them by name
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
 DELAYED_PACKETS = 100_000  # netem drops what is more; the queue that may drop is tbf's
+COMMAND_S = 10.0  # how long a command of iproute2 may take
 OTHERWISE = "or choose link=relay"
 
 
@@ -47,7 +49,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
     """
     ip, tc = _find("ip"), _find("tc")
     _check_allowed()
-    with _claimed(ip) as (name, network):
+    with _claimed(ip) as (name, network), urgent(lambda: _remove(ip, name)):
         try:
             machine, vehicle = _connect(ip, name, network)
             shaper = _Tbf(tc, _router(name), limit)
@@ -78,6 +80,9 @@ class _Tbf:
 
     def limit(self, kbps: float) -> Counters:
         return self._set("change", kbps)
+
+    def check(self) -> None:
+        self._tc.check()
 
     def end(self) -> None:
         self._tc.end()
@@ -217,7 +222,7 @@ def _check_allowed() -> None:
 
 def _run(*command: str) -> str:
     """Standard output of a command. raises RunError with what it says where it fails"""
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = _done(command)
     if done.returncode:
         said = " ".join(done.stderr.split()) or f"status {done.returncode}"
         raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {said}; {OTHERWISE[3:]}")
@@ -226,4 +231,11 @@ def _run(*command: str) -> str:
 
 def _said(*command: str) -> str:
     """Standard output of a command that may fail."""
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    return _done(command).stdout
+
+
+def _done(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_S)
+    except subprocess.TimeoutExpired:
+        raise RunError(f"link=netns: {' '.join(command)}: has not ended within {COMMAND_S:g} s") from None

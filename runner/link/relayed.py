@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
+from runner.core.model import Endpoint
 from runner.link.child import Child
 from runner.link.ends import Ends, overrides
 from runner.link.limit import Counters, Limit
-from runner.model import Endpoint
+from runner.system import children
 
 
 @contextmanager
@@ -29,9 +28,8 @@ def relayed(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
         "queue_ms": limit.queue_ms,
         "delay_ms": limit.delay_ms,
     }
-    paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    relay = Child("relay", (sys.executable, "-m", "runner.link.relay", json.dumps(settings)), environment)
+    command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
+    relay = Child("relay", command, children.environment())
     try:
         listens = relay.answer()
         for_operator = overrides(Endpoint(media.host, listens["media"]), control)
@@ -49,3 +47,6 @@ class _Relay:
 
     def limit(self, kbps: float) -> Counters:
         return Counters(**self._child.ask(str(kbps)))
+
+    def check(self) -> None:
+        self._child.check()

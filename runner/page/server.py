@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import mimetypes
 import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
-from importlib.util import find_spec
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
+from aiohttp.web_protocol import RequestHandler
 
-from runner.control import read_message
-from runner.errors import RunError
-from runner.model import Vehicle, plain
+from runner.core.model import Camera, Vehicle, plain
+from runner.graph import video_codec
+from runner.h264.access_unit import AccessUnit, Recent
+from runner.mqtt.messages import read_message
+from runner.operator.station import Listener, Station
 from runner.page.control import Control
 from runner.page.history import History
 from runner.page.viewer import Viewer
-from runner.ports import check_port_free
-from runner.station import Station
-from runner.units import AccessUnit, Recent
+from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
+from runner.system.files import plotly_script
+from runner.system.ports import check_port_free
 
 STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that stands for so long is marked within 150 ms
 NOTES = 50  # told to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
 SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here and not megabytes later
-HEARTBEAT_S = 30  # a viewer that vanished without a word is noticed after one and a half of these
+START_S = 10.0  # the port is known to be free: only a machine that stands still takes longer
+STOP_S = 0.5  # how long open connections may take to close
+REQUEST_S = 10.0  # a connection without a complete request for so long is closed
+PING_S = 0.5
+SILENT_S = 2.0  # a viewer that has not even answered a ping for so long is dropped, and connects again if it lives
+ENDS = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 CLOSED_ABOVE_BYTES = 1_048_576  # a message as long as this is not even read
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
@@ -38,10 +48,10 @@ POLICY = (
 )
 
 
-class Page:
+class Page(Listener):
     """The page and everybody who looks at it.
 
-    `tell` and `show` may be called from any thread; everything else happens in the page's own.
+    A listener of the station; it and `show` may be called from any thread, everything else happens in the page's own.
 
     raises  RunError where the port is in use or plotly is not installed
     """
@@ -50,14 +60,14 @@ class Page:
         self._vehicle, self._station = vehicle, station
         check_port_free(vehicle.page.endpoint)
         self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
-        self._plotly = _plotly_script()
+        self._plotly = plotly_script("page")
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
-        periods = (camera.graph.settings.get("key_interval_s") for camera in vehicle.cameras.values())
-        self._recent = [Recent(None if period is None else float(period)) for period in periods]
+        self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
         self._viewers: set[Viewer] = set()
         self._control = Control()
+        self._silent: set[RequestHandler] = set()  # new connections without a complete request
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
 
@@ -68,16 +78,22 @@ class Page:
 
     def start(self) -> None:
         self._thread.start()
-        asyncio.run_coroutine_threadsafe(self._start(), self._loop).result()
+        asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(START_S)
 
     def stop(self) -> None:
-        asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result()
+        with suppress(TimeoutError):  # a connection that does not close ends with the process
+            asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(STOP_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(timeout=5)
+        self._thread.join(STOP_S)
 
-    def tell(self, kind: str, message: Mapping[str, Any]) -> None:
-        """What is new, as `Station` tells it."""
-        self._loop.call_soon_threadsafe(self._tell, kind, message)
+    def on_state(self, state: VehicleState | None) -> None:
+        self._loop.call_soon_threadsafe(self._tell, "state", state_to_json(state))
+
+    def on_sample(self, sample: Sample) -> None:
+        self._loop.call_soon_threadsafe(self._add_sample, sample)
+
+    def on_note(self, note: Note) -> None:
+        self._loop.call_soon_threadsafe(self._add_note, {"time": note.t, "text": note.text})
 
     def show(self, camera: str, unit: AccessUnit) -> None:
         """One access unit that has just come."""
@@ -86,21 +102,57 @@ class Page:
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        app = web.Application(middlewares=[_guard])
+        app = web.Application(middlewares=[self._heard, _guard])
         app.router.add_get("/live", self._on_viewer)
         app.router.add_get("/plotly.js", lambda _: _script(self._plotly))
         app.router.add_get("/", _served(STATIC / "index.html"))
         for file in STATIC.iterdir():
             app.router.add_get(f"/static/{file.name}", _served(file))
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
+        self._runner = web.AppRunner(
+            app, access_log=None, logger=self._logger(), shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
+        )
         await self._runner.setup()
-        await web.TCPSite(self._runner, *self._address).start()
+        self._server = await self._loop.create_server(self._connection, *self._address)
+
+    def _logger(self) -> logging.Logger:
+        """What the server library complains of, without its tracebacks."""
+        logger = logging.Logger("page")
+        logger.addHandler(_Complaints(self._station.note))
+        return logger
+
+    def _connection(self) -> asyncio.Protocol:
+        """A new connection, which is closed unless its first request is complete in time."""
+        assert self._runner.server
+        connection = self._runner.server()
+        self._silent.add(connection)
+        self._loop.call_later(REQUEST_S, self._expire, connection)
+        return connection
+
+    def _expire(self, connection: RequestHandler) -> None:
+        if connection in self._silent:
+            self._silent.remove(connection)
+            connection.force_close()
+
+    async def _end(self) -> None:
+        self._server.close()
+        await self._runner.cleanup()
+
+    @web.middleware
+    async def _heard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """A request is complete."""
+        self._silent.discard(request.protocol)
+        response: web.StreamResponse = await handler(request)
+        return response
+
+    def _add_sample(self, sample: Sample) -> None:
+        self._history.add(sample)
+        self._tell("sample", {"time": sample.t, **to_json(sample)})
+
+    def _add_note(self, note: Mapping[str, Any]) -> None:
+        self._notes.append(note)
+        self._tell("note", note)
 
     def _tell(self, kind: str, message: Mapping[str, Any]) -> None:
-        if kind == "sample":
-            self._history.add(message)
-        elif kind == "note":
-            self._notes.append(message)
         for viewer in self._viewers:
             viewer.tell(kind, message)
 
@@ -116,29 +168,42 @@ class Page:
         line = request.transport.get_extra_info("socket") if request.transport else None
         if line is not None:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, heartbeat=HEARTBEAT_S)
+        ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, autoping=False)
         await ws.prepare(request)
         viewer = Viewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
         self._greet(viewer)
         self._viewers.add(viewer)
         self._control.opened(token, time.monotonic())
         self._tell_control()
-        sender = asyncio.create_task(_send(ws, viewer))
+        tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(_ping(ws))]
         try:
-            async for message in ws:
-                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                    self._on_message(viewer, message.data)
+            await self._listen(ws, viewer)
+        except TimeoutError:
+            if request.transport:
+                request.transport.abort()  # nobody answers a goodbye either
         finally:
-            sender.cancel()
+            for task in tasks:
+                task.cancel()
             self._viewers.remove(viewer)
             if token not in {other.token for other in self._viewers}:
                 self._control.closed(token, time.monotonic())
             self._tell_control()
         return ws
 
+    async def _listen(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
+        """What a viewer says, until it leaves.
+
+        raises  TimeoutError for one that makes no progress: pings go the way of the video, and answers come back
+        """
+        while (message := await ws.receive(SILENT_S)).type not in ENDS:
+            if message.type is WSMsgType.PING:
+                await asyncio.wait_for(ws.pong(message.data), SILENT_S)
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                self._on_message(viewer, message.data)
+
     def _greet(self, viewer: Viewer) -> None:
         viewer.tell("hello", _introduction(self._vehicle))
-        viewer.tell("state", self._station.state)
+        viewer.tell("state", state_to_json(self._station.state))
         viewer.tell("history", self._history.columns())
         for note in self._notes:
             viewer.tell("note", note)
@@ -171,14 +236,17 @@ class Page:
     def _on_request(self, viewer: Viewer, document: dict[str, Any]) -> None:
         identity = document.pop("id", None)
 
-        def answer(kind: str, said: Mapping[str, Any]) -> None:
-            viewer.tell(kind, {"id": identity, **said})
+        def answer(result: str, reason: str) -> None:
+            viewer.tell("reply", {"id": identity, "result": result, "reason": reason})
+
+        def on_reply(outcome: Outcome) -> None:
+            self._loop.call_soon_threadsafe(answer, outcome.result, outcome.reason)
 
         problem = self._problem(viewer.token, identity, document.get("event"))
         if problem:
-            answer("reply", {"result": "refused", "reason": problem})
+            answer("refused", problem)
         else:
-            self._station.ask(document, lambda *said: self._loop.call_soon_threadsafe(answer, *said))
+            self._station.ask(document, on_reply)
 
     def _problem(self, token: str, identity: object, event: object) -> str:
         """Why a request is not even sent to the vehicle, or ""."""
@@ -189,6 +257,26 @@ class Page:
         if self._control.seen_by(token) != "you":
             return "this page does not hold control; take it first"
         return ""
+
+
+def _recent(camera: Camera) -> Recent:
+    period = camera.graph.settings.get("key_interval_s")
+    return Recent(None if period is None else float(period), video_codec(camera.graph))
+
+
+class _Complaints(logging.Handler):
+    """Notes each fault of this server once. What is not HTTP is its sender's fault, and answered with 400."""
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        super().__init__(logging.WARNING)
+        self._note, self._noted = note, set[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        text = f"page: {record.getMessage()}" + (f": {type(error).__name__}: {error}" if error else "")
+        if not isinstance(error, HttpProcessingError) and text not in self._noted and len(self._noted) < NOTES:
+            self._noted.add(text)
+            self._note(text)
 
 
 async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
@@ -204,6 +292,14 @@ async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
         pass  # who reads the socket ends it
 
 
+async def _ping(ws: web.WebSocketResponse) -> None:
+    """Ask a viewer to say something now and then."""
+    with suppress(ConnectionError):  # who reads the socket ends it
+        while True:
+            await asyncio.sleep(PING_S)
+            await ws.ping()
+
+
 def _introduction(vehicle: Vehicle) -> dict[str, Any]:
     """What a page must know of the vehicle before anything else."""
     cameras = [
@@ -213,6 +309,7 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "height": camera.height,
             "fps": float(camera.fps),
             "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
+            "codec": video_codec(camera.graph) or None,
             "weight": plain(camera.weight),
             "scaling": [plain(factor) for factor in camera.rate_quality.scaling],
             "b_min_kbps": [plain(bound) for bound in camera.rate_quality.b_min],
@@ -226,7 +323,8 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
 @web.middleware
 async def _guard(request: web.Request, handler: Any) -> web.StreamResponse:
     """Only pages of this server, by its own name: no other site in the same browser may look or ask."""
-    allowed = {f"{host}:{request.url.port}" for host in ("127.0.0.1", "localhost")}
+    sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
+    allowed = {f"{host}:{sockname[1]}" for host in ("127.0.0.1", "localhost")}
     origin = request.headers.get("Origin")
     if request.headers.get("Host") not in allowed or (origin and origin.removeprefix("http://") not in allowed):
         raise web.HTTPForbidden(text="only for pages of this server\n")
@@ -249,14 +347,3 @@ def _served(file: Path) -> Any:
 
 async def _script(path: Path) -> web.FileResponse:
     return web.FileResponse(path)
-
-
-def _plotly_script() -> Path:
-    """The script that plotly's wheel brings.
-
-    raises  RunError
-    """
-    spec = find_spec("plotly")
-    if spec is None or spec.origin is None:
-        raise RunError("the Python module plotly is not installed: pip install 'tod-runner[page]'")
-    return Path(spec.origin).parent / "package_data" / "plotly.min.js"

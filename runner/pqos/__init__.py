@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from runner.events import BitratePredicted, Event, PositionReported
-from runner.model import Kbps, ModelError, exact, plain
+from runner.core.events import BitratePredicted, Event, PositionReported
+from runner.core.model import Kbps, ModelError, exact, plain
 from runner.pqos.bandwidth_map import BandwidthMap, Way, offset
 from runner.pqos.table import RATE, TIME, find_file, number, read_map, read_table
 

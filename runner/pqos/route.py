@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.model import ModelError
+from runner.core.model import ModelError
 from runner.pqos.bandwidth_map import EARTH_M, Floats, Ints
 
 THIN_M = 4.0  # points closer than this make a route shake

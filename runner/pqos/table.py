@@ -16,9 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.model import ModelError
+from runner.core.model import ModelError
+from runner.schema import shown
+from runner.system.files import why_no_file
 
 FINITE = sys.float_info.max
+MOST_BYTES = 200_000_000  # a month at 1 Hz
+LONGEST_HEADER = 10_000  # characters
 
 
 class Column(NamedTuple):
@@ -62,10 +66,14 @@ def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> P
     if not isinstance(name, str) or not name:
         raise ModelError(key, name, "must name a file")
     paths = [base / name for base in bases] or [Path(name)]
-    for path in paths:
-        if path.is_file():
-            return path
-    raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
+    path = next((path for path in paths if path.exists()), None)
+    if path is None:
+        raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
+    if not path.is_file():
+        raise ModelError(key, name, why_no_file(path))
+    if path.stat().st_size > MOST_BYTES:
+        raise ModelError(key, name, f"must be at most {MOST_BYTES // 1_000_000} MB long")
+    return path
 
 
 def number(settings: Mapping[str, Any], key: str, *, positive: bool = False) -> float:
@@ -107,15 +115,17 @@ def read_map(path: Path) -> NDArray[np.float64]:
 def header(path: Path) -> list[str]:
     """Column names in the first line of a CSV file, in lower case."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return [name.strip(' \t\r\n"').lower() for name in file.readline().split(",")]
+        return [name.strip(' \t\r\n"').lower() for name in file.readline(LONGEST_HEADER).split(",")]
 
 
 def _csv(path: Path, columns: Sequence[Column]) -> _Text:
     found = header(path)
     names = [next((name for name in column.names if name in found), "") for column in columns]
     if "" in names:
+        # What the file holds is not shown: it may be another than the one that was meant.
         wanted = ", ".join(" or ".join(column.names) for column in columns)
-        raise ModelError("file", f"{path}:1: {','.join(found)[:80]!r}", f"must be a header with the columns {wanted}")
+        lacks = ", ".join(column.names[0] for column, name in zip(columns, names, strict=True) if not name)
+        raise ModelError("file", f"{path}:1: no column {lacks}", f"must be a header with the columns {wanted}")
     index = [found.index(name) for name in names]
 
     def rows() -> Iterator[tuple[int, Sequence[str]]]:
@@ -192,5 +202,5 @@ def _not_a_number(path: Path, text: _Text) -> ModelError:
             try:
                 float(cell)
             except ValueError:
-                return ModelError("file", f"{path}:{line}: {name} {cell!r}", "must be a number")
+                return ModelError("file", f"{path}:{line}: {name} {shown(cell)}", "must be a number")
     return ModelError("file", path, "must hold plain decimal numbers only")

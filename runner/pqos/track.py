@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from runner.events import PositionReported
-from runner.model import ModelError
+from runner.core.events import PositionReported
+from runner.core.model import ModelError
 from runner.pqos import SLOWEST_MPS
 from runner.pqos.bandwidth_map import Floats, offset
 from runner.pqos.route import route

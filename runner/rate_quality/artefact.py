@@ -11,8 +11,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from runner.core.model import Camera, plain
 from runner.errors import UserError
-from runner.model import Camera, plain
 from runner.rate_quality.cache import digest
 from runner.rate_quality.choice import Choice
 from runner.rate_quality.curves import Crossing, Ladder, Point
@@ -129,7 +129,7 @@ def read_model(path: Path) -> dict[str, Any]:
         document = schema.read_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise wrong((error.strerror or str(error)).lower()) from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise wrong(f"is no model file: {error}") from None
     if isinstance(document, dict) and document.get("version", VERSION) != VERSION:
         raise wrong(f"is of version {document['version']}, this tod-runner reads {VERSION}")

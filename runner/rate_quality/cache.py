@@ -9,8 +9,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from runner.files import write_whole
 from runner.rate_quality.curves import Point
+from runner.system.files import write_whole
 
 
 def digest(*parts: object) -> str:

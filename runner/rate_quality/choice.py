@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import ceil
 from statistics import fmean
 
-from runner.model import plain
+from runner.core.model import plain
 from runner.rate_quality.curves import (
     Crossing,
     Curves,

@@ -7,23 +7,23 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
+from runner.clips import cache_directory
+from runner.core.model import Camera, ModelError, Progress, Vehicle
 from runner.errors import RunError, UserError
-from runner.files import why_no_file, write_whole
 from runner.graph import compile_graph
-from runner.model import Camera, ModelError, Progress, Vehicle
+from runner.lanes import Lane, cut, fragment
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest
 from runner.rate_quality.choice import Wishes, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
-from runner.rate_quality.lanes import Lane, cut, fragment
 from runner.rate_quality.metrics import Metric, find_metric
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.sequence import as_filmed, survey
 from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep
 from runner.rate_quality.workers import open_executor, parallel_tasks
-from runner.sources import cache_directory
+from runner.system.files import why_no_file, write_whole
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from runner.lanes import Lane
 from runner.rate_quality.curves import Curves, Ladder, Point, Score, along, best_ladder, draw_curves
-from runner.rate_quality.lanes import Lane
 
 FIRST_RATES = 4  # of the adaptive plan, for each factor
 CLOSE = 1.05  # a crossing is known when both factors were encoded so near to it

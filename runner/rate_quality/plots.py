@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from runner.files import write_whole
-from runner.model import plain
+from runner.core.model import plain
 from runner.rate_quality.artefact import Measured
 from runner.rate_quality.curves import Curves, along, draw_curves, mean_score
+from runner.system.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,11 +10,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
+from runner.core.model import Camera
 from runner.errors import RunError, UserError
-from runner.model import Camera
+from runner.lanes import FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
-from runner.rate_quality.lanes import FRAMES, LaneSet
-from runner.recordings import INDEX
+from runner.rate_quality.recordings import INDEX
 
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma

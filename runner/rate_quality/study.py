@@ -10,7 +10,7 @@ from math import gcd
 from pathlib import Path
 from typing import Any
 
-from runner.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain, suggest
+from runner.core.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain, suggest
 
 FEWEST_SCORED = 40  # frames; fewer make a mean that the next sequence does not confirm
 

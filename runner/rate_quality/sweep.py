@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+from runner.core.model import Roi
 from runner.graph import Plan
-from runner.model import Roi
+from runner.lanes import Lane, compile_lanes, fragment
 from runner.rate_quality.cache import Cache, digest, point_from_json, point_to_json
 from runner.rate_quality.curves import Point
-from runner.rate_quality.lanes import Lane, compile_lanes, fragment
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.task import Cancelled, Task, run_task
 

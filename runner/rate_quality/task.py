@@ -8,10 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from runner.core.model import Roi
 from runner.errors import RunError
-from runner.model import Roi
+from runner.lanes import Lane, LaneSet
 from runner.rate_quality.curves import Point
-from runner.rate_quality.lanes import Lane, LaneSet
 
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Meter, Metric

@@ -12,6 +12,7 @@ from multiprocessing import get_context
 from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
+from runner.system.bound import die_with
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -36,7 +37,12 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
             yield executor
         return
     # GStreamer's threads do not survive a fork.
-    pool = ThreadPoolExecutor(parallel) if workers == "threads" else ProcessPoolExecutor(parallel, get_context("spawn"))
+    pool: Executor
+    if workers == "threads":
+        pool = ThreadPoolExecutor(parallel)
+    else:
+        # Idle workers wait for ever for a process that was killed.
+        pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
     try:
         yield pool
     finally:
@@ -49,7 +55,7 @@ def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise RunError("workers=dask needs Dask: pip install 'tod-runner[cluster]'") from None
+        raise RunError("workers=dask needs Dask: install the extra cluster, see docs/install.md") from None
     with ExitStack() as stack:
         try:
             own = {"n_workers": parallel, "threads_per_worker": 1, "dashboard_address": None}

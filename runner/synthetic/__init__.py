@@ -1,73 +1,31 @@
 """The `synthetic` source: a procedural drive, rendered once into a cache as one clip per camera.
 
-The street repeats after one lap, so the last frame of a clip is followed by its first. This module holds what needs
-neither numba nor GStreamer: what a camera sees, where its clip lies, who renders it. The street is in
-`world.py`, the picture in `picture.py`, the file in `gst/clip_writer.py`.
+The street repeats after one lap, so the last frame of a clip is followed by its first. This module shares the work out;
+the street is in `world.py`, the picture in `picture.py`, the file in `gst/clip_writer.py`.
 """
 
 from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import multiprocessing
 import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from fractions import Fraction
 from importlib.util import find_spec
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from runner.model import ModelError, Pose, Progress
+from runner.clips import View, clip_path
+from runner.core.model import Progress
 
-RENDERER_VERSION = 2  # raise it with every change that changes pictures or files
 SHORTEST_S = 4
 BYTES_PER_PIXEL = 0.15  # upper estimate of a clip's size, for the check of the disk
 UNFINISHED = ".part"
 REPORT_EVERY_S = 0.25  # of drive
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """What one camera sees of the drive.
-
-    width, height  px, even
-    fov_deg        horizontal field of view; below 180 for a pinhole
-    lens           "pinhole" or "fisheye" (equidistant, fills the whole picture)
-    """
-
-    width: int
-    height: int
-    fps: Fraction
-    pose: Pose
-    fov_deg: float
-    lens: str
-
-    def __post_init__(self) -> None:
-        if self.lens not in ("pinhole", "fisheye"):
-            raise ModelError("lens", repr(self.lens), "must be pinhole or fisheye")
-        if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
-            raise ModelError("size", f"{self.width}x{self.height}", "both sides must be even and at least 16 px")
-        if not 0 < self.fov_deg <= (360 if self.lens == "fisheye" else 170):
-            rule = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
-            raise ModelError("fov_deg", f"{self.fov_deg:g}", rule)
-        if self.pose.z_m <= 0 or self.fps <= 0:
-            raise ModelError("pose.z_m", f"z_m {self.pose.z_m:g}, fps {self.fps}", "must be above 0")
-
-    def frames(self, seconds: float) -> int:
-        """Number of frames of a clip of that many seconds."""
-        return round(seconds * self.fps)
-
-
-def clip_path(view: View, seconds: float, cache: Path) -> Path:
-    """Where the clip of a view lies: its name is a digest of everything that its pictures depend on."""
-    digest = hashlib.sha256(repr((RENDERER_VERSION, view, float(seconds))).encode()).hexdigest()
-    return cache / f"drive-{digest[:20]}.mp4"
 
 
 def render(views: Sequence[View], seconds: float, cache: Path, progress: Progress) -> None:
@@ -114,7 +72,7 @@ def _remove_unfinished(cache: Path) -> None:
 
 def _need_numba() -> None:
     if find_spec("numba") is None:
-        raise RuntimeError("the synthetic drive needs numba: pip install 'tod-runner[synthetic]'")
+        raise RuntimeError("the synthetic drive needs numba: install the extra synthetic, see docs/install.md")
 
 
 def _pixels(view: View, seconds: float) -> int:
@@ -212,7 +170,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
 
 def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: Callable[[int], None]) -> None:
     """Render into a file beside the clip and rename it: a clip is there in full or not at all."""
-    from runner.gst.clip_writer import write_clip
+    from runner.apply import write_clip
     from runner.synthetic.picture import pictures
 
     clip = clip_path(view, seconds, cache)

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.model import Pose
-from runner.synthetic import View
+from runner.clips import View
+from runner.core.model import Pose
 from runner.synthetic.world import (
     GROUND,
     LEVELS,

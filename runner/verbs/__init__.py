@@ -8,7 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from runner.configuration.files import GROUPS
+from runner.core.model import suggest
 from runner.errors import UserError
+from runner.schema import schema_document
+
+DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
 
 
 class Verb(NamedTuple):
@@ -25,34 +30,36 @@ class Verb(NamedTuple):
 
 VERBS = {
     "print": Verb("what would run, and why; starts nothing", "runner.verbs.print", ("total_kbps", "format")),
-    "validate": Verb("check every file and every combination", "runner.verbs.validate", ()),
+    "validate": Verb("check your files and what they compose to", "runner.verbs.validate", ("all",), "FILE"),
     "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
-    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), "DRIVE"),
-    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), "DRIVE"),
-    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), "DRIVE"),
-    "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", ()),
+    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
+    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
+    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
+    "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", (), "VERB"),
 }
 
 
-# By Python module, the extra of this package that brings it.
+# By extra of this package, the Python modules that it brings.
 EXTRAS = {
-    "paho": "live",
-    "rich": "live",
-    "aiohttp": "page",
-    "plotly": "page",
-    "numba": "synthetic",
-    "cv2": "model",
-    "scipy": "model",
-    "matplotlib": "model",
-    "imageio_ffmpeg": "vmaf",
-    "distributed": "cluster",
-    "foxglove": "mcap",
+    "live": ("paho", "rich"),
+    "page": ("aiohttp", "plotly"),
+    "synthetic": ("numba",),
+    "model": ("numba", "cv2", "scipy", "matplotlib"),
+    "report": ("matplotlib", "plotly"),
+    "vmaf": ("imageio_ffmpeg",),
+    "cluster": ("distributed",),
+    "mcap": ("foxglove",),
 }
+
+
+def extra_of(module: str) -> str | None:
+    """The extra that brings a Python module; None: no extra does."""
+    return next((extra for extra, modules in EXTRAS.items() if module in modules), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +79,7 @@ class Arguments:
     def parse(verb: str, words: Sequence[str]) -> Arguments:
         """Split the words. A path given to an argument may hold any character, since Hydra never sees it.
 
-        raises  UserError for a flag, which no verb has
+        raises  UserError for a flag, which no verb has, and for a name that only another verb takes or nothing has
         """
         own = (*VERBS[verb].arguments, "conf")
         values: dict[str, str] = {}
@@ -83,11 +90,14 @@ class Arguments:
                 values[key] = value
             elif word.startswith("-"):
                 raise UserError("command line", "", word, "there are no flags; write NAME=VALUE, or --help")
-            elif VERBS[verb].takes and (not equals or "/" in key):  # a path may hold a = of its own
+            elif VERBS[verb].takes == DRIVE and (not equals or "/" in key):  # a path may hold a = of its own
                 plain.append(word)
             elif not equals and not word.startswith("~"):
-                raise UserError("command line", "", word, "must be NAME=VALUE")
+                if not VERBS[verb].takes:
+                    raise UserError("command line", "", word, "must be NAME=VALUE")
+                plain.append(word)
             else:
+                _check_name(verb, key)
                 overrides.append(word)
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain))
@@ -114,3 +124,32 @@ class Arguments:
 
     def path(self, key: str) -> Path | None:
         return Path(self.values[key]) if key in self.values else None
+
+
+def _check_name(verb: str, key: str) -> None:
+    """Refuse what is surely no override: an argument of another verb, or a misspelt word.
+
+    raises  UserError; names that nothing comes near to are left to the schema of the configuration
+    """
+    if VERBS[verb].takes == DRIVE:  # these verbs read no configuration
+        return
+    name = key.lstrip("+~/").partition("@")[0].partition(".")[0]
+    own = (*VERBS[verb].arguments, "conf")
+    configured = [*GROUPS, *schema_document("composed")["properties"]]
+    if verb in ("model", "doctor"):
+        configured += schema_document("study")["properties"]  # these stand alone there
+    if name in configured:
+        return
+    takers = [other for other, its in VERBS.items() if name in its.arguments]
+    if takers:
+        rule = f"is an argument of {', '.join(takers)}; {verb} has {', '.join(own)}"
+        raise UserError("command line", name, None, rule)
+    hint = suggest(name, (*own, *configured))
+    if "did you mean" in hint:
+        raise UserError("command line", name, None, f"unknown name, {hint}")
+
+
+def study_word(word: str) -> str:
+    """An override of the verb `model`, where a key of conf/study/ stands alone: metric=psnr is study.metric=psnr."""
+    key = word.replace(".", "=").partition("=")[0]
+    return f"study.{word}" if key in schema_document("study")["properties"] else word

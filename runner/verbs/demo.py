@@ -24,33 +24,34 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from runner.broker import private_broker
-from runner.compose import conf_directories
-from runner.config import composed, load_experiment, load_run
+from runner.configuration.config import Configuration, configuration
+from runner.configuration.experiment import LinkSettings
+from runner.configuration.files import conf_directories
+from runner.core.model import Vehicle
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
-from runner.errors import RunError, UserError
-from runner.experiment import LinkSettings
+from runner.errors import UserError
 from runner.link import LimitedLink, limited_link
-from runner.model import Vehicle
-from runner.sources import render_missing
+from runner.mqtt.broker import private_broker
+from runner.plans import render_missing
+from runner.system import children, signals
+from runner.system.children import VerbProcess
 from runner.verbs import Arguments
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
 
 FPS_PER_CORE = 5  # Hz; what is encoded, sent, decoded and shown eight times without falling behind
 LOOK_S = 0.05  # how soon after a side's end the other is stopped
+SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
+END_S = 2.8  # both sides, link and broker
 DRIVE = "drive"  # where a drive lies below output=
 
 
@@ -59,6 +60,7 @@ class _Run(NamedTuple):
 
     arguments  with the overrides of this one
     directory  where it is logged; None: nowhere
+    document   its composed configuration
     """
 
     name: str
@@ -66,63 +68,88 @@ class _Run(NamedTuple):
     vehicle: Vehicle
     directory: Path | None
     link: LinkSettings | None
+    document: dict[str, Any]
 
 
 def run(arguments: Arguments) -> int:
     apply = streaming()
-    arguments = _with_rate(arguments)
-    experiment, link = load_experiment(arguments.overrides, arguments.conf)
+    arguments, config = _with_rate(arguments)
+    experiment, link = config.experiment()
     duration_s = arguments.number("duration_s")
     duration_s = experiment.duration_s if duration_s is None else duration_s
     output, models = arguments.path("output"), arguments.path("models")
     if output:
         check_report(output, models)
+        _check_empty(output)
     elif models:
         raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
-    runs = [_prepared(arguments, name, words, link, apply) for name, words in (experiment.runs or {"": ()}).items()]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no side is left behind
+    runs = [
+        _prepared(arguments, name, words, config, link, apply) for name, words in (experiment.runs or {"": ()}).items()
+    ]
     if experiment.about:
         say(experiment.about)
-    status, driven = 0, list[Path]()
+    driven = list[Path]()
     for number, one in enumerate(runs, 1):
         if one.name:
             say(f"drive {number} of {len(runs)}: {one.name}, {duration_s:g} s")
-        status = _drive(one, duration_s)
-        if status:
-            break
+        _drive(one, duration_s)
         driven += [one.directory] if one.directory else []
     if output and driven:
         bases = [base / "cameras" for base in conf_directories(arguments.conf)]
-        say(f"report: {report(driven, output, models, bases)}")
-    return status
+        with signals.interruptible():
+            say(f"report: {report(driven, output, models, bases)}")
+    return 0
+
+
+def _check_empty(output: Path) -> None:
+    """Whether all that will lie in the directory comes from this demo.
+
+    raises  UserError
+    """
+    try:
+        found = sorted(path.name for path in output.iterdir()) if output.exists() else []
+    except OSError as error:
+        raise UserError("command line", "output", repr(str(output)), (error.strerror or str(error)).lower()) from None
+    if found:
+        rule = f"must be a new or an empty directory, holds {', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
+        raise UserError("command line", "output", repr(str(output)), rule)
 
 
 def _prepared(
-    arguments: Arguments, name: str, words: Sequence[str], link: LinkSettings | None, apply: ModuleType
+    arguments: Arguments,
+    name: str,
+    words: Sequence[str],
+    config: Configuration,
+    link: LinkSettings | None,
+    apply: ModuleType,
 ) -> _Run:
-    """All that a drive needs, looked at before the first begins; `link` is that of a run which adds nothing."""
+    """All that a drive needs, checked before the first begins; `config` and `link` are those of a run without words."""
     own = replace(arguments, overrides=[*arguments.overrides, *words])
     directory = _directory(arguments, name)
     if words:
-        _, link = load_experiment(own.overrides, own.conf)
+        config = configuration(own.overrides, own.conf, runnable=False)
+        _, link = config.experiment()
     if link and directory is None:
         raise UserError(
             "command line", "link", link.kind, "what it does is to be looked at: give log=DIR or output=OUT"
         )
-    vehicle, _, _ = load_run(own.overrides, own.conf, check=apply.check_plan)
+    config = config.drivable(apply.check_plan)
+    config.pqos()
+    vehicle = config.vehicle()
     with progress_bar() as progress:
         render_missing(vehicle, progress)
-    return _Run(name, own, vehicle, directory, link)
+    return _Run(name, own, vehicle, directory, link, config.document)
 
 
-def _with_rate(arguments: Arguments) -> Arguments:
+def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
     """With a frame rate that this machine carries, where neither the user nor an experiment names one."""
-    if any(word.lstrip("+~").startswith("fps_max") for word in arguments.overrides):
-        return arguments
-    if composed(arguments.overrides, arguments.conf).document.get("fps_max") is not None:
-        return arguments
+    config = configuration(arguments.overrides, arguments.conf, runnable=False)
+    named = any(word.lstrip("+~").startswith("fps_max") for word in arguments.overrides)
+    if named or config.document.get("fps_max") is not None:
+        return arguments, config
     fps_max = f"fps_max={FPS_PER_CORE * len(os.sched_getaffinity(0))}"
-    return replace(arguments, overrides=[fps_max, *arguments.overrides])
+    arguments = replace(arguments, overrides=[fps_max, *arguments.overrides])
+    return arguments, configuration(arguments.overrides, arguments.conf, runnable=False)
 
 
 def _directory(arguments: Arguments, run: str) -> Path | None:
@@ -141,44 +168,62 @@ def _directory(arguments: Arguments, run: str) -> Path | None:
     return directory
 
 
-def _drive(run: _Run, duration_s: float) -> int:
-    """One drive of both sides; returns the operator's exit status.
+def _drive(run: _Run, duration_s: float) -> None:
+    """One drive of both sides.
 
-    raises  RunError where the vehicle's side or the link ends before the operator's
+    raises  RunError where a part of it ends early, KeyboardInterrupt where a signal came
     """
     own = [*run.arguments.overrides, *([f"conf={run.arguments.conf}"] if run.arguments.conf else [])]
     own += [f"log={run.directory}"] if run.directory else []
     with (
-        tempfile.TemporaryFile("w+") as said,
+        signals.stopping(END_S),
         _link(run) as (link, log),
-        private_broker(link.broker if link else run.vehicle.control),
-        _side("vehicle", [*own, *(link.vehicle_overrides if link else ())], link, said.fileno()) as vehicle,
-        _side("operator", [*own, *(link.operator_overrides if link else ()), f"duration_s={duration_s}"]) as operator,
+        private_broker(link.broker if link else run.vehicle.control) as broker,
+        _sides(own, link, duration_s) as (vehicle, operator),
     ):
-        waiting = link is not None
+        began, waiting = time.monotonic(), link is not None
+        while operator.poll() != 0 or time.monotonic() < began + duration_s:
+            signals.check()
+            for part in (broker, link, vehicle, operator):
+                if part:
+                    part.check()
+            if waiting and link and run.directory and (at := _began(run.directory)):
+                waiting = False
+                log.begin(at)
+                link.start(at)
+            time.sleep(LOOK_S)
+
+
+@contextmanager
+def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) -> Iterator[tuple[VerbProcess, ...]]:
+    """Both sides as processes, vehicle and operator. What the vehicle says is told only where it matters."""
+    to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
+    with tempfile.TemporaryFile("w+") as said, ExitStack() as stack:
+        before = link.vehicle_command if link else ()
+        sides = (
+            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, said),
+            VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={duration_s}"]),
+        )
+        for side in sides:
+            stack.enter_context(signals.urgent(side.kill))
         try:
-            while (status := operator.poll()) is None and vehicle.poll() is None:
-                if waiting and link and run.directory and (began := _began(run.directory)):
-                    waiting = False
-                    log.begin(began)
-                    link.start(began)
-                if link:
-                    link.check()
-                time.sleep(LOOK_S)
+            yield sides
         finally:
-            early = vehicle.poll()
-            for side in (operator, vehicle):
-                side.terminate()
-            for side in (operator, vehicle):
-                side.wait()
-        said.seek(0)
-        text = said.read().strip()
-        if early is not None:
-            raise RunError(f"the vehicle's side ended early:\n{text}")
-        for line in text.splitlines():
-            if WITHOUT_LOG in line:
-                say(line)
-    return status or 0
+            _end(sides)
+            said.seek(0)
+            for line in said:
+                if WITHOUT_LOG in line:
+                    say(line.rstrip())
+
+
+def _end(sides: Iterable[VerbProcess]) -> None:
+    """Ask both sides to end, and kill what does not."""
+    until = time.monotonic() + SIDE_END_S
+    for side in sides:
+        side.ask()
+    for side in sides:
+        if not children.end(side.process, max(0.0, until - time.monotonic())):
+            say(f"{side.name} did not end within {SIDE_END_S:g} s and was killed")
 
 
 @contextmanager
@@ -188,11 +233,10 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
     if settings is None:
         yield None, Log(None, "link", {}, {}, say)
         return
-    config = composed(run.arguments.overrides, run.arguments.conf).document
-    log = Log(run.directory, "link", config, {}, say)
+    log = Log(run.directory, "link", run.document, {}, say)
     try:
         media, control = run.vehicle.media, run.vehicle.control
-        with limited_link(settings.kind, settings.limit, media, control, log.write) as link:
+        with limited_link(settings.kind, settings.limit, media, control, log.record) as link:
             yield link, log
     finally:
         log.close()
@@ -205,13 +249,3 @@ def _began(directory: Path) -> float | None:
             return float(json.loads(file.readline())["time"])
     except (OSError, ValueError):
         return None
-
-
-def _side(
-    verb: str, words: Sequence[str], link: LimitedLink | None = None, stderr: int | None = None
-) -> subprocess.Popen[bytes]:
-    """One side in a process of its own, with the same Python."""
-    command = [*(link.vehicle_command if link else ()), sys.executable, "-m", "runner", verb, *words]
-    root = str(Path(__file__).resolve().parents[2])
-    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return subprocess.Popen(command, stderr=stderr, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)})

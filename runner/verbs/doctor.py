@@ -1,34 +1,40 @@
-"""usage: tod-runner doctor [OVERRIDE ...]
+"""usage: tod-runner doctor [VERB] [OVERRIDE ...]
 
-What this machine lacks for what the configuration asks for, and what brings it: Python packages, GStreamer and its
-bindings, elements, broker, free ports, cores. Ends with status 1 where something is missing.
+What this machine lacks for a verb with this configuration, and what brings it: Python packages, GStreamer and its
+bindings, elements, broker, free ports, cores. Without a verb it is `demo`, which takes what both sides take. Ends with
+status 1 where something is missing.
 
   tod-runner doctor
-  tod-runner doctor vehicle=delivery_robot graph=h264_va_rtsp
+  tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
+  tod-runner doctor model metric=vmaf
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from runner.broker import find_mosquitto
-from runner.config import load
-from runner.errors import RunError
-from runner.model import Vehicle
-from runner.ports import check_port_free
-from runner.sources import compile_plans
-from runner.verbs import EXTRAS, Arguments
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint, Vehicle, suggest
+from runner.errors import MissingBindings, RunError, UserError
+from runner.mqtt.broker import find_mosquitto
+from runner.plans import compile_plans
+from runner.system.ports import check_port_free
+from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
-TYPELIBS = {  # Debian package by typelib
-    "Gst": "gir1.2-gstreamer-1.0",
-    "GstRtp": "gir1.2-gst-plugins-base-1.0",
-    "GstRtsp": "gir1.2-gst-plugins-base-1.0",
-    "GstRtspServer": "gir1.2-gst-rtsp-server-1.0",
-}
 CORE_MPX_S = 180  # what one core crops, scales and encodes in a second at factor 0.5, measured with h264_rtsp
+STREAMING = ("vehicle", "operator", "demo", "record", "model")  # verbs that need GStreamer
+NEEDED = {  # extras of this package that a verb needs whatever the configuration says
+    "vehicle": ("live",),
+    "operator": ("live",),
+    "demo": ("live",),
+    "record": ("live",),
+    "model": ("model",),
+    "report": ("report",),
+    "export": ("mcap",),
+}
 
 
 class Finding(NamedTuple):
@@ -39,47 +45,66 @@ class Finding(NamedTuple):
 
 
 def run(arguments: Arguments) -> int:
-    vehicle = load(arguments.overrides, arguments.conf, runnable=False)
-    findings = list(examine(vehicle))
+    verb = _verb(arguments)
+    overrides = [study_word(word) for word in arguments.overrides] if verb == "model" else arguments.overrides
+    config = configuration(overrides, arguments.conf, runnable=False)
+    findings = list(examine(verb, config.vehicle(), config.document))
     for fine, what in findings:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
+    if not findings:
+        print(f"ok      {verb} needs nothing besides this package")
     return 0 if all(fine for fine, _ in findings) else 1
 
 
-def examine(vehicle: Vehicle) -> Iterator[Finding]:
-    """Everything that the live verbs need."""
-    for module, extra in EXTRAS.items():
-        there = _importable(module)
-        yield Finding(there, f"Python module {module}" + ("" if there else f": pip install 'tod-runner[{extra}]'"))
-    bindings = list(_bindings())
-    yield from bindings
-    if all(finding.fine for finding in bindings):
-        yield from _elements(vehicle)
-    try:
-        yield Finding(True, f"MQTT broker {find_mosquitto()}, for the demo")
-    except RunError as error:
-        yield Finding(False, str(error))
-    yield from _ports(vehicle)
-    yield _cores(vehicle)
+def _verb(arguments: Arguments) -> str:
+    words = arguments.words or ("demo",)
+    if len(words) > 1:
+        raise UserError("command line", "", words[1], "must be one verb")
+    if words[0] not in VERBS:
+        raise UserError("command line", "", words[0], f"unknown verb, {suggest(words[0], VERBS)}")
+    return words[0]
 
 
-def _importable(module: str) -> bool:
-    return find_spec(module) is not None
+def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Everything that a verb needs with this configuration."""
+    for extra in _extras(verb, vehicle, document):
+        for module in EXTRAS[extra]:
+            there = find_spec(module) is not None
+            hint = "" if there else f": install the extra {extra}, see docs/install.md"
+            yield Finding(there, f"Python module {module}{hint}")
+    if verb in STREAMING:
+        bindings = list(_bindings())
+        yield from bindings
+        if all(finding.fine for finding in bindings):
+            yield from _elements(vehicle)
+    if verb == "demo":
+        yield _broker()
+    yield from _ports(verb, vehicle)
+    if verb in ("vehicle", "demo"):
+        yield _cores(vehicle)
+
+
+def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[str]:
+    """Extras of this package that a verb needs."""
+    yield from NEEDED.get(verb, ())
+    if verb in ("operator", "demo") and vehicle.page.serve:
+        yield "page"
+    if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
+        yield "synthetic"
+    if verb == "model":
+        study = document["study"]
+        yield from ["vmaf"] if "vmaf" in study["metric"] else []
+        yield from ["cluster"] if study["workers"] == "dask" else []
 
 
 def _bindings() -> Iterator[Finding]:
-    if not _importable("gi"):
-        yield Finding(False, "Python module gi: apt-get install python3-gi, and a virtual environment that sees it")
-        return
-    import gi
-
-    for name, package in TYPELIBS.items():
-        try:
-            gi.require_version(name, "1.0")
-        except ValueError:
-            yield Finding(False, f"typelib {name}: apt-get install {package}")
-        else:
-            yield Finding(True, f"typelib {name}")
+    """GStreamer's Python bindings: PyGObject and typelibs."""
+    try:
+        from runner import apply
+    except MissingBindings as error:
+        yield from (Finding(False, f"{part}: {why}") for part, why in error.missing.items())
+    else:
+        yield from (Finding(True, f"typelib {name}") for name in apply.TYPELIBS)
 
 
 def _elements(vehicle: Vehicle) -> Iterator[Finding]:
@@ -94,9 +119,21 @@ def _elements(vehicle: Vehicle) -> Iterator[Finding]:
         yield Finding(True, f"{len(names)} GStreamer elements")
 
 
-def _ports(vehicle: Vehicle) -> Iterator[Finding]:
-    ports = {"media.port": vehicle.media, "control.port": vehicle.control}
-    if vehicle.page.serve:
+def _broker() -> Finding:
+    try:
+        return Finding(True, f"MQTT broker {find_mosquitto()}, for the demo")
+    except RunError as error:
+        return Finding(False, str(error))
+
+
+def _ports(verb: str, vehicle: Vehicle) -> Iterator[Finding]:
+    """Ports that a verb listens on."""
+    ports: dict[str, Endpoint] = {}
+    if verb in ("vehicle", "demo"):
+        ports["media.port"] = vehicle.media
+    if verb == "demo":
+        ports["control.port"] = vehicle.control
+    if verb in ("operator", "demo") and vehicle.page.serve:
         ports["page.port"] = vehicle.page.endpoint
     for key, endpoint in ports.items():
         try:

@@ -26,7 +26,9 @@ from typing import Any, BinaryIO
 
 from runner.drive.read import read_drive
 from runner.errors import RunError, UserError
-from runner.files import unfinished
+from runner.records import VideoBegan
+from runner.system import signals
+from runner.system.files import unfinished
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
@@ -49,7 +51,7 @@ def run(arguments: Arguments) -> int:
     drive = read_drive(directory)
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
-    filmed = any(line.get("log") == "video" for side in drive.sides.values() for line in side.lines)
+    filmed = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
     read_video = streaming().read_video if filmed else _nothing
     with _new(output) as file, _later(f"{output}") as progress:
         count = write_mcap(drive, file, read_video, lambda what: print(what, file=sys.stderr), progress)
@@ -85,6 +87,7 @@ def _later(what: str) -> Iterator[Callable[[float], None]]:
     with progress_bar() as tell:
 
         def progress(done: float) -> None:
+            signals.check()
             if time.monotonic() - began > QUIET_S:
                 tell(what, done)
 

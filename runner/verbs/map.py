@@ -19,7 +19,7 @@ from runner.drive.capacity import Cell, Sample, cannot_tell, cells, limited_samp
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.errors import RunError, UserError
-from runner.files import whole_file
+from runner.system.files import whole_file
 from runner.verbs import Arguments
 
 PERCENTILE, CELL_M = 10.0, 10.0

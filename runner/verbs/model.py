@@ -23,17 +23,16 @@ What was measured is kept by content in the user's cache: a run that is interrup
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.compose import conf_directories, options
-from runner.config import load_study
+from runner.configuration.config import configuration
+from runner.configuration.files import conf_directories, options
+from runner.core.model import ModelError, Vehicle, suggest
 from runner.errors import ConfigError, Problem, RunError, UserError
-from runner.model import ModelError, Vehicle, suggest
-from runner.schema import schema_document
-from runner.verbs import Arguments
+from runner.system import signals
+from runner.verbs import Arguments, study_word
 from runner.verbs.screen import progress_bar, say, streaming
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ def run(arguments: Arguments) -> int:
     paths = _sequences(arguments, vehicle, names)
     from runner.rate_quality.measure import measure
 
-    with progress_bar() as progress:
+    with progress_bar() as progress, signals.interruptible():
         for written in measure(vehicle, study, {name: paths[name] for name in names}, output, progress, say):
             print(written)
     return 0
@@ -77,7 +76,7 @@ def _need_libraries() -> None:
 
     missing = [name for name in ("numba", "cv2", "scipy", "matplotlib") if find_spec(name) is None]
     if missing:
-        raise RunError(f"the Python modules {', '.join(missing)} are not installed: pip install 'tod-runner[model]'")
+        raise RunError(f"the Python modules {', '.join(missing)} are not installed: extra model, see docs/install.md")
 
 
 def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
@@ -85,27 +84,24 @@ def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     from runner.apply import check_plan
     from runner.rate_quality.study import check_cameras
 
-    words = [_study_word(word) for word in arguments.overrides]
+    words = [study_word(word) for word in arguments.overrides]
     wanted = arguments.values.get("camera")
-    vehicle, study = load_study(words, arguments.conf, check=check_plan)
+    config = configuration(words, arguments.conf, runnable=False, check=check_plan)
+    study, vehicle = config.study(), config.vehicle()
     if wanted and wanted not in vehicle.cameras:
         kinds = options("cameras", conf_directories(arguments.conf))
         if wanted not in kinds:
             hint = suggest(wanted, [*vehicle.cameras, *kinds])
             raise UserError("command line", "camera", repr(wanted), f"is neither mounted nor a kind of camera, {hint}")
-        vehicle, study = load_study([*words, f"+cameras@cameras.{wanted}={wanted}"], arguments.conf, check=check_plan)
+        words.append(f"+cameras@cameras.{wanted}={wanted}")
+        config = configuration(words, arguments.conf, runnable=False, check=check_plan)
+        study, vehicle = config.study(), config.vehicle()
     names = [wanted] if wanted else list(vehicle.cameras)
     try:
         check_cameras(study, names)
     except ModelError as error:
         raise UserError("command line", error.key, str(error.found), error.rule) from None
     return vehicle, study, names
-
-
-def _study_word(word: str) -> str:
-    """A key of conf/study/ that stands alone."""
-    key = re.split(r"[=.]", word.lstrip("+~"), maxsplit=1)[0]
-    return f"study.{word}" if key in schema_document("study")["properties"] and word[0] not in "+~" else word
 
 
 def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Path]:
@@ -136,7 +132,7 @@ def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Pa
     """The clip that each camera's source plays; a drive that is not rendered yet is rendered first."""
     from dataclasses import replace
 
-    from runner.sources import compile_plans, render_missing
+    from runner.plans import compile_plans, render_missing
 
     wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
     with progress_bar() as progress:

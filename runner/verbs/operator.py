@@ -14,84 +14,47 @@ comes is written to DIR/operator.jsonl, for `report` and `export`.
 from __future__ import annotations
 
 import gc
-import signal
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from runner.config import composed, load
-from runner.drive.heard import listener
-from runner.drive.log import Log
-from runner.model import Vehicle
-from runner.sources import compile_plans
-from runner.station import Station
+from runner.operator.live import LiveOperator, live_operator
+from runner.system.signals import stopping
 from runner.verbs import Arguments
-from runner.verbs.screen import streaming
+from runner.verbs.screen import SWITCH_S, streaming
 from runner.verbs.table import Table, show_summary
 
 if TYPE_CHECKING:
-    from runner.apply import OperatorSide
     from runner.page.server import Page
 
-SAMPLE_S = 0.25
-SWITCH_S = 0.0005  # a thread that has a frame to pass on waits no longer than this for one that draws a table
+SHOW_S = 0.25
 
 
 def run(arguments: Arguments) -> int:
-    apply = streaming()
+    streaming()
     duration = arguments.number("duration_s")
-    vehicle = load(arguments.overrides, arguments.conf, runnable=False, check=apply.check_plan)
-    log = arguments.path("log")
-    plans = compile_plans(vehicle)
-    config = composed(arguments.overrides, arguments.conf).document if log else {}
-    versions = apply.versions(element for plan in plans for element in plan.operator)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
     sys.setswitchinterval(SWITCH_S)
-    with Table() as table:
-        station = Station(vehicle)
-        station.listeners.append(table.tell)
-        drive = Log(log, "operator", config, versions, station.note)
-        if log:
-            station.listeners.append(listener(station, drive))
-        with _served(vehicle, station) as page:
-            station.connect()
-            video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
-            on_unit = page.show if page else None
-            side = apply.OperatorSide(plans, station.report, on_unit, arrivals=log is not None, video=video)
-            drive.begin()
+    with (
+        Table() as table,
+        live_operator(arguments.overrides, arguments.conf, log=arguments.path("log")) as operator,
+    ):
+        station = operator.station
+        station.listeners.append(table)
+        with _served(operator) as page:
+            operator.start(page.show if page else None, duration)
             gc.freeze()  # what is loaded by now stays: collecting it again and again would hold up frames
-            until = None if duration is None else time.monotonic() + duration
-            # A terminal that takes nothing (Ctrl-S) may hold up the table, and nothing else.
-            sampling = threading.Thread(target=_sample, args=(station, side, stop, until), name="sampling", daemon=True)
-            sampling.start()
-            try:
-                while sampling.is_alive():
-                    sampling.join(SAMPLE_S)
+            with stopping(action=operator.end) as stop:
+                while operator.runs(SHOW_S):
                     table.show(station.rows(), station.headline())
-            finally:
-                stop.set()
-                sampling.join()
-                station.close()
-                side.stop()
-                drive.close()
     show_summary(station.meters, station.samples)
-    return 0
-
-
-def _sample(station: Station, side: OperatorSide, stop: threading.Event, until: float | None) -> None:
-    """Take samples until it is time to stop."""
-    while not stop.wait(SAMPLE_S) and (until is None or time.monotonic() < until):
-        station.take(side.sample(station.sending()))
+    return stop.status
 
 
 @contextmanager
-def _served(vehicle: Vehicle, station: Station) -> Iterator[Page | None]:
-    """The page while it is wanted."""
+def _served(operator: LiveOperator) -> Iterator[Page | None]:
+    """The page, unless the configuration switches it off."""
+    vehicle, station = operator.vehicle, operator.station
     if not vehicle.page.serve:
         yield None
         return
@@ -99,7 +62,7 @@ def _served(vehicle: Vehicle, station: Station) -> Iterator[Page | None]:
 
     page = Page(vehicle, station)
     page.start()
-    station.listeners.append(page.tell)
+    station.listeners.append(page)
     station.note(f"page: {page.url}")
     try:
         yield page

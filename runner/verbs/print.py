@@ -2,7 +2,8 @@
 
 Dry run: for each camera the pipeline of the vehicle and of the operator, and what the rules decide for a total of
 N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: where the live system has an
-RTSP server and its client, the lines state a UDP sink and the matching source, since gst-launch has neither.
+RTSP server and its client, the lines state a UDP sink and the matching source, since gst-launch has neither. Passwords
+in addresses are left out: put them back to run such a line.
 
   tod-runner print total_kbps=3000                              the paper's vehicle at 3 Mbit/s
   tod-runner print vehicle=delivery_robot mode=collective       another vehicle
@@ -17,26 +18,31 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
-from runner import sources
-from runner.commands import wanted
-from runner.config import load
-from runner.decision import Decision
-from runner.events import BitratePredicted, Event, ModeSelected, TotalSet
+from runner.configuration.config import configuration
+from runner.core.commands import wanted
+from runner.core.decision import Decision
+from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
+from runner.core.model import Kbps, Mode, Vehicle, exact, plain
+from runner.core.step import start, step
 from runner.graph import Plan
-from runner.model import Kbps, Mode, Vehicle, exact, plain
-from runner.step import start, step
+from runner.plans import compile_plans
+from runner.records import CameraDecision, to_json
+from runner.redact import redacted
 from runner.verbs import Arguments
 
 
 def run(arguments: Arguments) -> int:
     form = arguments.choice("format", ("text", "json"))
     total = arguments.number("total_kbps")
-    vehicle = load(arguments.overrides, arguments.conf)
-    plans = sources.compile_plans(vehicle)
+    vehicle = configuration(arguments.overrides, arguments.conf).vehicle()
+    plans = compile_plans(vehicle)
     decision = decide(vehicle, None if total is None else exact(total))
-    print(as_json(plans, decision) if form == "json" else as_text(vehicle, plans, decision))
-    if form == "json" and (note := _stand_ins(plans)):
-        print(note, file=sys.stderr)
+    text = as_json(plans, decision) if form == "json" else as_text(vehicle, plans, decision)
+    print(redacted(text))
+    notes = _stand_ins(plans) if form == "json" else []
+    if redacted(text) != text:
+        notes.append("passwords of addresses are left out")
+    print("\n".join(notes), end="\n" if notes else "", file=sys.stderr)
     return 0
 
 
@@ -60,7 +66,7 @@ def as_json(plans: Sequence[Plan], decision: Decision) -> str:
             "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
             "operator": plan.operator_line(),
             "server": plan.server,
-            "decision": decision.settings[plan.camera.name].to_json(),
+            "decision": to_json(CameraDecision.of(decision.settings[plan.camera.name])),
         }
         for plan in plans
     }
@@ -70,7 +76,7 @@ def as_json(plans: Sequence[Plan], decision: Decision) -> str:
 
 def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
-    lines += [f"# {note}" for note in [_stand_ins(plans)] if note]
+    lines += [f"# {note}" for note in _stand_ins(plans)]
     for plan in plans:
         setting = decision.settings[plan.camera.name]
         what = f"{setting.width}x{setting.height} at {setting.kbps} kbit/s" if setting.sending else "not sending"
@@ -82,6 +88,6 @@ def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:
     return "\n".join(lines)
 
 
-def _stand_ins(plans: Sequence[Plan]) -> str:
+def _stand_ins(plans: Sequence[Plan]) -> list[str]:
     names = [plan.camera.name for plan in plans if plan.stands_in]
-    return f"videotestsrc stands in for the frames of {', '.join(names)}" if names else ""
+    return [f"videotestsrc stands in for the frames of {', '.join(names)}"] if names else []

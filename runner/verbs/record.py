@@ -18,7 +18,6 @@ comes down to the margin ends, with status 1.
 from __future__ import annotations
 
 import shutil
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -27,12 +26,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner import recordings
-from runner.compose import compose
-from runner.config import load
+from runner.configuration.config import configuration
+from runner.core.model import Camera, Vehicle, plain
 from runner.errors import RunError, UserError
-from runner.model import Camera, Vehicle, plain
-from runner.sources import compile_plans, render_missing
+from runner.plans import compile_plans, render_missing
+from runner.rate_quality import recordings
+from runner.system.signals import Stop, stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, say, streaming
 
@@ -47,7 +46,8 @@ Show = Callable[[Mapping[str, "Recorded"]], None]
 def run(arguments: Arguments) -> int:
     duration, directory = _duration(arguments), _directory(arguments)
     apply = streaming()
-    vehicle = load(arguments.overrides, arguments.conf, check=apply.check_plan)
+    config = configuration(arguments.overrides, arguments.conf, check=apply.check_plan)
+    vehicle = config.vehicle()
     _check_sources(vehicle)
     recordings.make_directory(directory)
     with progress_bar() as progress:
@@ -56,8 +56,9 @@ def run(arguments: Arguments) -> int:
     apply.check_recorders(plans)
     recordings.check_space(directory, vehicle.cameras.values(), vehicle.recording, duration)
     files = recordings.claim_files(directory, vehicle.cameras)
-    session = _Session(vehicle, directory, duration)
-    with _interrupted(session), _shown(vehicle, files, duration) as show:
+    # Encoders and disks take their time to finish; a second signal does not wait for them.
+    with stopping(limit_s=None) as stop, _shown(vehicle, files, duration) as show:
+        session = _Session(vehicle, directory, duration, stop)
         try:
             side = apply.RecordingSide(plans, files, duration)
             try:
@@ -66,32 +67,34 @@ def run(arguments: Arguments) -> int:
                 side.stop()
         finally:
             recordings.remove_empty(files.values())
-    session.conclude(compose(arguments.overrides, arguments.conf).document)
+    session.conclude(config.document)
     return session.status()
 
 
 class _Session:
     """One recording from start to end: names files when they are complete, and knows why it ends."""
 
-    def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None) -> None:
-        self._vehicle, self._directory, self._duration_s = vehicle, directory, duration_s
+    def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None, stop: Stop) -> None:
+        self._vehicle, self._directory, self._duration_s, self._stop = vehicle, directory, duration_s, stop
         self._ended: dict[str, Recorded] = {}
         self._finishing = False  # before the time that was asked for
         self._kept: set[str] = set()  # cameras whose files are complete and have their names
         self._problems: list[str] = []
         self._losing: set[str] = set()
         self._margin = recordings.margin(vehicle.cameras.values())
-        self.signal = 0  # the one that asked for the end
 
     def watch(self, side: RecordingSide, show: Show) -> None:
         """Until every camera has ended."""
         while len(self._ended) < len(self._vehicle.cameras):
-            time.sleep(SAMPLE_S)
+            if self._finishing:
+                time.sleep(SAMPLE_S)
+            elif self._stop.wait(SAMPLE_S):
+                say("finishing the files")
             samples = side.sample()
             show(samples)
             for name, recorded in samples.items():
                 self._take(name, recorded)
-            if not self._finishing and (self.signal or self._is_full()):
+            if not self._finishing and (self._stop.is_set() or self._is_full()):
                 self._finishing = True
                 side.finish()
 
@@ -179,9 +182,7 @@ class _Session:
         return f"{name}: {recordings.final(self._directory, name)}: {size}, {amount}"
 
     def status(self) -> int:
-        if self._problems:
-            return 1
-        return 130 if self.signal == signal.SIGINT else 0
+        return 1 if self._problems else self._stop.status
 
 
 def _warnings(recorded: Recorded) -> Iterator[str]:
@@ -217,24 +218,6 @@ def _check_sources(vehicle: Vehicle) -> None:
     if pushed:
         rule = "its frames are pushed by a Python program, which `record` is not; choose another source"
         raise UserError("command line", "source", ", ".join(pushed), rule)
-
-
-@contextmanager
-def _interrupted(session: _Session) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the recording with complete files; a second Ctrl-C ends it at once."""
-
-    def on_signal(number: int, _frame: object) -> None:
-        session.signal = session.signal or number
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        say("finishing the files")
-
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, on_signal) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ accepted is answered with "accepted": false and the reason, and the run goes on.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with the configuration that it was driven with:
 the decisions are those of the drive. Overrides change that configuration and so answer "what if"; with log= the answer
-is written as a drive of its own, for `report`.
+is written as a drive of its own, for `report`, and to output= only where that is given.
 
 Predictions are those of the input. With a pqos= on the command line they are dropped and that source predicts instead,
 from the positions and times of the input; its events are marked "source": "pqos".
@@ -23,23 +23,26 @@ from the positions and times of the input; its events are marked "source": "pqos
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from runner.config import Base, composed, load, load_run
-from runner.decision import Decision
-from runner.drive.log import FILES, Log, run_lines
-from runner.drive.read import Line, check_began, is_log, read_line, read_lines
+from runner import records
+from runner.configuration.config import Base, configuration
+from runner.core.decision import Decision
+from runner.core.events import BitratePredicted, Event, parse, to_json
+from runner.core.model import Vehicle
+from runner.core.step import Run, start, step
+from runner.drive.log import FILES, Log, log_run
+from runner.drive.read import check_began, is_log, read_line, read_lines
 from runner.errors import UserError
-from runner.events import BitratePredicted, Event, parse, to_json
-from runner.files import whole_file
-from runner.model import Vehicle
+from runner.records import Began, InForce
 from runner.schema import log_problem
-from runner.step import Run, start, step
+from runner.system.files import whole_file
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
@@ -53,14 +56,17 @@ _encode = json.JSONEncoder(ensure_ascii=False).encode
 def run(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
-        vehicle, pqos = _load(arguments, name, began)
-        with _output(arguments) as output, _log(arguments, name, began) as log:
+        config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
+        chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
+        pqos = config.pqos()[0] if chosen else None
+        vehicle = config.vehicle()
+        with _output(arguments) as output, _log(arguments, config.document, began) as log:
             for line in replay(vehicle, events(lines, name), pqos, log):
                 output.write(line)
     return 0
 
 
-def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Line | None]:
+def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]:
     """All lines again, and the beginning of the drive that they are; None: they are but events."""
     lines = iter(text)
     first = list(islice(lines, 1))
@@ -69,37 +75,27 @@ def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Line | None]:
         return chain(first, lines), None
     if problem := log_problem(line):
         raise UserError(f"{name}: line 1", "", None, problem)
-    check_began(line, name)
-    if line["side"] != "vehicle":
-        raise UserError(f"{name}: line 1", "side", repr(line["side"]), f"has no events, they are in {FILES['vehicle']}")
-    return chain(first, lines), line
+    began = check_began(line, name)
+    if began.side != "vehicle":
+        raise UserError(f"{name}: line 1", "side", repr(began.side), f"has no events, they are in {FILES['vehicle']}")
+    return chain(first, lines), began
 
 
-def _base(name: str, began: Line | None) -> Base | None:
+def _base(name: str, began: Began | None) -> Base | None:
     """The configuration that a drive was driven with."""
-    return (began["config"], f"{name}: line 1: config") if began else None
-
-
-def _load(arguments: Arguments, name: str, began: Line | None) -> tuple[Vehicle, Pqos | None]:
-    """The configuration of the drive, or the composed one, with the overrides on top."""
-    overrides, base = arguments.overrides, _base(name, began)
-    if any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in overrides):
-        vehicle, pqos, _ = load_run(overrides, arguments.conf, runnable=False, base=base)
-        return vehicle, pqos
-    return load(overrides, arguments.conf, runnable=False, base=base), None
+    return (dict(began.config), f"{name}: line 1: config") if began else None
 
 
 @contextmanager
-def _log(arguments: Arguments, name: str, began: Line | None) -> Iterator[Log | None]:
+def _log(arguments: Arguments, config: Mapping[str, Any], began: Began | None) -> Iterator[Log | None]:
     """The answer as a drive, there only when it is whole; None where nobody asks for it."""
     directory = arguments.path("log")
     if directory is None:
         yield None
         return
-    config = composed(arguments.overrides, arguments.conf, _base(name, began)).document
     log = Log(directory, "vehicle", config, {}, lambda what: print(what, file=sys.stderr))
     try:
-        log.begin(began["time"] if began else 0.0)
+        log.begin(began.time if began else 0.0)
         yield log
     except BaseException:
         log.discard()
@@ -119,8 +115,7 @@ def replay(
     for document, event in inputs if pqos is None else _predicted(inputs, pqos):
         before, now = now, step(vehicle, now, event)
         if log:
-            for line in run_lines(event, before, now):
-                log.write(line)
+            log_run(log, event, before, now)
         yield answers.line(document, now)
 
 
@@ -148,12 +143,14 @@ class _Answers:
         heard["accepted"] = not now.refused
         if now.refused:
             heard["reason"] = now.refused
+        if now.fault:
+            heard["fault"] = now.fault
         commands = _encode([command.to_json() for command in now.commands])
         return f'{_encode(heard)[:-1]}, {self._in_force(now.decision)}, "commands": {commands}}}\n'
 
     def _in_force(self, decision: Decision) -> str:
         if self._decision is None or not decision.says_the_same(self._decision):
-            self._decision, self._text = decision, _encode(decision.to_json())[1:-1]
+            self._decision, self._text = decision, _encode(records.to_json(InForce.of(decision)))[1:-1]
         return self._text
 
 
@@ -184,10 +181,11 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
     try:
         path = path / FILES["vehicle"] if path.is_dir() else path
         _keep(path, arguments.path("output"))
-        with path.open(encoding="utf-8", errors="replace") as file:
-            yield str(path), file
+        file = path.open(encoding="utf-8", errors="replace")
     except OSError as error:
         raise UserError("command line", "input", repr(str(path)), (error.strerror or "").lower()) from None
+    with file:
+        yield str(path), file
 
 
 def _keep(path: Path, output: Path | None) -> None:
@@ -198,8 +196,13 @@ def _keep(path: Path, output: Path | None) -> None:
 
 @contextmanager
 def _output(arguments: Arguments) -> Iterator[TextIO]:
-    """Standard output line by line, or a file that is there only when the run has ended."""
+    """Standard output line by line, or a file that is there only when the run has ended.
+
+    With log= the answer is a drive: decisions are in there, and in another file only where one is named.
+    """
     path = arguments.path("output")
+    if path is None and arguments.path("log"):
+        path = Path(os.devnull)
     if path is None:
         # Someone may wait for each answer before sending the next event.
         sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)  # type: ignore[union-attr]

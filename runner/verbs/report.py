@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.compose import conf_directories
+from runner.configuration.files import conf_directories
 from runner.errors import RunError, UserError
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar
@@ -53,20 +53,22 @@ def report(
     """
     from runner.drive import document
     from runner.drive.claims import claims
-    from runner.drive.figures import write_figures
+    from runner.drive.figures import figures
     from runner.drive.html import page
-    from runner.files import write_whole
+    from runner.drive.print import write_figures
     from runner.rate_quality.artefact import dumps
+    from runner.system.files import write_whole
     from runner.verbs.report_table import show
 
     with progress_bar() as progress:
         drives = _measured(paths, models, bases, lambda share: progress("drives", share))
         held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
-        figures, left_out = write_figures(drives, output, progress)
-        told = document.to_json(drives, held, figures, left_out)
+        made, left_out = figures(drives)
+        write_figures(made, output, progress)
+        told = document.to_json(drives, held, [figure.name for figure in made], left_out)
         write_whole(output / DOCUMENT, dumps(told))
         index = output / "index.html"
-        write_whole(index, page(drives, held, figures, left_out).encode())
+        write_whole(index, page(drives, held, made, left_out).encode())
     show(drives, held, left_out)
     return index
 
@@ -108,7 +110,7 @@ def _need_libraries() -> None:
 
     missing = [name for name in ("matplotlib", "plotly", "rich") if find_spec(name) is None]
     if missing:
-        raise RunError(f"the Python modules {', '.join(missing)} are not installed: pip install 'tod-runner[report]'")
+        raise RunError(f"the Python modules {', '.join(missing)} are not installed: extra report, see docs/install.md")
 
 
 def _measured(

@@ -8,19 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
-from runner.errors import RunError
-from runner.model import Progress
+from runner.core.model import Progress
+from runner.errors import MissingBindings, RunError
+from runner.redact import redacted
+from runner.system import signals
+
+SWITCH_S = 0.0005  # a thread with a frame or a message to pass on waits no longer than this for one that computes
 
 
 def streaming() -> ModuleType:
-    """The module `runner.apply`.
+    """The module `runner.apply`. From here on signals are held, see `runner.system.signals.hold`.
 
     raises  RunError where GStreamer's Python bindings are missing
     """
+    signals.hold()
     try:
         from runner import apply
-    except (ImportError, ValueError) as error:
-        raise RunError(f"{error}; run `make setup`, or see what is missing with `tod-runner doctor`") from None
+    except MissingBindings as error:
+        raise RunError(f"{error}; or run `make setup`") from None
+    signals.check()
     return apply
 
 
@@ -28,12 +34,15 @@ def say(what: str) -> None:
     """One line for the person who looks on, with the time of day."""
     now = time.time()
     clock = time.strftime("%H:%M:%S", time.localtime(now))
-    print(f"{clock}.{int(now * 1000) % 1000:03d} {what}", file=sys.stderr, flush=True)
+    print(f"{clock}.{int(now * 1000) % 1000:03d} {redacted(what)}", file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Shows how far long work is; nothing where there is none. Off a terminal, a line for each tenth."""
+    """Shows how far long work is; nothing where there is none. Off a terminal, a line for each tenth.
+
+    What reports its progress from the main thread is interrupted there by a signal.
+    """
     if not sys.stderr.isatty():
         yield _progress_lines()
         return
@@ -46,6 +55,7 @@ def progress_bar() -> Iterator[Progress]:
         tasks: dict[str, int] = {}
 
         def progress(what: str, done: float) -> None:
+            signals.check()
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=1.0)
             bars.update(tasks[what], completed=done)  # type: ignore[arg-type]
@@ -57,6 +67,7 @@ def _progress_lines() -> Progress:
     tenths: dict[str, int] = {}
 
     def progress(what: str, done: float) -> None:
+        signals.check()
         if int(done * 10) != tenths.get(what):
             tenths[what] = int(done * 10)
             say(f"{what}: {done:.0%}")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any
 
@@ -15,15 +18,17 @@ from rich.live import Live
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from runner.station import Row
-from runner.telemetry import Meter, middle, percentile
+from runner.operator.meter import Meter, middle, percentile
+from runner.operator.station import CameraRow, Listener
+from runner.records import Note
+from runner.system.signals import urgent
 
 PLAIN_EVERY_S = 5.0
 NOTES = 4
 KEPT_NEWS = 1000
 
 
-class Table:
+class Table(Listener):
     """Shown in place on a terminal, every few seconds elsewhere."""
 
     def __init__(self) -> None:
@@ -32,22 +37,22 @@ class Table:
         self._news: deque[str] = deque(maxlen=KEPT_NEWS)  # not shown yet
         self._notes: deque[str] = deque(maxlen=NOTES)
         self._shown = 0.0
+        self._stack = ExitStack()
 
     def __enter__(self) -> Table:
         if self._live:
-            self._live.__enter__()
+            self._stack.enter_context(urgent(_show_cursor))
+            self._stack.enter_context(self._live)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._live:
-            self._live.__exit__(kind, error, at)
+        self._stack.__exit__(kind, error, at)
 
-    def tell(self, kind: str, message: Mapping[str, Any]) -> None:
-        """News of the station, from any thread: one line below the table, when it is shown next."""
-        if kind == "note":
-            self._news.append(f"{time.strftime('%H:%M:%S', time.localtime(message['time']))} {message['text']}")
+    def on_note(self, note: Note) -> None:
+        """From any thread: one line below the table, when it is shown next."""
+        self._news.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {note.text}")
 
-    def show(self, rows: Sequence[Row], headline: str) -> None:
+    def show(self, rows: Sequence[CameraRow], headline: str) -> None:
         while self._news:
             line = self._news.popleft()
             self._notes.append(line)
@@ -60,34 +65,40 @@ class Table:
             self._console.print(_table(rows, headline))
 
 
-def _table(rows: Sequence[Row], headline: str) -> RichTable:
+def _show_cursor() -> None:
+    """Undo what the live table does to the terminal, unless that takes nothing."""
+    if select.select([], [sys.stdout], [], 0)[1]:
+        os.write(sys.stdout.fileno(), b"\x1b[?25h\n")
+
+
+def _table(rows: Sequence[CameraRow], headline: str) -> RichTable:
     table = RichTable(title=headline, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("camera")
     for heading in ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("why", overflow="fold")
     for row in rows:
-        received, setting = row.received, row.setting
-        size = f"{received.width}x{received.height}" if received.width else "-"
+        received, state = row.received, row.state
+        size = f"{received.width}x{received.height}" if received.width and row.rates.fps else "-"
         latency = f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-"
         table.add_row(
             row.name,
             f"{row.rates.fps:.1f}",
             f"{row.rates.kbps:.0f}",
-            str(setting.get("kbps", "-")),
-            f"{setting['demand_kbps']:.0f}" if setting else "-",
+            str(state.kbps) if state else "-",
+            f"{state.demand_kbps:.0f}" if state else "-",
             Text(size, style=_size_style(row)),
-            str(setting.get("scaling") or "off") if setting else "-",
+            str(state.scaling or "off") if state else "-",
             latency,
             str(received.lost),
-            str(setting.get("reason", "")),
+            state.reason if state else "",
         )
     return table
 
 
-def _size_style(row: Row) -> str:
+def _size_style(row: CameraRow) -> str:
     """Marks a picture that has not the size that was decided (yet)."""
-    decided, received = row.decided, row.received
+    decided, received = row.state, row.received
     wrong = decided and decided.sending and (decided.width, decided.height) != (received.width, received.height)
     return "bold yellow" if wrong else ""
 

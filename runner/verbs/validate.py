@@ -1,170 +1,375 @@
-"""usage: tod-runner validate [OVERRIDE ...] [conf=DIR]
+"""usage: tod-runner validate [OVERRIDE ...] [FILE ...] [conf=DIR] [all=true]
 
-Check every file of the configuration against its schema, then every combination of vehicle, modes, graph and source:
-it must compose and compile. Where GStreamer is installed, also against its registry: elements, properties, types,
-ranges, and whether what a knob turns may change while playing. Maps, traces and tracks of pqos files are read. Ends
-with status 2 and all problems at once.
+Check the files of your directory against their schemas, then what they compose to: each file once with the choices of
+the command line, else the defaults; each vehicle also with each graph and source of yours. Without a directory the
+packaged files are checked, and the one configuration that the command line names. With all=true every vehicle meets
+every graph and source, every other file is composed once, and a file that refers to another group, or chooses of it,
+meets each file of that group. Packaged experiments, with all their runs, and links are composed as they are.
 
-  tod-runner validate                          the packaged files
-  tod-runner validate conf=my_vehicles         yours too, the step for your CI
-  tod-runner validate vehicle=tum_q7           one vehicle with everything else
+FILE, a word that ends in .yaml or .yml, limits the check to that file and the files that build on it. Its directory is
+conf=DIR, else the nearest one above it that has folders of groups.
+
+Where GStreamer is installed, also against its registry: elements, properties, types, ranges, and whether what a knob
+turns may change while playing. Maps, traces and tracks of pqos files are read. Ends with status 2 and all problems at
+once.
+
+  tod-runner validate conf=my_vehicles                       your files, the step for your CI
+  tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit
+  tod-runner validate conf=my_vehicles vehicle=van           one of your vehicles with your graphs and sources
+  tod-runner validate vehicle=tum_q7 pqos.file=yard.csv      one configuration
+  tod-runner validate all=true                               everything that is packaged
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from itertools import product, repeat
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
-
 from runner import schema
-from runner.compose import GROUPS, conf_directories, label, load_file, options, yaml_problem
-from runner.config import Check, composed, load, load_experiment, load_run, load_study
-from runner.errors import ConfigError, Problem
+from runner.configuration.build import Check
+from runner.configuration.combinations import Combinations, reaches, words_of
+from runner.configuration.compose import compose
+from runner.configuration.config import Configuration
+from runner.configuration.files import GROUPS, bases_of, built_on, conf_directories, find_file, options
+from runner.configuration.overrides import COMMAND_LINE, choosable
+from runner.configuration.yaml_file import label, load_file, load_node
+from runner.core.model import ModelError, suggest
+from runner.errors import ConfigError, MissingBindings, Problem, UserError
 from runner.graph import Plan
-from runner.model import ModelError
 from runner.verbs import Arguments
 
 DATA = ("maps", "traces")  # folders for what pqos files name; a bandwidth map may be YAML
-COMBINED = ("vehicle", "modes", "graph", "source")
-SINGLE: dict[str, Callable[..., object]] = {
-    "pqos": load_run,
-    "recording": load,
-    "study": load_study,
-    "link": load_experiment,
-    "experiment": load_experiment,
+CROSSED = ("vehicle", "graph", "source")  # groups whose files meet each other
+STANDING_ALONE = ("experiment", "link")  # packaged, never meet a choice of the command line
+Ask = Callable[[Configuration], object]
+READERS: dict[str, Ask] = {  # by group, what reads its part of the configuration, if not the vehicle
+    "pqos": Configuration.pqos,
+    "study": Configuration.study,
+    "link": Configuration.experiment,
 }
+Choices = tuple[tuple[str, str], ...]  # group and file
+
+
+class Run(NamedTuple):
+    """One of the runs of an experiment: where it stands, and the overrides that it adds."""
+
+    file: str
+    path: str
+    words: tuple[str, ...]
+
+    def blamed(self, problem: Problem) -> Problem:
+        """A problem of the command line, told of the run if that has the word."""
+        word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
+        if problem.file != COMMAND_LINE or word is None:
+            return problem
+        return Problem(self.file, self.path, word, problem.rule)
+
+
+class Task(NamedTuple):
+    """A configuration to check: overrides, files that are chosen on top, and the run of an experiment among those."""
+
+    overrides: tuple[str, ...]
+    choices: Choices = ()
+    run: Run | None = None
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        return (*self.overrides, *words_of(dict(self.choices)), *(self.run.words if self.run else ()))
+
+    @property
+    def asks(self) -> Sequence[Ask]:
+        """What is asked of the configuration."""
+        if not self.choices or "experiment" in dict(self.choices):
+            return Configuration.pqos, Configuration.experiment
+        return [READERS.get(group, Configuration.vehicle) for group, _ in self.choices]
 
 
 def run(arguments: Arguments) -> int:
-    directories = conf_directories(arguments.conf)
-    found, files = check_files(directories)
-    if found:
-        raise ConfigError(found)
-    combinations = [Task(load, words) for words in _combinations(arguments, directories)]
-    tasks = [*combinations, *_single_choices(arguments, directories)]
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(tasks))) as pool:
-        chunk = max(1, len(tasks) // (8 * (os.cpu_count() or 1)))
-        results = list(pool.map(_check, tasks, repeat(arguments.conf), chunksize=chunk))
-    problems = [problem for result in results for problem in result.problems]
-    if problems:
-        raise ConfigError(problems)
-    notes = dict.fromkeys(note for result in results for note in result.notes)
-    print(f"{files} files and {len(combinations)} combinations of {', '.join(COMBINED)} are valid")
+    everything = arguments.choice("all", ("false", "true")) == "true"
+    files, configurations, notes = 0, 0, dict[str, None]()
+    _composed.cache_clear()
+    for conf, named in _directories(arguments).items():
+        directories = conf_directories(conf)
+        found, checked = check_files(directories if everything else directories[:1], named)
+        if found:
+            raise ConfigError(found)
+        tasks = _Tasks(tuple(arguments.overrides), conf, everything, named)
+        checker = _Checker(conf, Combinations(arguments.overrides, conf, tasks.choices))
+        for task in tasks:
+            checker.check(task)
+        if checker.problems:
+            raise ConfigError(checker.problems)
+        files, configurations = files + checked, configurations + len({task.words for task in tasks})
+        notes |= checker.notes
+    print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
     print("\n".join(notes), end="\n" if notes else "")
     return 0
 
 
-def check_files(directories: Sequence[Path]) -> tuple[list[Problem], int]:
-    """Every YAML file of some configuration directories against the schema of its group; and how many there are."""
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
+    """Configuration directories, and the files in each that are checked; None: all of them."""
+    if not arguments.words:
+        return {arguments.conf: None}
+    found: dict[Path | None, list[Path] | None] = {}
+    for word in arguments.words:
+        file = Path(word)
+        if not _is_yaml(file.name):
+            raise UserError("command line", "", word, "must be NAME=VALUE, or a file that ends in .yaml or .yml")
+        if not file.is_file():
+            raise UserError("command line", "", word, "no such file")
+        inside = [arguments.conf] if arguments.conf else list(file.parents)
+        above = [conf for conf in inside if file.resolve().is_relative_to(conf.resolve()) and _has_groups(conf)]
+        if not above:
+            rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."
+            rule = f"is not in {arguments.conf}" if arguments.conf else rule
+            raise UserError("command line", "", word, rule)
+        conf = above[0]
+        found.setdefault(conf, []).append(conf / file.resolve().relative_to(conf.resolve()))  # type: ignore[union-attr]
+    return found
+
+
+def _has_groups(directory: Path) -> bool:
+    return any((directory / group).is_dir() for group in GROUPS)
+
+
+def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> tuple[list[Problem], int]:
+    """The YAML files of some directories, or some of them, against the schemas of their groups; and how many."""
     problems: list[Problem] = []
     count = 0
     for directory in directories:
-        for path in sorted(directory.rglob("*.yaml")):
-            if path.relative_to(directory).parts[0] in DATA:
+        for path in _yaml_files(directory):
+            if named is not None and path not in named:
                 continue
             count += 1
-            problems += check_file(path, path.relative_to(directory), label(path, directories))
+            problems += check_file(path, path.relative_to(directory))
     return problems, count
 
 
-def check_file(path: Path, relative: Path, name: str) -> Iterator[Problem]:
+def _yaml_files(directory: Path) -> Iterator[Path]:
+    """Files with an ending of YAML or JSON; those of data and of hidden folders aside."""
+    for folder, folders, names in os.walk(directory):
+        top = Path(folder) == directory
+        folders[:] = sorted(name for name in folders if name[0] != "." and not (top and name in DATA))
+        yield from (Path(folder, name) for name in sorted(names) if _is_yaml(name))
+
+
+def _is_yaml(name: str) -> bool:
+    return name[0] != "." and name.lower().endswith((".yaml", ".yml"))
+
+
+def check_file(path: Path, relative: Path) -> Iterator[Problem]:
     """Problems of one file. The folder says which schema it follows."""
-    group = relative.parts[0] if len(relative.parts) > 1 else relative.stem
-    kind = {"cameras": "camera"}.get(group, group)
-    if kind not in (*GROUPS, "camera", "config"):
-        folders = ", ".join(f"{group}/" for group in GROUPS)
-        yield Problem(name, "", None, f"belongs to no group, the groups are {folders}")
+    name, group = label(path), "/".join(relative.parts[:-1])
+    if rule := _misplaced(group, relative):
+        yield Problem(name, "", None, rule)
         return
     try:
+        load_node(path)
         content = load_file(path)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        yield yaml_problem(error, name)
+    except ConfigError as error:
+        yield from error.problems
         return
-    bases = content.get("defaults") if isinstance(content, dict) else None
-    inherits = any(isinstance(base, str) and base != "_self_" for base in bases or ())
-    for finding in schema.findings(content, kind):
+    inherits = bool(bases_of(path))
+    for finding in schema.findings(content, {"": "config", "cameras": "camera"}.get(group, group)):
         if inherits and finding.found == "missing":
             continue  # a file that it builds on may have it; the combinations show whether
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
-class Task(NamedTuple):
-    """Overrides to try, and what composes them: one of the functions of runner.config, called with `runnable=False`."""
-
-    compose: Callable[..., object]
-    overrides: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    problems: list[Problem]
-    notes: list[str]
-
-
-def _combinations(arguments: Arguments, directories: Sequence[Path]) -> Iterator[list[str]]:
-    """Overrides for each combination; a choice on the command line narrows its axis."""
-    axes: list[list[list[str]]] = [[arguments.overrides]]
-    for group in COMBINED:
-        words = [[f"{group}={option}"] for option in options(group, directories)]
-        axes.append([[]] if _chosen(arguments, group) else words)
-    for parts in product(*axes):
-        yield [word for part in parts for word in part]
+def _misplaced(group: str, relative: Path) -> str:
+    """Why Hydra would not find a file, or ""."""
+    first = relative.parts[0]
+    if group and group not in GROUPS:
+        nested = f"files stand in {first}/ itself, not in folders below" if first in GROUPS else ""
+        return f"would be ignored: {nested or f'no such group as {group}/, {suggest(group, GROUPS)}'}"
+    if not group and relative.stem != "config":
+        return f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
+    if relative.suffix != ".yaml":
+        return f"would be ignored: Hydra reads {relative.stem}.yaml"
+    if group and not choosable(relative.stem):
+        return "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
+    return ""
 
 
-def _single_choices(arguments: Arguments, directories: Sequence[Path]) -> Iterator[Task]:
-    """Each file of the groups that are not combined: maps and traces are read, experiments with all their runs."""
-    yield Task(load_run, arguments.overrides)
-    for group, compose in SINGLE.items():
-        if _chosen(arguments, group):
-            continue
-        for option in options(group, directories):
-            words = [*arguments.overrides, f"{group}={option}"]
-            yield Task(compose, words)
-            if group == "experiment":
-                yield from (Task(load_run, [*words, *added]) for added in _runs(words, arguments.conf))
+# --- what they compose to ---------------------------------------------------------------------------------------------
 
 
-def _chosen(arguments: Arguments, group: str) -> bool:
-    """Whether the command line chooses a file of a group."""
-    return any(word.lstrip("+").partition("=")[0] == group for word in arguments.overrides)
+class _Tasks:
+    """What to compose.
+
+    named  what must take part in a configuration for it to be checked; None: anything
+    """
+
+    def __init__(
+        self, overrides: tuple[str, ...], user: Path | None, everything: bool, named: Collection[Path] | None
+    ) -> None:
+        self._overrides, self._user, self._everything, self._named = overrides, user, everything, named
+        self._directories = conf_directories(user)
+        searched = self._directories if everything else self._directories[:-1]
+        settled = _settled(overrides)
+        self._files = {group: options(group, searched) for group in GROUPS if group not in settled}
+        self._vehicle_settled = "vehicle" in settled
+        self._tasks = list(dict.fromkeys(filter(self._concerned, self._all())))
+
+    def __iter__(self) -> Iterator[Task]:
+        return iter(self._tasks)
+
+    @property
+    def choices(self) -> list[tuple[str, str]]:
+        """Groups and files that are chosen by any of them."""
+        return list(dict.fromkeys(choice for task in self._tasks for choice in task.choices))
+
+    def _all(self) -> Iterator[Task]:
+        """Single files before those that they meet; the same may come twice."""
+        yield Task(self._overrides)
+        for group, names in self._files.items():
+            for name in names:
+                yield from self._of_one_file(group, name)
+        vehicles: Sequence[str | None] = self._files.get("vehicle", [])
+        others: list[Sequence[str | None]] = [self._files.get(group) or [None] for group in CROSSED[1:]]
+        if self._vehicle_settled or not (vehicles or self._everything):
+            vehicles = [None]
+        for met in product(vehicles, *others):
+            chosen = zip(CROSSED, met, strict=True)
+            yield Task(self._overrides, tuple((group, one) for group, one in chosen if one))
+        if self._everything:
+            yield from self._reached()
+
+    def _of_one_file(self, group: str, name: str) -> Iterator[Task]:
+        """A file with the choices of the command line; an experiment also with each of its runs."""
+        packaged = name not in options(group, self._directories[:-1])
+        overrides = () if packaged and group in STANDING_ALONE else self._overrides
+        task = Task(overrides, ((group, name),))
+        yield task
+        if group == "experiment":
+            yield from (task._replace(run=run) for run in _runs(name, task.words, self._user))
+
+    def _reached(self) -> Iterator[Task]:
+        """Files that refer to other groups or choose of them, with every choice of those."""
+        for group, names in self._files.items():
+            for name in names if group not in STANDING_ALONE else ():
+                with suppress(ConfigError):  # reported of the file alone
+                    for other in reaches(find_file(self._directories, group, name)):
+                        for choice in self._files.get(other, ()):
+                            yield Task(self._overrides, ((group, name), (other, choice)))
+
+    def _concerned(self, task: Task) -> bool:
+        if self._named is None:
+            return True
+        chosen = (find_file(self._directories, group, name) for group, name in task.choices)
+        files = {file for path in chosen for file in built_on(path, self._directories)}
+        return not files.isdisjoint(self._named) or (not task.choices and self._root in self._named)
+
+    @property
+    def _root(self) -> Path:
+        return find_file(self._directories, "", "config")
 
 
-def _runs(overrides: list[str], user: Path | None) -> list[list[str]]:
-    """What the runs of an experiment add; nothing where it cannot be composed, which is told elsewhere."""
+def _settled(words: Iterable[str]) -> set[str]:
+    """Groups that the command line chooses of, or changes values of; such a value is meant for what is in force."""
+    keys = {word.lstrip("+~").partition("=")[0].partition("@")[0].partition(".")[0].lstrip("/") for word in words}
+    return keys | ({"vehicle"} if "cameras" in keys else set())
+
+
+_composed = lru_cache(maxsize=32)(compose)  # experiments are composed to see their runs, too
+
+
+def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[Run]:
+    """The runs of an experiment; none where it cannot be composed, which another task reports."""
     try:
-        section = composed(overrides, user).document.get("experiment")
+        section = _composed(overrides, user).document.get("experiment")
     except ConfigError:
-        return []
+        return
+    file = label(find_file(conf_directories(user), "experiment", experiment))
     runs = section.get("runs") if isinstance(section, dict) else None
-    added = runs.values() if isinstance(runs, dict) else ()
-    return [[], *(words for words in added if isinstance(words, list) and all(isinstance(w, str) for w in words))]
+    for name, words in (runs if isinstance(runs, dict) else {}).items():
+        if isinstance(words, list) and all(isinstance(word, str) for word in words):
+            yield Run(file, f"experiment.runs.{name}", tuple(words))
 
 
-def _check(task: Task, user: Path | None) -> Checked:
-    notes: list[str] = []
-    try:
-        task.compose(task.overrides, user, runnable=False, check=_registry_check(notes))
-    except ConfigError as error:
-        return Checked(error.problems, [])
-    return Checked([], notes)
+@dataclass
+class _Checker:
+    """Checks configurations one after the other.
+
+    broken  files that cannot be composed or are wrong: what they meet is not checked
+    fine    sections that the schemas accept, by key and identity
+    """
+
+    user: Path | None
+    combinations: Combinations
+    problems: list[Problem] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+    broken: set[tuple[str, str]] = field(default_factory=set)
+    fine: set[tuple[str, int]] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._registry = _registry_check(self.notes)
+
+    def check(self, task: Task) -> None:
+        if self.broken.isdisjoint(task.choices) and not self._is_fine_assembled(task):
+            self._check_composed(task)
+
+    def _is_fine_assembled(self, task: Task) -> bool:
+        """Whether there is nothing wrong with a configuration made of sections; what is wrong is looked at composed."""
+        if task.run or task.overrides != self.combinations.overrides:
+            return False
+        assembled = self.combinations.assembled(dict(task.choices))
+        if assembled is None:
+            return False
+        sections = {(key, id(value)) for key, value in assembled.document.items()}
+        fits = {key for key, _ in sections & self.fine}
+        config = Configuration(assembled, self.user, runnable=False, check=self._registry, fits=fits)
+        if _problems(config, task.asks):
+            return False
+        self.fine |= sections
+        return True
+
+    def _check_composed(self, task: Task) -> None:
+        try:
+            composed = _composed(task.words, self.user)
+            config = Configuration(composed, self.user, runnable=False, check=self._registry)
+            problems = _problems(config, task.asks)
+        except ConfigError as error:
+            problems = error.problems
+        if problems and len(task.choices) == 1:
+            self.broken |= set(task.choices)
+        self.problems += map(task.run.blamed, problems) if task.run else problems
 
 
-def _registry_check(notes: list[str]) -> Check | None:
+def _problems(config: Configuration, asks: Iterable[Ask]) -> list[Problem]:
+    problems = []
+    for ask in asks:
+        try:
+            ask(config)
+        except ConfigError as error:
+            problems += error.problems
+    return problems
+
+
+def _registry_check(notes: dict[str, None]) -> Check | None:
     """The check against GStreamer's registry; what it could not look at goes to the notes."""
     try:
         from runner.apply import check_plan, missing_plugins, missing_recorders
-    except ImportError:
-        notes.append("nothing was checked against the GStreamer registry: its Python bindings are not installed")
+    except MissingBindings as error:
+        notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
 
     def check(plan: Plan) -> list[ModelError]:
-        notes.extend(f"not checked: {sentence}" for sentence in (*missing_plugins(plan), *missing_recorders(plan)))
+        missing = (*missing_plugins(plan), *missing_recorders(plan))
+        notes.update({f"not checked: {sentence}": None for sentence in missing})
         return check_plan(plan)
 
     return check

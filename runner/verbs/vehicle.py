@@ -11,23 +11,24 @@ after duration_s. With log=DIR events, decisions and telemetry are written to DI
 
 from __future__ import annotations
 
-import signal
+import sys
 
-from runner.live import live_vehicle
+from runner.system.signals import stopping
+from runner.vehicle.live import live_vehicle
 from runner.verbs import Arguments
-from runner.verbs.screen import progress_bar, say, streaming
+from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
 
 
 def run(arguments: Arguments) -> int:
     streaming()
     duration = arguments.number("duration_s")
+    sys.setswitchinterval(SWITCH_S)
     with (
         progress_bar() as progress,
         live_vehicle(
             arguments.overrides, arguments.conf, log=arguments.path("log"), say=say, progress=progress
         ) as vehicle,
+        stopping(action=vehicle.loop.stop) as stop,
     ):
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: vehicle.loop.stop())
-        vehicle.loop.run(duration)
-    return 0
+        vehicle.run(duration)
+    return stop.status

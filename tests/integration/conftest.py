@@ -4,9 +4,14 @@
 on all cores.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from rig import free_port
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
 
 BESIDE_OTHERS = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
 
@@ -18,3 +23,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("gst")
             if path.stem not in BESIDE_OTHERS:
                 item.add_marker("alone")
+
+
+@pytest.fixture
+def broker() -> Iterator[Endpoint]:
+    """Address of a broker of the test's own."""
+    endpoint = Endpoint("127.0.0.1", free_port())
+    with private_broker(endpoint):
+        yield endpoint

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import queue
 import socket
 import subprocess
 import sys
@@ -11,6 +13,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from runner.operator.station import Listener
+from runner.records import Note, Sample, VehicleState, state_to_json, to_json
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "data"))
@@ -51,6 +56,83 @@ def until(done: Callable[[], Any], seconds: float = 15, every_s: float = 0.01) -
     return seen
 
 
+class Heard(Listener):
+    """Keeps what a station says, as ("state" | "sample" | "note", record)."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, Any]] = []
+
+    def on_state(self, state: VehicleState | None) -> None:
+        self.said.append(("state", state))
+
+    def on_sample(self, sample: Sample) -> None:
+        self.said.append(("sample", sample))
+
+    def on_note(self, note: Note) -> None:
+        self.said.append(("note", note))
+
+    @property
+    def notes(self) -> list[str]:
+        return [record.text for kind, record in self.said if kind == "note"]
+
+
+class Operator:
+    """An operator's end of the control link, as a program would write it."""
+
+    def __init__(self, broker: Any, vehicle: str = "delivery_robot", name: str = "") -> None:
+        from runner.mqtt.link import Link
+        from runner.mqtt.messages import OPERATOR_GONE, read_state, topic
+
+        self.name = name or f"op{free_port()}"
+        self.states: queue.Queue[Any] = queue.Queue()
+        self.last: Any = None  # state
+        self.replies: dict[str, Any] = {}
+        self.telemetry: list[Any] = []
+        self._heard_at = 0.0
+        self.requests = topic(vehicle, "request", self.name)
+        listen = {
+            topic(vehicle, "state"): lambda message: self.states.put(state_to_json(read_state(message.payload))),
+            topic(vehicle, "reply", self.name): lambda m: self.replies.update({(r := json.loads(m.payload))["id"]: r}),
+            topic(vehicle, "telemetry"): self._on_telemetry,
+        }
+        self.link = Link(broker, (self.requests, OPERATOR_GONE), listen, lambda here: None, lambda what: None)
+        self.link.connect()
+        assert self.link.wait_connected(15)
+
+    def _on_telemetry(self, message: Any) -> None:
+        from runner.mqtt.messages import read_telemetry
+
+        self.telemetry.append(to_json(read_telemetry(message.payload)))
+        self._heard_at = time.monotonic()
+
+    def as_of(self) -> float:
+        """The vehicle's time now, as far as it is known here."""
+        return float(until(lambda: self.telemetry)[-1]["t"]) + time.monotonic() - self._heard_at
+
+    def send(self, identity: str, **event: Any) -> None:
+        self.link.publish(self.requests, {"id": identity, "as_of": self.as_of(), **event})
+
+    def ask(self, identity: str, **event: Any) -> Any:
+        self.send(identity, **event)
+        return until(lambda: self.replies.get(identity))
+
+    def state(self, wanted: Callable[[Any], bool]) -> Any:
+        """The next state of which something is true."""
+        end = time.monotonic() + 15
+        while not wanted(state := self.states.get(timeout=max(0.0, end - time.monotonic()))):
+            self.last = state
+        self.last = state
+        return state
+
+    def reach(self, wanted: Callable[[Any], bool]) -> Any:
+        """The state last looked at, or else the next one, of which something is true."""
+        return self.last if self.last and wanted(self.last) else self.state(wanted)
+
+    def publish(self, payload: bytes, **options: Any) -> None:
+        """Anything, as a request."""
+        self.link._client.publish(self.requests, payload, qos=1, **options)
+
+
 def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """The command line in a process of its own."""
     command = [sys.executable, "-m", "runner", *words]
@@ -86,11 +168,11 @@ def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iter
     from dataclasses import replace
 
     from runner.apply import VehicleSide, check_plan
-    from runner.config import load
-    from runner.sources import compile_plans
+    from runner.configuration.config import configuration
+    from runner.plans import compile_plans
 
     words = ["source=test", *overrides, f"media.port={free_port()}"]
-    vehicle = load(words, check=check_plan)
+    vehicle = configuration(words, check=check_plan).vehicle()
     vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras or vehicle.cameras})
     plans = compile_plans(vehicle)
     reported: list[str] = []
@@ -155,3 +237,37 @@ def watching(plan: Any, *, pictures: bool = False) -> Iterator[Client]:
         yield client
     finally:
         client.close()
+
+
+IP_CAMERA = """
+import sys
+from runner.gst import GLib
+from gi.repository import GstRtspServer
+server = GstRtspServer.RTSPServer()
+server.set_address("127.0.0.1")
+server.set_service(sys.argv[1])
+factory = GstRtspServer.RTSPMediaFactory()
+factory.set_launch(
+    "( videotestsrc is-live=true ! video/x-raw,format=I420,width=320,height=240,framerate=25/1 "
+    "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 ! rtph264pay name=pay0 pt=96 config-interval=-1 )"
+)
+factory.set_shared(True)
+server.get_mount_points().add_factory("/stream", factory)
+server.attach(None)
+print("serves", flush=True)
+GLib.MainLoop().run()
+"""
+
+
+@contextmanager
+def ip_camera(port: int) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """An IP camera in a process of its own. Yields its address and the process, which may be stopped or killed."""
+    command = [sys.executable, "-c", IP_CAMERA, str(port)]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=CHECKOUT) as child:
+        try:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "serves\n"
+            yield f"rtsp://127.0.0.1:{port}/stream", child
+        finally:
+            child.kill()

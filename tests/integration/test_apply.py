@@ -11,9 +11,9 @@ import time
 import pytest
 
 from rig import CLIPS, Client, streaming, until, watching
-from runner.commands import Command
+from runner.core.commands import Command
+from runner.core.model import Roi
 from runner.errors import RunError
-from runner.model import Roi
 
 CAMERA = "front_left"
 
@@ -224,8 +224,14 @@ def test_a_frame_of_another_size_is_refused():
         until(lambda: side.push(CAMERA, b"abc"))
 
 
+def test_a_frame_of_a_misspelt_camera_is_refused():
+    rule = "camera 'front_lfet': no such camera, did you mean front_left"
+    with streaming("source=appsrc") as (side, _, _plans, _reported), pytest.raises(ValueError, match=rule):
+        side.push("front_lfet", b"abc")
+
+
 def test_a_port_in_use_is_told_in_one_line():
-    from runner.ports import check_port_free
+    from runner.system.ports import check_port_free
 
     with streaming() as (_, vehicle, _, _reported), pytest.raises(RunError) as told:
         check_port_free(vehicle.media)

@@ -16,11 +16,11 @@ from jsonschema import Draft202012Validator
 
 from rig import free_port, run, until
 from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan
-from runner.commands import Command
-from runner.config import load
+from runner.configuration.config import configuration
+from runner.core.commands import Command
 from runner.drive.log import FORMAT
 from runner.drive.mcap import follow
-from runner.sources import compile_plans
+from runner.plans import compile_plans
 
 pytest.importorskip("foxglove")
 reader = pytest.importorskip("mcap.reader")
@@ -131,7 +131,8 @@ def stamp(field):
 def filmed(tmp_path_factory):
     """Two cameras that were really streamed and received, in a drive on both sides; the frames of each file."""
     drive, told, arrived = tmp_path_factory.mktemp("filmed"), [], []
-    vehicle = load(["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"], check=check_plan)
+    words = ["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"]
+    vehicle = configuration(words, check=check_plan).vehicle()
     vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in CAMERAS})
     plans, files = compile_plans(vehicle), VideoFiles(drive, lambda *first: told.append(first))
     reported = []

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rig import streaming, until
-from runner.commands import Command
+from runner.core.commands import Command
 from runner.errors import UserError
-from runner.frames import live_frames
+from runner.operator.frames import live_frames
 
 pytestmark = pytest.mark.gst
 

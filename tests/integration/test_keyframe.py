@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from runner.keyframe import grey_idr
-from runner.units import Recent, read_unit
+from runner.h264.access_unit import Recent, read_unit
+from runner.h264.keyframe import grey_idr
 
 pytestmark = pytest.mark.gst
 

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from rig import streaming, until
-from runner.commands import Command
+from runner.core.commands import Command
 from runner.gst import receiver
 
 pytestmark = pytest.mark.gst

@@ -17,8 +17,8 @@ import pytest
 
 from rig import CHECKOUT, CLIPS, process, run, streaming, until
 from runner import schema
-from runner.commands import Command
-from runner.model import Roi
+from runner.core.commands import Command
+from runner.core.model import Roi
 from runner.rate_quality.artefact import read_model
 from runner.rate_quality.curves import Point, along, draw_curves, mean_score
 from runner.rate_quality.metrics import find_metric

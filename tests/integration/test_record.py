@@ -17,11 +17,11 @@ from typing import Any
 import pytest
 
 from rig import CHECKOUT, CLIPS, process, run, until
-from runner import recordings
-from runner.config import load
+from runner.configuration.config import configuration
 from runner.errors import RunError
 from runner.graph import launch
-from runner.sources import compile_plans
+from runner.plans import compile_plans
+from runner.rate_quality import recordings
 
 pytestmark = pytest.mark.gst
 
@@ -76,7 +76,7 @@ def digests(found: list[tuple[int, str]]) -> list[str]:
 
 def source_line(*overrides: str) -> str:
     """The source of the one camera, as it stands in every pipeline, without the element that paces it."""
-    (plan,) = compile_plans(load([*ONE, *overrides]))
+    (plan,) = compile_plans(configuration([*ONE, *overrides]).vehicle())
     return launch(element for element in plan.source if element.name != "pace")
 
 
@@ -235,7 +235,7 @@ def test_a_disk_without_room_is_refused_before_the_start(small_disk):
 @pytest.mark.parametrize(("free", "fits"), [(86_000_000, False), (87_000_000, True)])
 def test_the_room_that_is_needed(tmp_path, monkeypatch, free, fits):
     """10 frames of 848x480: 6.1 MB raw; kept free are 64 MB and two seconds of 6.1 MB."""
-    vehicle = load([*ONE, "source=test", "fps_max=10", "recording.of_raw=1.7"])
+    vehicle = configuration([*ONE, "source=test", "fps_max=10", "recording.of_raw=1.7"]).vehicle()
     usage = shutil._ntuple_diskusage(10**9, 10**9 - free, free)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     check = (tmp_path, vehicle.cameras.values(), vehicle.recording, 1)

@@ -13,7 +13,7 @@ import pytest
 from drives import write_drive, write_models
 
 from rig import CHROMIUM_FLAGS
-from runner.compose import compose
+from runner.configuration.compose import compose
 from runner.verbs.report import report
 
 pytestmark = pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
@@ -24,10 +24,10 @@ sync_api = pytest.importorskip("playwright.sync_api")
 SINGLE = {
     ("bitrate_on_track", 0): 6,  # way, points, arrows, start, end, where one points at
     ("totals", 0): 4,
-    ("bitrates", 0): 4,
-    ("bitrates", 1): 4,
-    ("scaling", 0): 4,
-    ("scaling", 1): 4,
+    ("bitrates", 0): 5,  # mean, lowest and highest of two cameras, and two others
+    ("bitrates", 1): 3,
+    ("scaling", 0): 3,
+    ("scaling", 1): 1,
     ("latency", 0): 3,  # two percentiles, one camera that froze
     ("latency", 1): 9,
     ("quality", 0): 4,
@@ -118,7 +118,7 @@ def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, screenshots:
 def test_the_theme_follows_the_system_and_is_chosen_by_a_button(chromium: Any, single: Path) -> None:
     with opened(chromium, single, scheme="light") as page:
         theme = "document.documentElement.dataset.theme"
-        colour = "document.querySelector('.bitrates').data[0].line.color"
+        colour = "document.querySelector('.quality').data[0].line.color"
         assert (page.evaluate(theme), page.evaluate(colour)) == ("day", "#0b6fae")
         page.locator("#theme").click()
         page.wait_for_function(f"{colour} === '#56b4e9'")
@@ -129,7 +129,7 @@ def test_factors_say_why(chromium: Any, single: Path) -> None:
     with opened(chromium, single) as page:
         at = page.evaluate("document.querySelector('.scaling').data[0].x.findIndex(t => t > 12)")
         told = hovered(page, "scaling", 0, 0, at)
-        assert "front_left from " in told
+        assert "front_left, front_right from " in told
         assert "of 6000 kbit/s, range [300, 950) -> 0.25" in told
 
 

@@ -6,13 +6,14 @@ import json
 
 import pytest
 
-from rig import free_port, until
-from runner.broker import private_broker
-from runner.config import load
-from runner.control import OFFLINE, Link
+from rig import Heard, free_port, until
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint
 from runner.gst.receiver import Received
-from runner.model import Endpoint
-from runner.station import ANSWER_S, SILENT_S, Station
+from runner.mqtt.broker import private_broker
+from runner.mqtt.link import Link
+from runner.mqtt.messages import OFFLINE, topic
+from runner.operator.station import SILENT_S, Station
 
 pytestmark = pytest.mark.gst
 
@@ -24,10 +25,18 @@ STATE = {
     "mode": "automatic",
     "total_kbps": 1500,
     "cameras": {
-        name: {**CAMERA, "roi": {"x": 0, "y": 0, "width": 1280, "height": 720}, "reason": "why", "applied": {}}
+        name: {
+            **CAMERA,
+            "roi": {"x": 0, "y": 0, "width": 1280, "height": 720},
+            "reason": "why",
+            "weight": 1,
+            "applied": {},
+        }
         for name in ("front", "rear", "mast")
     },
 }
+
+TELEMETRY = {"t": 2, "predicted_kbps": 2000, "position": None, "refused": 0, "cameras": {}}
 
 
 class Vehicle:
@@ -35,9 +44,19 @@ class Vehicle:
 
     def __init__(self, broker):
         self.requests = []
-        listen = {"request": lambda payload: self.requests.append(json.loads(payload))}
-        self.link = Link("delivery_robot", broker, ("state", OFFLINE), listen, lambda here: None)
+        self.operator = ""  # who asked last
+        listen = {topic("delivery_robot", "request", "+"): self._on_request}
+        self.link = Link(broker, (topic("delivery_robot", "state"), OFFLINE), listen, lambda here: None, print)
         self.link.connect()
+        assert self.link.wait_connected(15)
+
+    def _on_request(self, message):
+        self.operator = message.sender
+        self.requests.append(json.loads(message.payload))
+
+    def publish(self, kind, message):
+        parts = (kind, self.operator) if kind == "reply" else (kind,)
+        self.link.publish(topic("delivery_robot", *parts), message)
 
     def request(self, event):
         return until(lambda: next((asked for asked in self.requests if asked["event"] == event), None))
@@ -47,75 +66,91 @@ class Vehicle:
 def both():
     broker = Endpoint("127.0.0.1", free_port())
     with private_broker(broker):
-        station = Station(load(["vehicle=delivery_robot", f"control.port={broker.port}"]))
-        told = []
-        station.listeners.append(lambda kind, message: told.append((kind, message)))
+        station = Station(configuration(["vehicle=delivery_robot", f"control.port={broker.port}"]).vehicle(), {})
+        heard = Heard()
+        station.listeners.append(heard)
         vehicle = Vehicle(broker)
         station.connect()
-        vehicle.link.publish("state", STATE)
-        until(lambda: station.state["online"])
-        yield station, vehicle, told
+        vehicle.publish("state", STATE)
+        vehicle.publish("telemetry", TELEMETRY)
+        until(lambda: station.state)
+        yield station, vehicle, heard
         station.close()
-        vehicle.link.close("state", OFFLINE)
+        vehicle.link.close((topic("delivery_robot", "state"), OFFLINE))
+
+
+def results(replies):
+    return [(reply.result, reply.reason) for reply in replies]
 
 
 def samples():
     return dict.fromkeys(("front", "rear", "mast"), Received())
 
 
-def notes(told):
-    return [message["text"] for kind, message in told if kind == "note"]
-
-
 def test_who_comes_says_hello_and_is_answered(both):
-    station, vehicle, told = both
+    station, vehicle, heard = both
     assert "id" in vehicle.request("operator_connected")
     replies = []
-    station.ask({"event": "total_set", "kbps": 1000}, lambda *said: replies.append(said))
+    station.ask({"event": "total_set", "kbps": 1000}, replies.append)
     asked = vehicle.request("total_set")
-    vehicle.link.publish("reply", {"id": "another", "t": 1, "result": "applied", "reason": ""})
-    vehicle.link.publish("reply", {"id": asked["id"], "t": 1, "result": "refused", "reason": "no"})
+    vehicle.publish("reply", {"id": "another", "t": 1, "result": "applied", "reason": ""})
+    vehicle.publish("reply", {"id": asked["id"], "t": 1, "result": "refused", "reason": "no"})
     until(lambda: replies)
-    assert replies == [("reply", {"result": "refused", "reason": "no"})]
-    assert notes(told) == ["the vehicle is there, mode automatic"]
+    assert results(replies) == [("refused", "no")]
+    assert heard.notes == ["the vehicle is online, mode automatic"]
 
 
 def test_a_request_that_nobody_answers_has_timed_out(both):
     station, _, _ = both
     replies = []
-    station.ask({"event": "total_set", "kbps": 1000}, lambda kind, said: replies.append(said))
-    until(lambda: station.take(samples()) is None and replies, seconds=5 * ANSWER_S)
-    assert replies == [{"result": "timed out", "reason": "no answer from the vehicle within 2 s"}]
+    station.ask({"event": "total_set", "kbps": 1000}, replies.append)
+    until(lambda: station.take(samples()) is None and replies, seconds=5 * station.answer_s)
+    assert results(replies) == [("timed out", "no answer from the vehicle within 3 s")]
 
 
 def test_a_silent_vehicle_is_not_there_and_returns_by_a_word(both):
-    station, vehicle, told = both
-    until(lambda: station.take(samples()) is None and not station.state["online"], seconds=10 * SILENT_S)
+    station, vehicle, heard = both
+    until(lambda: station.take(samples()) is None and not station.state, seconds=10 * SILENT_S)
     replies = []
-    station.ask({"event": "total_set", "kbps": 1000}, lambda kind, said: replies.append(said))
-    assert replies == [{"result": "refused", "reason": "the vehicle is not there"}]
+    station.ask({"event": "total_set", "kbps": 1000}, replies.append)
+    assert results(replies) == [("refused", "the vehicle is offline")]
     vehicle.requests.clear()
-    vehicle.link.publish("telemetry", {"t": 2, "predicted_kbps": 2000, "position": None, "refused": 0, "cameras": {}})
-    until(lambda: station.state["online"])
+    vehicle.publish("telemetry", TELEMETRY)
+    until(lambda: station.state)
     vehicle.request("operator_connected")
-    assert notes(told)[1:] == ["the vehicle has said nothing for 0.7 s", "the vehicle is there, mode automatic"]
+    assert heard.notes[1:] == ["the vehicle has been silent for 0.7 s", "the vehicle is online, mode automatic"]
     station.take(samples())
-    sample = told[-1][1]
-    assert (sample["predicted_kbps"], sample["allocated_kbps"]) == (2000, 1500)
+    sample = heard.said[-1][1]
+    assert (sample.predicted_kbps, sample.allocated_kbps) == (2000, 1500)
 
 
-def test_changes_are_told_with_their_cause_and_reason(both):
-    _, vehicle, told = both
-    rear = {**STATE["cameras"]["rear"], "scaling": 0.25, "reason": "300 of 4000 kbit/s, range [0, 400) -> 0.25"}
-    cameras = {**STATE["cameras"], "rear": rear}
-    vehicle.link.publish("state", {**STATE, "cause": "bitrate_predicted kbps 900", "cameras": cameras})
-    until(lambda: len(notes(told)) == 2)
-    assert notes(told)[1] == "bitrate_predicted kbps 900 -> rear: 300 of 4000 kbit/s, range [0, 400) -> 0.25"
+def test_a_vehicle_whose_clock_is_ahead_is_warned_of_where_its_ages_stood(both):
+    station, _, heard = both
+    station.take({name: Received(frames=9, latency_ms=-500.4) for name in samples()})
+    warning = "delivery_robot, mode automatic, total 1500 kbit/s; its clock is ahead by at least 500 ms: "
+    assert station.headline() == f"{warning}latencies are unknown"
+    assert {row.received.latency_ms for row in station.rows()} == {None}
+    assert heard.said[-1][1].clock_ahead_ms == 500.4
+    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: ages of pictures are unknown; ")
+
+
+def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
+    station, vehicle, heard = both
+    cameras = {
+        name: {**camera, "scaling": 0.25, "reason": f"{kbps} of 4000 kbit/s, range [0, 400) -> 0.25"}
+        for kbps, (name, camera) in enumerate(STATE["cameras"].items(), 300)
+    }
+    state = {**STATE, "t": 2.0, "cause": "bitrate_predicted kbps 900", "total_kbps": 900, "cameras": cameras}
+    vehicle.publish("state", state)
+    vehicle.publish("state", {**state, "t": 3.0, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
+    until(lambda: station.state.total_kbps == 880)
+    text = "Prediction 900 kbit/s: front, rear, mast 0.5 -> 0.25 (3 of 3 cameras, total 900 kbit/s)"
+    assert heard.notes[1:] == [text]
 
 
 def test_a_vehicle_that_leaves_is_gone_at_once(both):
-    station, vehicle, told = both
-    vehicle.link.publish("state", OFFLINE)
-    until(lambda: not station.state["online"])
-    assert notes(told)[1:] == ["the vehicle is gone"]
-    assert told[-1] == ("state", OFFLINE)
+    station, vehicle, heard = both
+    vehicle.publish("state", OFFLINE)
+    until(lambda: not station.state)
+    assert heard.notes[1:] == ["the vehicle is offline"]
+    assert heard.said[-1] == ("state", None)

@@ -2,7 +2,7 @@
 
 import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
-import { make, spoken } from "./format.js";
+import { by, make, spoken } from "./format.js";
 
 const SHOWN_S = 300;
 const SETTLE_MS = 1500; // from the first picture to loading the charts
@@ -10,7 +10,6 @@ const AT_LATEST_MS = 4000; // without any picture
 const BETWEEN_MS = 60; // from one chart to the next: no long task
 const EARTH_M = 6371000;
 
-const by = (id) => document.getElementById(id);
 const visible = new Set();
 let loading = false;
 
@@ -18,7 +17,8 @@ let loading = false;
 
 const ages = () => {
   const { time } = store.series;
-  return time.map((each) => each - time.at(-1));
+  const now = time.at(-1) ?? 0;
+  return time.map((each) => each - now);
 };
 
 const line = (x, y, name, colour, more = {}) =>
@@ -61,10 +61,10 @@ function metres() {
   const known = lat.flatMap((each, i) => (each === null || lon[i] === null ? [] : [i]));
   if (!known.length) return null;
   const radians = Math.PI / 180;
-  const [first] = known;
+  const from = { lat: lat[known[0]] ?? 0, lon: lon[known[0]] ?? 0 };
   return {
-    x: known.map((i) => (lon[i] - lon[first]) * radians * EARTH_M * Math.cos(lat[first] * radians)),
-    y: known.map((i) => (lat[i] - lat[first]) * radians * EARTH_M),
+    x: known.map((i) => ((lon[i] ?? 0) - from.lon) * radians * EARTH_M * Math.cos(from.lat * radians)),
+    y: known.map((i) => ((lat[i] ?? 0) - from.lat) * radians * EARTH_M),
     kbps: known.map((i) => actual_kbps[i]),
   };
 }

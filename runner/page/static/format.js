@@ -20,8 +20,26 @@ export const clockTime = (seconds) => new Date(seconds * 1000).toTimeString().sl
 export const spoken = (name) => name.replaceAll("_", " ");
 
 /**
+ * The element that the page's document gives an id.
+ * @template {HTMLElement} [E=HTMLElement]
+ * @param {string} id
+ * @param {new () => E} [kind]
+ * @returns {E}
+ */
+export function by(id, kind) {
+  const element = document.getElementById(id);
+  if (!(element instanceof (kind ?? HTMLElement))) throw new Error(`index.html: no ${kind?.name ?? "element"} #${id}`);
+  return /** @type {E} */ (element);
+}
+
+/**
  * An element: make("button", {class: "on", title: "..."}, "text", child).
  * Keys that begin with "on" are listeners; false and null leave an attribute out.
+ * @template {keyof HTMLElementTagNameMap} K
+ * @param {K} tag
+ * @param {Record<string, any>} attributes
+ * @param {(Node|string)[]} children
+ * @returns {HTMLElementTagNameMap[K]}
  */
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);

@@ -3,13 +3,12 @@
 import { inControl, listen, mode, publish, store } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
-import { mark, whole, write } from "./format.js";
+import { by, mark, whole, write } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is just opening
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 
-const by = (id) => document.getElementById(id);
-const buttons = [...document.querySelectorAll("#modes button")];
+const buttons = [...by("modes").querySelectorAll("button")];
 
 /** Ask for another mode. What is highlighted stays what the vehicle says. */
 export function selectMode(wanted) {
@@ -22,7 +21,7 @@ export function toggleControl() {
   if (store.holder === "you") return send({ release_control: true });
   if (store.holder === "nobody") return send({ take_control: true });
   write(by("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
-  by("confirm").showModal();
+  by("confirm", HTMLDialogElement).showModal();
 }
 
 function refresh() {
@@ -46,7 +45,7 @@ function refreshModes() {
 }
 
 function refreshControl() {
-  const button = by("take-control");
+  const button = by("take-control", HTMLButtonElement);
   write(by("holder"), store.connected ? HOLDERS[store.holder] : "");
   mark(by("holder"), "data-holder", store.holder);
   write(button, store.holder === "you" ? "Release" : "Take control");
@@ -67,15 +66,26 @@ function refreshBanner() {
   mark(by("connection"), "data-state", words === "connected" ? "fine" : "bad");
 }
 
+function refreshWarning() {
+  const ahead = store.connected && store.state?.online ? store.sample?.clock_ahead_ms : null;
+  const known = ahead === null || ahead === undefined;
+  const by_s = known ? "" : (ahead / 1000).toFixed(1);
+  const text = `▲ The vehicle's clock is ahead by at least ${by_s} s: the age of its pictures is unknown, and LATE cannot be shown`;
+  by("warning").hidden = known;
+  write(by("warning"), known ? "" : text);
+}
+
 function refreshTotals() {
-  for (const key of ["predicted", "allocated", "actual"]) write(by(key), whole(store.connected ? store.sample?.[`${key}_kbps`] : NaN));
+  refreshWarning();
+  const current = store.connected && store.state?.online;
+  for (const key of ["predicted", "allocated", "actual"]) write(by(key), whole(current ? store.sample?.[`${key}_kbps`] : NaN));
 }
 
 function moveFocus(event) {
   const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
   if (!step) return;
   event.preventDefault();
-  const at = buttons.indexOf(document.activeElement);
+  const at = buttons.findIndex((button) => button === document.activeElement);
   buttons[(at + step + buttons.length) % buttons.length].focus();
 }
 
@@ -83,13 +93,14 @@ export function startHeader() {
   for (const button of buttons) button.addEventListener("click", () => selectMode(button.dataset.mode));
   by("modes").addEventListener("keydown", moveFocus);
   by("take-control").addEventListener("click", toggleControl);
-  by("confirm").addEventListener("close", ({ target }) => {
-    if (target.returnValue === "yes") send({ take_control: true });
-    target.returnValue = "";
+  const confirm = by("confirm", HTMLDialogElement);
+  confirm.addEventListener("close", () => {
+    if (confirm.returnValue === "yes") send({ take_control: true });
+    confirm.returnValue = "";
   });
   by("help-open").addEventListener("click", () => publish("help"));
   listen("hello state control requests socket", refresh);
-  listen("sample socket", refreshTotals);
+  listen("sample socket state", refreshTotals);
   setTimeout(refresh, START_MS + 50);
   refresh();
 }

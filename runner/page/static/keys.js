@@ -1,11 +1,11 @@
 /** The keyboard, and the dialog that lists its keys. */
 
-import { camera, enlarge, listen, publish, select, store } from "./store.js";
+import { enlarge, listen, publish, select, store } from "./store.js";
 import { selectMode, toggleControl } from "./header.js";
 import { focusTile, switchCamera } from "./tiles.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
-import { make } from "./format.js";
+import { by, make } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
 const CHORD_MS = 2500;
@@ -65,14 +65,14 @@ function pressed(event) {
 
 function selectNumber(number) {
   const name = store.hello?.cameras[number - 1]?.name;
-  if (!camera(name)) return;
+  if (name === undefined) return;
   if (store.enlarged) enlarge(name);
   select(name);
   focusTile(name);
 }
 
 export function startKeys() {
-  const help = document.getElementById("help");
+  const help = by("help", HTMLDialogElement);
   const rows = LIST.map(([key, what]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, what)));
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
   help.append(make("h2", { id: "help-title" }, "Keys"), make("table", {}, make("tbody", {}, ...rows)), close);

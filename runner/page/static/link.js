@@ -13,8 +13,9 @@ const heard = {
     if (!open) store.holder = "nobody";
     publish("socket", open);
   },
-  status({ camera, status }) {
+  status({ camera, status, why }) {
     store.status[camera] = status;
+    store.refused[camera] = why;
     publish("status", { camera, status });
   },
   ages({ ages }) {

@@ -30,7 +30,7 @@ listen("reply", ({ id, result, reason }) => {
   answers.get(id)?.({ result, reason });
   answers.delete(id);
 });
-window.tod = {
+globalThis.tod = {
   measure: () => ask("measure"),
   stages: () => ask("stages"),
   picture: (name) => ask("picture", name),

@@ -1,13 +1,13 @@
 /** News, newest first, and toasts for what needs a look now. */
 
 import { listen, store } from "./store.js";
-import { clockTime, make, write } from "./format.js";
+import { by, clockTime, make, write } from "./format.js";
 
 const TOAST_MS = { hint: 4000, problem: 8000 };
 const MOST = 4;
 
-const list = document.getElementById("news");
-const toasts = document.getElementById("toasts");
+const list = by("news");
+const toasts = by("toasts");
 const latest = make("p", { id: "latest" });
 const roomy = matchMedia("(min-width: 1700px) and (min-height: 900px)");
 
@@ -21,22 +21,21 @@ function refresh() {
 }
 
 function toast({ text, level }) {
-  const same = [...toasts.children].find((each) => each.dataset.text === text);
-  same?.remove();
+  [...toasts.children].find((each) => each.getAttribute("data-text") === text)?.remove();
   const shape = level === "problem" ? "✕ " : "";
   const element = make("div", { class: "toast", "data-level": level, "data-text": text }, shape + text);
   element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
   toasts.append(element);
-  while (toasts.children.length > MOST) toasts.firstChild.remove();
+  while (toasts.children.length > MOST) toasts.firstChild?.remove();
   setTimeout(() => element.remove(), TOAST_MS[level]);
 }
 
 /** Where there is room, the whole list stands below the tiles; else its newest line does, and the list has a tab. */
 function place() {
-  const strip = document.getElementById("strip");
+  const strip = by("strip");
   if (roomy.matches) strip.replaceChildren(list);
   else {
-    document.getElementById("news-panel").append(list);
+    by("news-panel").append(list);
     strip.replaceChildren(latest);
   }
 }

@@ -6,7 +6,7 @@ import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js"
 import { makeSlider } from "./slider.js";
 import { SHAPES, switchCamera, unapplied } from "./tiles.js";
 import { colourOf } from "./colours.js";
-import { factor, make, mark, region, size, whole, write } from "./format.js";
+import { by, factor, make, mark, region, size, whole, write } from "./format.js";
 
 const SIDES = ["x", "y", "width", "height"];
 const WHY = {
@@ -14,7 +14,8 @@ const WHY = {
   collective: "Shared from the total in mode C; choose S to set it by hand.",
 };
 
-const name = () => store.selected;
+/** The selected camera; "" before the first hello, when nothing is shown here. */
+const name = () => store.selected ?? "";
 const whyNot = () => (!decided(name()) ? "The vehicle is not there." : inControl() ? null : `${capital(whyNoControl())}.`);
 const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
@@ -86,7 +87,7 @@ function setWeight() {
 }
 
 function sendSides() {
-  const { width, height } = camera(name());
+  const { width, height } = fullRegion(name());
   const roi = Object.fromEntries(SIDES.map((side) => [side, Math.round(+sides[side].value)]));
   const inside = roi.x >= 0 && roi.y >= 0 && roi.x + roi.width <= width && roi.y + roi.height <= height;
   if (!inside) return complain(`the ROI leaves the image of ${width}×${height}`);
@@ -97,7 +98,7 @@ function sendSides() {
 
 /** Ask for the full image of the selected camera. */
 export function sendFull() {
-  if (!name()) return;
+  if (!store.selected) return;
   const why = whyNotByHand();
   if (why) return complain(why);
   sendRegion(name(), fullRegion(name()));
@@ -113,15 +114,15 @@ function refresh() {
   refreshHead(now);
   refreshSettings(about, now);
   refreshComparison(now);
-  refreshDiagram(about, now);
+  refreshDiagram(about);
 }
 
 function refreshHead(now) {
   const word = store.status[name()] ?? "synchronising";
   const asked = pending(`on:${name()}`);
   write(title, name());
-  swatch.style.background = colourOf(store.hello.cameras.findIndex((each) => each.name === name()));
-  write(status, `${SHAPES[word]} ${word.toUpperCase()}`);
+  swatch.style.background = colourOf(store.hello?.cameras.findIndex((each) => each.name === name()) ?? 0);
+  write(status, `${SHAPES[word]} ${word === "unsupported" ? "NO PICTURE" : word.toUpperCase()}`);
   mark(status, "data-status", word);
   mark(on, "aria-checked", now?.on === true);
   mark(on, "aria-label", `${name()} on`);
@@ -129,7 +130,7 @@ function refreshHead(now) {
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? "switch this camera on or off (o)";
   write(on, asked ? (asked.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  write(reason, now?.reason || "–");
+  write(reason, [word === "unsupported" ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
 }
 
 function refreshSettings(about, now) {
@@ -162,8 +163,8 @@ function refreshFactors(about, now, why) {
     choices.replaceChildren(...about.scaling.map(button));
   }
   const asked = pending(`scaling:${name()}`)?.event.scaling;
-  for (const button of choices.children) {
-    const value = +button.dataset.factor;
+  for (const button of choices.querySelectorAll("button")) {
+    const value = Number(button.dataset.factor);
     button.disabled = Boolean(why);
     mark(button, "aria-pressed", now?.scaling === value);
     mark(button, "data-pending", asked === value ? "" : null);
@@ -174,10 +175,12 @@ function refreshComparison(now) {
   const applied = now?.applied ?? {};
   const yes = (value) => (value === undefined ? "–" : value ? "yes" : "no");
   const differs = now ? unapplied(now) : [];
+  // An encoder that gets no frames keeps its last setting: that is no bitrate that is sent.
+  const kept = (value) => (applied.sending === false && value !== "–" ? `– (keeps ${value})` : value);
   const values = {
     sending: [yes(now?.sending), yes(applied.sending)],
-    bitrate: [whole(now?.kbps), whole(applied.bitrate)],
-    size: [size(now?.width, now?.height), size(applied.size?.width, applied.size?.height)],
+    bitrate: [whole(now?.kbps), kept(whole(applied.bitrate))],
+    size: [size(now?.width, now?.height), kept(size(applied.size?.width, applied.size?.height))],
     ROI: [region(now?.roi), region(applied.roi)],
   };
   for (const [key, { row, cells }] of rows) {
@@ -228,7 +231,7 @@ export function startPanel() {
       diagram.box),
   );
   const head = make("div", { class: "head" }, swatch, title, status, on);
-  document.getElementById("camera-panel").append(head, reason, controls, comparison(), differing);
+  by("camera-panel").append(head, reason, controls, comparison(), differing);
   listen("hello state sample control requests socket status theme", refresh);
   listen("selected", forget);
 }

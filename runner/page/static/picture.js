@@ -7,16 +7,23 @@
 import { toRgba } from "./yuv.js";
 
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
+/** @typedef {"I420"|"NV12"} Format */
 const FORMATS = ["I420", "NV12"];
 const SPARES = 16;
 const ASK_MS = 3000;
+
+/** @typedef {{bytes: Uint8Array, image: ImageData}} Memory */
+/** @type {Memory[]} */
 const spare = []; // memory of pictures that are closed
 
 /** A frame, as it is; closed when the next one is shown. */
 class FramePicture {
+  /** @param {VideoFrame} frame */
   constructor(frame) {
-    const { displayWidth: width, displayHeight: height } = frame;
-    Object.assign(this, { frame, width, height, painted: { width, height } });
+    this.frame = frame;
+    this.width = frame.displayWidth;
+    this.height = frame.displayHeight;
+    this.painted = { width: this.width, height: this.height };
   }
 
   paint(context, width, height) {
@@ -37,10 +44,21 @@ class FramePicture {
 
 /** The planes of a frame; turned into pixels when first painted, since not every decoded picture is. */
 class PlanePicture {
+  converted = false;
+
+  /**
+   * @param {Memory} memory
+   * @param {PlaneLayout[]} planes
+   * @param {{format: Format, colorSpace: VideoColorSpace, width: number, height: number}} shape of the frame
+   */
   constructor(memory, planes, { format, colorSpace, width, height }) {
-    const { width: wide, height: high } = memory.image;
-    Object.assign(this, { memory, planes, format, colorSpace, width, height, converted: false });
-    this.painted = { width: wide, height: high };
+    this.memory = memory;
+    this.planes = planes;
+    this.format = format;
+    this.colorSpace = colorSpace;
+    this.width = width;
+    this.height = height;
+    this.painted = { width: memory.image.width, height: memory.image.height };
   }
 
   paint(context, width, height) {
@@ -49,7 +67,7 @@ class PlanePicture {
     this.converted = true;
     if (width === image.width && height === image.height) return context.putImageData(image, 0, 0);
     const still = new OffscreenCanvas(image.width, image.height);
-    still.getContext("2d", { alpha: false, willReadFrequently: true }).putImageData(image, 0, 0);
+    still.getContext("2d", { alpha: false, willReadFrequently: true })?.putImageData(image, 0, 0);
     context.drawImage(still, 0, 0, width, height);
   }
 
@@ -92,12 +110,14 @@ function isPlain({ displayWidth, displayHeight, visibleRect, format }) {
  * The picture of a frame, which is closed here or with the picture. Where the screen shows less than half of its pixels
  * and they are turned into colours here, every fourth is enough.
  * @param {VideoFrame} frame  @param {number} shown width on the screen, px
- * @returns {Promise<FramePicture|PlanePicture>}
+ * @typedef {FramePicture|PlanePicture} Picture
+ * @returns {Promise<Picture>}
  */
 export async function pictureOf(frame, shown) {
   if (hasGpu || !isPlain(frame)) return new FramePicture(frame);
   try {
-    const { format, colorSpace, displayWidth: width, displayHeight: height } = frame;
+    const { colorSpace, displayWidth: width, displayHeight: height } = frame;
+    const format = /** @type {Format} */ (frame.format); // else it is not plain
     const step = shown > 0 && 2 * shown <= width ? 2 : 1;
     const memory = memoryFor(width / step, height / step, frame.allocationSize());
     const planes = await frame.copyTo(memory.bytes);

@@ -9,6 +9,11 @@ import { send } from "./link.js";
 const GIVE_UP_MS = 6000; // the station itself says "timed out" long before
 const PREFIX = Math.random().toString(36).slice(2, 8);
 
+/**
+ * @typedef {{id: string, control: string, event: Record<string, any>, words: string, sent: number, timer: any}} Request
+ * @typedef {Omit<Request, "timer"> & {result: string, reason: string, answered: number}} Answered
+ * @type {{pending: Map<string, Request>, answered: Answered[]}}
+ */
 export const requests = { pending: new Map(), answered: [] };
 let count = 0;
 

@@ -33,7 +33,8 @@ export function regionOf(box, roi, full, a, b) {
 }
 
 /** Whole numbers between the bounds of what is seen; never smaller than the smallest, never outside the image. */
-function snap([from, to], low, high, end) {
+function snap(sides, low, high, end) {
+  const [from, to] = sides;
   const start = Math.round(Math.max(low, Math.min(from, high - 1)));
   const stop = Math.round(Math.min(high, Math.max(to, low + 1)));
   const length = Math.max(SMALLEST, stop - start);
@@ -45,7 +46,12 @@ export function sendRegion(name, roi) {
   request(`roi:${name}`, { event: "roi_set", camera: name, x, y, width, height }, `ROI of ${name}`);
 }
 
-export const fullRegion = (name) => ({ x: 0, y: 0, width: camera(name).width, height: camera(name).height });
+/** The whole image of a camera of the vehicle. */
+export function fullRegion(name) {
+  const full = camera(name);
+  if (!full) throw new Error(`no camera ${name}`);
+  return { x: 0, y: 0, width: full.width, height: full.height };
+}
 
 export function whyNoRegion() {
   if (!inControl()) return whyNoControl();
@@ -65,6 +71,7 @@ export function dragRegion(name, box) {
   };
   const place = (roi) => {
     const seen = seenRegion(name);
+    if (!seen) return;
     const content = contentOf(box, seen);
     Object.assign(rectangle.style, {
       left: `${content.x + (roi.x - seen.x) * content.scale}px`,
@@ -74,7 +81,7 @@ export function dragRegion(name, box) {
     });
     rectangle.hidden = false;
   };
-  const region = (event) => regionOf(box, seenRegion(name), camera(name), from, point(event));
+  const region = (event) => regionOf(box, seenRegion(name), fullRegion(name), from, point(event));
   const end = () => {
     from = null;
     dragging = false;

@@ -5,9 +5,8 @@
 
 import { pending } from "./requests.js";
 import { make, mark, whole, write } from "./format.js";
+import { STEPS, throttle, toKbps, toStep } from "./scale.js";
 
-const STEPS = 1000;
-const SPAN = 200; // the right end over the left end; rates below are set by number
 const SEND_EVERY_MS = 200;
 const HAND_MS = 400;
 
@@ -26,18 +25,15 @@ export function makeSlider({ label, data, id, send, control }) {
   let touched = -Infinity;
   let held = false;
 
-  // Even steps are even ratios: a little matters much at low rates, and no key press goes from plenty to nothing.
-  const toKbps = (step) => Math.max(1, Math.round(max * SPAN ** (step / STEPS - 1)));
-  const toStep = (kbps) => Math.round(STEPS * Math.min(1, Math.max(0, 1 + Math.log(kbps / max) / Math.log(SPAN))));
-
+  const chosen = () => toKbps(+range.value, max);
   const wish = throttle(send, SEND_EVERY_MS);
   range.addEventListener("pointerdown", () => (held = true));
   range.addEventListener("pointerup", () => (held = false));
   range.addEventListener("pointercancel", () => (held = false));
   range.addEventListener("input", () => {
     touched = performance.now();
-    number.value = toKbps(+range.value);
-    wish(toKbps(+range.value));
+    number.value = String(chosen());
+    wish(chosen());
   });
   number.addEventListener("input", () => (edited = true));
   number.addEventListener("blur", () => (edited = false));
@@ -45,7 +41,7 @@ export function makeSlider({ label, data, id, send, control }) {
     edited = false;
     if (number.value === "") return;
     const kbps = Math.max(1, Math.min(max, Math.round(+number.value)));
-    range.value = toStep(kbps);
+    range.value = String(toStep(kbps, max));
     send(kbps);
   });
 
@@ -60,30 +56,12 @@ export function makeSlider({ label, data, id, send, control }) {
       const asked = pending(control());
       mark(element, "data-pending", asked ? "" : null);
       tick.hidden = !Number.isFinite(value);
-      tick.style.setProperty("--at", toStep(value || 1) / STEPS);
+      tick.style.setProperty("--at", String(toStep(value || 1, max) / STEPS));
       write(inForce, asked ? `◌ now ${whole(value)}` : `now ${whole(value)}`);
-      mark(range, "aria-valuetext", `${toKbps(+range.value)} kbit/s, in force ${whole(value)}`);
+      mark(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(value)}`);
       if (held || asked || performance.now() - touched < HAND_MS) return;
-      range.value = toStep(value || 1);
-      if (!edited) number.value = Number.isFinite(value) ? Math.round(value) : "";
+      range.value = String(toStep(value || 1, max));
+      if (!edited) number.value = Number.isFinite(value) ? String(Math.round(value)) : "";
     },
-  };
-}
-
-/** Call at once, then at most every `wait` ms; the last value is always sent. */
-function throttle(call, wait) {
-  let timer = null;
-  let next = null;
-  const again = () => {
-    timer = null;
-    if (next === null) return;
-    const value = next;
-    next = null;
-    timer = setTimeout(again, wait);
-    call(value);
-  };
-  return (value) => {
-    next = value;
-    if (timer === null) again();
   };
 }

@@ -4,27 +4,45 @@ const LOST_MS = 1000;
 const INTERVALS = 1.3; // this many frame intervals without a picture are no jitter any more
 
 /**
- * @param {object} s what is known: connected, online, on, sending, drawn (a picture since the stream was last started),
- *   arrived and decoded (page times of the newest unit, or of the start of the stream), late_until, fps
+ * @typedef {object} Times what is known of a stream
+ * @property {boolean} connected
+ * @property {boolean} online
+ * @property {boolean|null} on
+ * @property {boolean|null} sending
+ * @property {string} refused why there is no decoder, "" where there is one
+ * @property {boolean} drawn a picture since the stream was last started
+ * @property {number} arrived page time of the newest unit, or of the start of the stream
+ * @property {number} decoded likewise
+ * @property {number} late_until page time
+ * @property {number} fps
+ *
+ * @param {Times} s
  * @param {{frozen_ms: number}} limits
  * @param {number} now page time
- * @returns {"off"|"paused"|"lost"|"frozen"|"late"|"synchronising"|"live"}
+ * @returns {"off"|"paused"|"lost"|"unsupported"|"frozen"|"late"|"synchronising"|"live"}
  */
 export function judge(s, limits, now) {
   const reachable = s.connected && s.online;
   if (reachable && s.on === false) return "off";
   if (reachable && s.sending === false) return "paused";
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
+  if (s.refused) return "unsupported";
   if (!s.drawn) return "synchronising";
   const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
   if (now - Math.min(s.arrived, s.decoded) > limit) return "frozen";
   return now < s.late_until ? "late" : "live";
 }
 
-/** The words on an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s". */
+/**
+ * The words on an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
+ * @param {string} status
+ * @param {number} since_ms since the newest unit
+ * @param {number} age_ms of the last late picture
+ */
 export function words(status, since_ms, age_ms) {
   if (status === "frozen") return `FROZEN ${(Math.floor(since_ms / 200) / 5).toFixed(1)} s`;
   if (status === "late") return `LATE ${Math.round(age_ms / 10) * 10} ms`;
   if (status === "lost") return since_ms < 1e8 ? `LOST ${Math.floor(since_ms / 1000)} s` : "LOST";
+  if (status === "unsupported") return "NO PICTURE";
   return status.toUpperCase();
 }

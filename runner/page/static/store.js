@@ -3,6 +3,72 @@
 const SHOWN_S = 300;
 const listeners = new Map();
 
+/**
+ * What the station sends, as far as the page reads it.
+ * @typedef {{x: number, y: number, width: number, height: number}} Region in px of the full image
+ * @typedef {object} Camera of hello
+ * @property {string} name
+ * @property {number} width px
+ * @property {number} height px
+ * @property {number} fps
+ * @property {{row: number, column: number}|null} place on the page
+ * @property {string|null} codec
+ * @property {number} weight
+ * @property {number[]} scaling factors, rising
+ * @property {number} b_full_kbps
+ * @typedef {{vehicle: string, cameras: Camera[]}} Hello
+ * @typedef {object} Applied what was read back from the elements
+ * @property {boolean} [sending]
+ * @property {number} [bitrate] kbit/s
+ * @property {{width: number, height: number}} [size] px
+ * @property {Region} [roi]
+ * @typedef {object} Decision of one camera
+ * @property {boolean} on
+ * @property {boolean} sending
+ * @property {number} demand_kbps
+ * @property {number} kbps
+ * @property {number|null} scaling
+ * @property {Region} roi
+ * @property {number} width px
+ * @property {number} height px
+ * @property {number} weight
+ * @property {string} reason
+ * @property {string} [fault]
+ * @property {Applied} applied
+ * @typedef {{online: boolean, mode: string, total_kbps: number, cameras: Record<string, Decision>}} State
+ * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
+ *   latency_ms: number|null, lost: number, rebuilt: number}} CameraSample
+ * @typedef {object} Sample
+ * @property {number} time s since 1970
+ * @property {number|null} predicted_kbps
+ * @property {number} allocated_kbps
+ * @property {number} actual_kbps
+ * @property {{lat: number, lon: number}|null} position
+ * @property {number|null} clock_ahead_ms
+ * @property {Record<string, CameraSample>} cameras
+ * @typedef {{time: number, text: string, level: string}} Note
+ */
+
+/** @typedef {(number|null)[]} Column */
+/** @typedef {{kbps: Column, allocated_kbps: Column, scaling: Column}} CameraColumns */
+
+/**
+ * @typedef {object} Store
+ * @property {Hello|null} hello
+ * @property {State|null} state
+ * @property {Sample|null} sample
+ * @property {string} holder
+ * @property {boolean} connected
+ * @property {Note[]} notes
+ * @property {ReturnType<typeof emptySeries>} series
+ * @property {Record<string, string>} status
+ * @property {Record<string, string>} refused
+ * @property {Record<string, {age_ms: number|null}>} ages
+ * @property {string|null} selected
+ * @property {string|null} enlarged
+ */
+
+/** @type {Store} */
 export const store = {
   hello: null,
   state: null,
@@ -12,6 +78,7 @@ export const store = {
   notes: [],
   series: emptySeries([]),
   status: {}, // by camera, as the worker judges
+  refused: {}, // by camera, why its video cannot be shown, or ""
   ages: {}, // by camera, capture to drawing
   selected: null,
   enlarged: null,
@@ -47,23 +114,33 @@ function hello(message) {
   if (!names.includes(store.enlarged)) store.enlarged = null;
 }
 
-/** One line of news, newest first; lines of the page itself come by this way too. */
+/**
+ * One line of news, newest first; lines of the page itself come by this way too.
+ * @param {{time?: number, text: string, level?: string}} note
+ */
 export function note({ time = Date.now() / 1000, text, level = "note" }) {
   store.notes = [{ time, text, level }, ...store.notes].sort((a, b) => b.time - a.time).slice(0, 200);
   publish("note", { time, text, level });
 }
 
+/** @param {string|null|undefined} name */
 export const camera = (name) => store.hello?.cameras.find((each) => each.name === name);
-export const decided = (name) => (store.state?.online ? store.state.cameras[name] : undefined);
+/**
+ * @param {string|null} name
+ * @returns {Decision|undefined}
+ */
+export const decided = (name) => (store.state?.online && name ? store.state.cameras[name] : undefined);
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
+/** @param {string} name */
 export function select(name) {
   if (!camera(name) || store.selected === name) return;
   store.selected = name;
   publish("selected", name);
 }
 
+/** @param {string|null} name */
 export function enlarge(name) {
   store.enlarged = name;
   publish("enlarged", name);
@@ -71,10 +148,13 @@ export function enlarge(name) {
 
 // --- the last five minutes, once a second -----------------------------------------------------------------------------
 
+/** @param {string[]} names */
 function emptySeries(names) {
-  const columns = { time: [], predicted_kbps: [], allocated_kbps: [], actual_kbps: [], lat: [], lon: [], cameras: {} };
-  for (const name of names) columns.cameras[name] = { kbps: [], allocated_kbps: [], scaling: [] };
-  return columns;
+  /** @type {Record<string, CameraColumns>} */
+  const cameras = Object.fromEntries(names.map((name) => [name, { kbps: [], allocated_kbps: [], scaling: [] }]));
+  /** @type {Record<"predicted_kbps"|"allocated_kbps"|"actual_kbps"|"lat"|"lon", Column> & {time: number[]}} */
+  const columns = { time: [], predicted_kbps: [], allocated_kbps: [], actual_kbps: [], lat: [], lon: [] };
+  return { ...columns, cameras };
 }
 
 function history(message) {

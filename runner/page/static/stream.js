@@ -1,6 +1,6 @@
 /** One camera in the worker: its decoder, its canvas, its status. */
 
-import { codecOf, spsOf } from "./h264.js";
+import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
 import { pictureOf } from "./picture.js";
 import { judge, words } from "./status.js";
@@ -18,21 +18,40 @@ const SETTLE_MS = 2000; // after a restart the decoder may take this long for th
 const LATE_HOLD_MS = 500; // one late picture is seen as long as this
 const STAGES = 1200;
 
+/** @typedef {import("./picture.js").Picture} Picture */
+/** @typedef {{picture: Picture, meta: any}} Shown */
+
 export class Stream {
+  arrived = now(); // page times of the newest unit and of the newest picture, or of the start of the stream
+  decoded = this.arrived;
+  drawn = false;
+  late_until = 0;
+
   /**
    * @param {object} camera as hello tells
    * @param {object} station what all streams share: clock, limits, connected, online, resync(name), wake() asks for a drawing
    */
   constructor(camera, station) {
-    Object.assign(this, { camera, name: camera.name, station });
-    this.canvas = this.context = this.decoder = this.sps = null;
+    this.camera = camera;
+    this.name = camera.name;
+    this.station = station;
+    /** @type {OffscreenCanvas|null} */
+    this.canvas = null;
+    /** @type {OffscreenCanvasRenderingContext2D|null} */
+    this.context = null;
+    /** @type {VideoDecoder|null} */
+    this.decoder = null;
+    this.sps = this.codec = null;
     this.display = { width: 0, height: 0, ratio: 1 };
-    this.waiting = null; // newest decoded picture, not drawn yet: {picture, meta}
+    /** @type {Shown|null} */
+    this.waiting = null; // newest decoded picture, not drawn yet
+    /** @type {Shown|null} */
     this.shown = null; // picture last drawn, kept for alarms and for tests
     this.meta = new Map(); // by timestamp: what is known of a unit in the decoder
     this.timestamp = 0;
     this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // of the decoder, the last one
+    this.refused = isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there is no picture
     this.stages = [];
     this.first_drawn = null;
     this.first = null; // for tests, the first picture drawn
@@ -41,6 +60,7 @@ export class Stream {
     this.transit = null; // usual time from the station to here
     this.on = this.sending = null;
     this.status = this.told = "synchronising";
+    /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
     this.late_age = NaN; // of the last picture that was late
     this.started();
@@ -74,7 +94,8 @@ export class Stream {
     const received = now();
     this.counts.received++;
     this.arrived = received;
-    if (!this.station.video) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
+    if (this.refused && unit.flags & KEY && isKnown(this.camera.codec)) this.reconsider(unit.data);
+    if (!this.station.video || this.refused) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
     if (unit.flags & RESTART) this.restart();
     if (unit.flags & KEY) this.configure(unit.data);
     if (!this.decoder || this.decoder.state !== "configured") return this.resync();
@@ -91,17 +112,31 @@ export class Stream {
 
   /** A key unit sets the decoder up, anew where its parameters are others. */
   configure(data) {
-    const sps = spsOf(data);
+    const sps = spsOf(data, this.camera.codec);
     if (!sps || (this.decoder && String(sps) === this.sps)) return;
     this.close();
     this.sps = String(sps);
-    const codec = codecOf(sps);
+    const codec = codecOf(sps, this.camera.codec);
     const decoder = new VideoDecoder({
       output: (frame) => (decoder === this.decoder ? this.output(frame) : frame.close()),
       error: (error) => decoder === this.decoder && this.failed(error),
     });
     this.decoder = decoder;
+    this.codec = codec;
     decoder.configure({ codec, optimizeForLatency: true });
+  }
+
+  /** Why the browser does not decode this stream, "" where it can. Browsers name the error differently. */
+  async refusal(codec) {
+    const { supported } = await VideoDecoder.isConfigSupported({ codec }).catch(() => ({ supported: false }));
+    const name = nameOf(this.camera.codec);
+    return supported ? "" : `This browser has no decoder for ${name} (${codec}). Choose a graph of H.264, or a browser that has one.`;
+  }
+
+  /** Another stream may be of a profile that the browser decodes. */
+  reconsider(data) {
+    const sps = spsOf(data, this.camera.codec);
+    if (sps && String(sps) !== this.sps) this.refused = "";
   }
 
   decode(unit, received) {
@@ -109,7 +144,7 @@ export class Stream {
     this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
     const type = unit.flags & KEY ? "key" : "delta";
     try {
-      this.decoder.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
+      this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
     } catch (error) {
       this.failed(error); // a delta where the decoder wants a key
     }
@@ -117,7 +152,7 @@ export class Stream {
 
   lags(unit, received) {
     if (unit.flags & CATCH_UP || this.settling()) return false;
-    if (this.decoder.decodeQueueSize > QUEUE) return true;
+    if (this.queued() > QUEUE) return true;
     const transit = this.station.clock.server(received) - unit.arrived;
     if (!Number.isFinite(transit)) return false;
     this.transit = this.transit === null ? transit : Math.min(transit, this.transit + 0.5);
@@ -129,10 +164,18 @@ export class Stream {
     return !this.drawn && now() - this.restarted < SETTLE_MS;
   }
 
-  failed(error) {
+  /** Units in the decoder. */
+  queued() {
+    return this.decoder?.decodeQueueSize ?? 0;
+  }
+
+  async failed(error) {
+    this.close();
+    const { codec } = this;
+    const why = await this.refusal(codec);
+    if (why && codec === this.codec) return void (this.refused = why); // another burst would not help
     this.counts.errors++;
     this.error = String(error);
-    this.close();
     this.resync();
   }
 
@@ -160,7 +203,7 @@ export class Stream {
     for (const key of this.meta.keys()) if (key <= frame.timestamp) this.meta.delete(key);
     this.counts.decoded++;
     this.decoded = now();
-    const behind = this.settling() && this.decoder.decodeQueueSize > 1; // there is a newer one already
+    const behind = this.settling() && this.queued() > 1; // there is a newer one already
     if (!meta || meta.flags & CATCH_UP || behind) return frame.close();
     this.wait(frame, { ...meta, decoded: this.decoded }, this.decoder);
   }
@@ -189,9 +232,9 @@ export class Stream {
   }
 
   age({ captured }, time) {
-    const { clock, limits } = this.station;
+    const { clock, limits, clock_ahead } = this.station;
     const age = clock.server(time) - captured;
-    if (age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
+    if (!clock_ahead && age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
   }
 
   note(meta, drawn) {
@@ -204,8 +247,8 @@ export class Stream {
 
   times() {
     const { connected, online } = this.station;
-    const { on, sending, drawn, arrived, decoded, late_until } = this;
-    return { connected, online, on, sending, drawn, arrived, decoded, late_until, fps: this.camera.fps };
+    const { on, sending, refused, drawn, arrived, decoded, late_until } = this;
+    return { connected, online, on, sending, refused, drawn, arrived, decoded, late_until, fps: this.camera.fps };
   }
 
   /** Judge the status; returns whether it is another one. Called by a timer. */
@@ -225,32 +268,29 @@ export class Stream {
   }
 
   paint(time) {
+    const { canvas, context } = this;
+    if (!canvas || !context) return;
     const text = this.overlay(time);
-    this.size(this.status === "frozen" || this.status === "lost");
-    const { width, height } = this.canvas;
-    if (this.shown && this.status !== "off") this.shown.picture.paint(this.context, width, height);
-    else this.blank(width, height);
-    if (text) drawOverlay(this.context, this.status, text);
+    this.size(canvas, this.status === "frozen" || this.status === "lost");
+    const { width, height } = canvas;
+    if (this.shown && this.status !== "off" && this.status !== "unsupported") this.shown.picture.paint(context, width, height);
+    else blank(context, width, height);
+    if (text) drawOverlay(context, this.status, text);
     this.painted = text;
-  }
-
-  blank(width, height) {
-    this.context.fillStyle = "#0b0e11";
-    this.context.fillRect(0, 0, width, height);
   }
 
   /**
    * The canvas has the picture's size. For an alarm that stands it is a whole multiple of it, near to what the screen
    * shows, so that words are sharp while the aspect, and with it the page's layout, stays.
    */
-  size(sharp) {
+  size(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const own = this.shown?.picture.painted ?? box;
     const times = sharp ? Math.min(6, Math.max(1, Math.ceil(box.width / own.width))) : 1;
     const width = own.width * times;
     const height = own.height * times;
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   }
 
   // --- for tests and benchmarks ---------------------------------------------------------------------------------------
@@ -278,6 +318,11 @@ export class Stream {
     this.shown?.picture.close();
     this.shown = null;
   }
+}
+
+function blank(context, width, height) {
+  context.fillStyle = "#0b0e11";
+  context.fillRect(0, 0, width, height);
 }
 
 function described({ width, height, bytes, planes }, { sequence, captured }) {

@@ -1,10 +1,10 @@
 /** The tabs of the side panel, where there is no room for everything at once. */
 
 import { publish } from "./store.js";
-import { mark } from "./format.js";
+import { by, mark } from "./format.js";
 
-const tabs = [...document.querySelectorAll("#tabs [role=tab]")];
-const side = document.getElementById("side");
+const tabs = [...by("tabs").querySelectorAll("button")];
+const side = by("side");
 
 export function openTab(name) {
   side.dataset.tab = name;
@@ -27,6 +27,6 @@ function move(event) {
 
 export function startTabs() {
   for (const tab of tabs) tab.addEventListener("click", () => openTab(tab.dataset.tab));
-  document.getElementById("tabs").addEventListener("keydown", move);
+  by("tabs").addEventListener("keydown", move);
   openTab("camera");
 }

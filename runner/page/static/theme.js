@@ -1,6 +1,7 @@
 /** Day or night: the operator's choice is kept, else the system's is followed. */
 
 import { publish } from "./store.js";
+import { by } from "./format.js";
 
 const KEY = "tod-theme";
 const light = matchMedia("(prefers-color-scheme: light)");
@@ -10,7 +11,7 @@ const chosen = () => localStorage.getItem(KEY);
 function show() {
   const theme = chosen() ?? (light.matches ? "day" : "night");
   document.documentElement.dataset.theme = theme;
-  document.getElementById("theme").textContent = theme === "day" ? "Night" : "Day";
+  by("theme").textContent = theme === "day" ? "Night" : "Day";
   publish("theme", theme);
 }
 
@@ -21,6 +22,6 @@ export function toggleTheme() {
 
 export function startTheme() {
   light.addEventListener("change", show);
-  document.getElementById("theme").addEventListener("click", toggleTheme);
+  by("theme").addEventListener("click", toggleTheme);
   show();
 }

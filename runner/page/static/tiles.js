@@ -6,23 +6,25 @@ import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion } from "./roi.js";
 import { heightsOf, rowsOf } from "./layout.js";
 import { colourOf } from "./colours.js";
-import { factor, make, mark, size, spoken, whole, write } from "./format.js";
+import { by, factor, make, mark, size, spoken, whole, write } from "./format.js";
 
-export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌" };
-const SHORT = { synchronising: "SYNC" }; // the picture has the whole word
-const ALARMS = ["late", "frozen", "lost"];
+export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
+const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
+const ALARMS = ["late", "frozen", "lost", "unsupported"];
+const SILENT = ["lost", "off", "paused"]; // nothing comes: what came last says nothing of now
 const THIN = "\u2009"; // space
 const CHROME = 66; // header and caption of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
-const area = document.getElementById("tiles");
+const area = by("tiles");
+const scene = by("scene");
 const tiles = new Map();
 let rows = [];
 let described = "";
 let hinted = false; // how to come back from an enlarged picture
 
 const sizes = new ResizeObserver((entries) => {
-  for (const { target } of entries) tellSize(target.dataset.name, target.clientWidth, target.clientHeight);
+  for (const { target } of entries) tellSize(target.getAttribute("data-name"), target.clientWidth, target.clientHeight);
 });
 
 // --- building ---------------------------------------------------------------------------------------------------------
@@ -55,7 +57,8 @@ function tile({ name }) {
     form: make("span", { class: "form" }),
   };
   const reason = make("div", { class: "reason", role: "tooltip" });
-  parts.box.append(reason);
+  const refused = make("p", { class: "refused", hidden: true });
+  parts.box.append(reason, refused);
   if (!canShowVideo) parts.box.append(make("p", { class: "no-picture" }, "no video in this browser"));
   const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
@@ -67,7 +70,7 @@ function tile({ name }) {
   );
   parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
-  tiles.set(name, { element, reason, ...parts });
+  tiles.set(name, { element, reason, refused, ...parts });
   giveCanvas(name, canvas);
   dragRegion(name, parts.box);
   sizes.observe(parts.box);
@@ -83,7 +86,6 @@ export function switchCamera(name) {
 // --- layout -----------------------------------------------------------------------------------------------------------
 
 function lay() {
-  const scene = area.parentElement;
   const heights = heightsOf(rows, area.clientWidth, area.clientHeight, CHROME);
   for (const [i, row] of rows.entries()) {
     for (const { camera: { name, width, height } } of row) {
@@ -93,10 +95,10 @@ function lay() {
       box.style.height = `${heights[i]}px`;
     }
   }
-  layEnlarged(scene);
+  layEnlarged();
 }
 
-function layEnlarged(scene) {
+function layEnlarged() {
   for (const [name, { element, box }] of tiles) {
     const large = store.enlarged === name;
     element.classList.toggle("enlarged", large);
@@ -124,8 +126,11 @@ function refresh(name, index) {
   refreshCaption(name, part);
 }
 
-function refreshStatus(name, { element, status }) {
+function refreshStatus(name, { element, status, refused }) {
   const word = store.status[name] ?? "synchronising";
+  const why = word === "unsupported" ? store.refused[name] : decided(name)?.fault;
+  refused.hidden = !why;
+  write(refused, why ?? "");
   mark(element, "data-status", word);
   write(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
 }
@@ -142,9 +147,10 @@ function refreshSwitch(name, { on }) {
 }
 
 function refreshCaption(name, { rates, form, reason }) {
-  const sample = store.sample?.cameras[name];
   const now = decided(name);
-  const age = store.ages[name]?.age_ms ?? sample?.latency_ms;
+  const silent = !store.connected || SILENT.includes(store.status[name]);
+  const sample = silent ? undefined : store.sample?.cameras[name];
+  const age = silent ? undefined : (store.ages[name]?.age_ms ?? sample?.latency_ms);
   const differs = now ? unapplied(now) : [];
   const bitrate = differs.includes("bitrate") || differs.includes("sending");
   const region = differs.includes("size") || differs.includes("ROI");
@@ -180,7 +186,8 @@ function announce({ camera: name, status }) {
   const part = tiles.get(name);
   if (!part) return;
   refreshStatus(name, part);
-  if (ALARMS.includes(status)) write(document.getElementById("announcer"), `${spoken(name)} ${status}`);
+  refreshCaption(name, part);
+  if (ALARMS.includes(status)) write(by("announcer"), `${spoken(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
 }
 
 export function startTiles() {
@@ -193,7 +200,7 @@ export function startTiles() {
     hinted = true;
   });
   if (!canShowVideo) sayNoVideo();
-  new ResizeObserver(lay).observe(area.parentElement);
+  new ResizeObserver(lay).observe(scene);
 }
 
 /** Move the focus to the tile of a camera. */

@@ -3,7 +3,7 @@
 import { inControl, listen, mode, store } from "./store.js";
 import { request, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
-import { make, write, whole } from "./format.js";
+import { by, make, write, whole } from "./format.js";
 
 const WHY = {
   single: "sum of the bitrates set in mode S; choose C to set it",
@@ -24,7 +24,7 @@ const slider = makeSlider({
 function refresh() {
   const now = mode();
   const most = (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
-  const total = now ? store.state.total_kbps : undefined;
+  const total = now ? store.state?.total_kbps : undefined;
   const reason = !now ? "the vehicle is not there" : WHY[now] ?? (inControl() ? null : whyNoControl());
   write(figure, whole(total));
   write(prediction, whole(store.sample?.predicted_kbps));
@@ -35,7 +35,7 @@ function refresh() {
 export function startTotal() {
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
   const inForce = make("div", {}, make("span", {}, "Total "), figure, make("span", { class: "muted" }, " kbit/s"));
-  document.getElementById("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
+  by("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
   listen("hello state sample control requests socket", refresh);
   refresh();
 }

@@ -7,12 +7,14 @@ import { Clock, now } from "./clock.js";
 import { hasGpu } from "./picture.js";
 import { Stream } from "./stream.js";
 // Named here, though used further down, so that all modules are fetched at once.
-import "./h264.js";
+import "./codec.js";
 import "./overlay.js";
 import "./status.js";
 import "./yuv.js";
 
 const WATCH_MS = 15;
+const CONNECT_MS = 1000; // a station that has not answered by then is asked again
+const SILENT_MS = 2000; // the station says something four times a second
 const RECONNECT_MS = 500;
 const TELL_MS = 250;
 const HEADER = 24;
@@ -22,12 +24,15 @@ const station = {
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
   online: true,
+  clock_ahead: false, // the vehicle's: ages of pictures are unknown then
   video: true,
   resync: (name) => send({ resync: name }),
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
-let socket = null;
+let socket = null; // null between two attempts
+let moved = 0; // when it was heard last
+let attempts = 0; // at connecting again
 let streams = []; // in the order of hello, which the binary messages count in
 let described = "";
 let asleep = true;
@@ -40,13 +45,43 @@ const find = (name) => streams.find((stream) => stream.name === name);
 // --- the socket -------------------------------------------------------------------------------------------------------
 
 function connect() {
-  socket = new WebSocket(settings.url);
-  socket.binaryType = "arraybuffer";
-  socket.onmessage = ({ data }) => (typeof data === "string" ? heard(JSON.parse(data)) : unit(data));
-  socket.onclose = () => {
-    connection(false);
-    setTimeout(connect, RECONNECT_MS);
+  const own = (socket = new WebSocket(settings.url));
+  moved = now();
+  own.binaryType = "arraybuffer";
+  own.onopen = () => (moved = now());
+  own.onmessage = ({ data }) => {
+    moved = now();
+    if (typeof data === "string") heard(JSON.parse(data));
+    else unit(data);
   };
+  own.onclose = drop;
+}
+
+/** Give up a connection, or an attempt at one, and soon try again. */
+function drop() {
+  socket.onopen = socket.onmessage = socket.onclose = null;
+  socket.close();
+  socket = null;
+  connection(false);
+  setTimeout(reconnect, RECONNECT_MS);
+}
+
+/**
+ * Connect once the station answers at all: browsers delay the WebSockets of a page, by seconds, whose attempts have
+ * failed many times, and this would go on when the station is back.
+ */
+async function reconnect() {
+  const answer = await fetch("/static/video.js", { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(CONNECT_MS) }).catch(() => null);
+  attempts++;
+  if (answer?.ok) connect();
+  else setTimeout(reconnect, RECONNECT_MS);
+}
+
+/** Drop a connection that makes no progress. */
+function supervise() {
+  if (!socket) return;
+  const limit = socket.readyState === WebSocket.CONNECTING ? CONNECT_MS : SILENT_MS;
+  if (now() - moved > limit) drop();
 }
 
 function connection(open) {
@@ -65,6 +100,7 @@ function heard(message) {
   if (message.kind === "clock") return station.clock.heard(message.page_ms, message.server_ms);
   if (message.kind === "hello") hello(message);
   if (message.kind === "state") decided(message);
+  if (message.kind === "sample") station.clock_ahead = message.clock_ahead_ms !== null;
   tell({ kind: "server", message });
 }
 
@@ -113,7 +149,9 @@ function watch() {
   const late = now() - watched > 3 * WATCH_MS;
   watched = now();
   // After a stall the units that came meanwhile are still in the queue: let them in before judging, at the next tick.
-  if (!late) judgeAll();
+  if (late) return;
+  supervise();
+  judgeAll();
 }
 
 function judgeAll() {
@@ -121,7 +159,7 @@ function judgeAll() {
     if (!stream.watch()) continue;
     log.push([now(), stream.name, stream.status]);
     if (log.length > 200) log.shift();
-    tell({ kind: "status", camera: stream.name, status: stream.status });
+    tell({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
   }
 }
 
@@ -130,7 +168,8 @@ function tellAges() {
   const ages = {};
   for (const { name, stages, status } of streams) {
     const last = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured).sort((a, b) => a - b);
-    ages[name] = { age_ms: last.length ? last[last.length >> 1] : null, status };
+    const age_ms = last.length ? last[last.length >> 1] : NaN;
+    ages[name] = { age_ms: age_ms >= 0 && !station.clock_ahead ? age_ms : null, status };
   }
   tell({ kind: "ages", ages });
 }
@@ -154,19 +193,19 @@ const orders = {
   },
   send: ({ message }) => tell({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, stages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = { measure, stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
     tell({ kind: "answer", id, value: await questions[what]() });
   },
 };
 
 /** Of each drawn picture: captured, arrived at the station, received here, decoded, drawn; ms on the station's clock. */
-function stages() {
+function allStages() {
   return Object.fromEntries(streams.map(({ name, stages }) => [name, stages]));
 }
 
 function measure() {
   const cameras = Object.fromEntries(streams.map((stream) => [stream.name, stream.measure(settings.origin)]));
-  return { cameras, status_log: log, gpu: hasGpu, clock_offset_ms: station.clock.offset };
+  return { cameras, status_log: log, gpu: hasGpu, clock_offset_ms: station.clock.offset, attempts };
 }
 
 onmessage = ({ data }) => orders[data.order](data);

@@ -41,11 +41,11 @@ export function toRgba(bytes, planes, format, space, image, width) {
   const out = new Int32Array(image.data.buffer);
   const convert = image.width === width ? wholeRow : halfRow;
   const across = image.width === width ? 1 : 2;
-  const tables = tablesOf(space);
+  const lookUp = tablesOf(space);
   for (let row = 0; row < image.height; row++) {
     const chroma = across === 2 ? row : row >> 1;
     const from = { y: y.offset + row * across * y.stride, below: y.stride, u: u.offset + chroma * u.stride, v: v.offset + chroma * v.stride };
-    convert(bytes, from, apart, tables, out, row * image.width, image.width);
+    convert(bytes, from, apart, lookUp, out, row * image.width, image.width);
   }
 }
 

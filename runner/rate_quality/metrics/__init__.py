@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from runner.core.model import suggest
 from runner.errors import UserError
-from runner.model import suggest
 from runner.rate_quality.metrics.interface import Luma, Mask, Meter, Metric, Size
 
 __all__ = ["NAMES", "VMAF_MODEL", "Luma", "Mask", "Meter", "Metric", "Size", "find_metric"]

@@ -82,7 +82,7 @@ def find_tool() -> Tool:
         if version := _version(exe):
             return Tool(exe, version)
     what = f"TOD_FFMPEG={named} is no ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
-    raise RunError(f"{what}: pip install 'tod-runner[vmaf]'")
+    raise RunError(f"{what}: install the extra vmaf, see docs/install.md")
 
 
 def _known() -> Iterator[str]:

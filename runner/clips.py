@@ -1,0 +1,75 @@
+"""Clips that a source renders before a run: what each camera sees of the drive, and where its clip is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+from runner.core.model import Camera, ModelError, Pose
+
+RENDERER_VERSION = 2  # raise it with every change that changes pictures or files
+# A camera without a pose looks ahead from the height of a driver's eyes.
+DRIVER = Pose(0.0, 0.0, 1.5, 0.0, 5.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What one camera sees of the drive.
+
+    width, height  px, even
+    fov_deg        horizontal field of view; below 180 for a pinhole
+    lens           "pinhole" or "fisheye" (equidistant, fills the whole picture)
+    """
+
+    width: int
+    height: int
+    fps: Fraction
+    pose: Pose
+    fov_deg: float
+    lens: str
+
+    def __post_init__(self) -> None:
+        if self.lens not in ("pinhole", "fisheye"):
+            raise ModelError("lens", repr(self.lens), "must be pinhole or fisheye")
+        if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
+            raise ModelError("size", f"{self.width}x{self.height}", "both sides must be even and at least 16 px")
+        if not 0 < self.fov_deg <= (360 if self.lens == "fisheye" else 170):
+            rule = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
+            raise ModelError("fov_deg", f"{self.fov_deg:g}", rule)
+        if self.pose.z_m <= 0 or self.fps <= 0:
+            raise ModelError("pose.z_m", f"z_m {self.pose.z_m:g}, fps {self.fps}", "must be above 0")
+
+    def frames(self, seconds: float) -> int:
+        """Number of frames of a clip of that many seconds."""
+        return round(seconds * self.fps)
+
+
+def view(camera: Camera) -> View:
+    """What a camera sees of the synthetic drive.
+
+    raises  ModelError where the drive cannot be rendered so
+    """
+    width, height = camera.source_size
+    return View(width, height, camera.fps, camera.pose or DRIVER, camera.fov_deg, camera.lens)
+
+
+def cache_directory() -> Path:
+    """The user's cache (XDG Base Directory Specification)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tod-runner"
+
+
+def clip_path(view: View, seconds: float, cache: Path) -> Path:
+    """Where the clip of a view lies: its name is a digest of everything that its pictures depend on."""
+    digest = hashlib.sha256(repr((RENDERER_VERSION, view, float(seconds))).encode()).hexdigest()
+    return cache / f"drive-{digest[:20]}.mp4"
+
+
+def rendered(camera: Camera) -> str | None:
+    """The camera's clip, where its source renders one and the cache has it."""
+    if not camera.source.render:
+        return None
+    path = clip_path(view(camera), camera.source.render_s, cache_directory())
+    return str(path) if path.exists() else None

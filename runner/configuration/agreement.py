@@ -1,0 +1,42 @@
+"""What the configurations of both sides must agree on, and where they do not. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from runner.schema import Path, dotted, shown
+
+SECTIONS = ("name", "fps_max", "cameras", "graph")
+# Of a camera, what belongs to one side alone: where its frames come from, where its tile stands.
+OWN = ("source", "device", "address", "clip", "place", "pose", "fov_deg", "lens")
+NAMED = 3  # differences that a message names
+
+Settings = Mapping[str, Any]
+
+
+def settings(document: Mapping[str, Any]) -> Settings:
+    """Values by path, such as cameras.front.fps, of a composed configuration."""
+    return dict(pair for key in SECTIONS for pair in _leaves(document.get(key), (key,)))
+
+
+def differences(here: Settings, vehicle: Settings) -> str:
+    """What the operator's configuration and the vehicle's differ in, in one line, or ""."""
+    paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
+    told = [
+        f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]
+    ]
+    more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
+    return "; ".join([*told, *more])
+
+
+def _leaves(value: Any, path: Path) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            if not (path[0] == "cameras" and len(path) == 2 and key in OWN):
+                yield from _leaves(inner, (*path, key))
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _leaves(inner, (*path, index))
+    else:
+        yield dotted(path), value

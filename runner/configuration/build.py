@@ -1,0 +1,364 @@
+"""From plain data to a `Vehicle`: what the schemas accept is built, and every problem is gathered."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from runner import schema
+from runner.clips import view
+from runner.configuration.origin import GRAPH_PARTS, Composed, Part
+from runner.configuration.resolve import without
+from runner.configuration.rule_lists import call_rule, check_order
+from runner.core.commands import KnobValue
+from runner.core.model import (
+    Camera,
+    Element,
+    Endpoint,
+    Graph,
+    Media,
+    Mode,
+    ModelError,
+    Page,
+    Place,
+    Pose,
+    RateQualityModel,
+    Recording,
+    Roi,
+    Source,
+    Turn,
+    Value,
+    Vehicle,
+    exact,
+    suggest,
+)
+from runner.core.rules import RuleCall
+from runner.errors import ConfigError, Problem
+from runner.graph import Plan, assignments, check_video, compile_graph
+from runner.system.files import why_no_file
+
+SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
+MOUNT_KEYS = ("device", "address", "clip")
+CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # what the schema asks of a camera, given by its kind
+GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "wire", "knobs", "mutable")
+
+T = TypeVar("T")
+
+Check = Callable[[Plan], Iterable[ModelError]]
+
+
+@dataclass
+class Builder:
+    """Builds model objects from plain data and gathers what is wrong with it; None stands for what could not be built.
+
+    Parts that the schema refuses are not built, so that one mistake is told once.
+    """
+
+    composed: Composed
+    runnable: bool
+    check: Check | None
+    fits: Collection[str] = ()  # sections that the schemas accept, as is known already
+    problems: list[Problem] = field(default_factory=list)
+    bad: set[schema.Path] = field(default_factory=set)
+    broken: dict[schema.Path, Problem] = field(default_factory=dict)  # rules of the model, by path
+    built: set[str] = field(default_factory=set)  # names of the cameras
+    vehicle: Vehicle | None = None
+    others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
+
+    @classmethod
+    def of(cls, composed: Composed, runnable: bool, check: Check | None, fits: Collection[str]) -> Builder:
+        """The builder of a configuration, with its vehicle built."""
+        builder = cls(composed, runnable, check, fits)
+        builder.vehicle = builder._vehicle()
+        builder._blame()
+        return builder
+
+    def _vehicle(self) -> Vehicle | None:
+        document = self.composed.document
+        unknown = {key: value for key, value in document.items() if key not in self.fits}
+        found = schema.findings(unknown, "composed")
+        wrong = list(self._told_once([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
+        self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
+        self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
+        modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
+        mounted = document.get("cameras")
+        cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
+        if not all(map(self.fine, ("media", "control", "page", "log"))):
+            return None
+        media = self.part(("media",), _media)
+        if media is None:
+            return None
+        control = Endpoint(document["control"]["host"], document["control"]["port"])
+        built = {name: camera for name, camera in cameras.items() if camera}
+        self.built = set(built)
+        recording = self.part(("recording",), _recording)
+        page = Page(**document["page"])
+        listening = {"page.port": page.port} if page.serve else {}
+        self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
+        for index, camera in enumerate(built.values()):
+            self._check_compiles(camera, media, index, recording)
+            if camera.source.render:
+                self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
+            if self.runnable:
+                self._check_inputs(camera)
+        if self.problems or recording is None:
+            return None
+        return Vehicle(
+            name=document["name"],
+            cameras=built,
+            mode=Mode(document["mode"]),
+            modes=modes,
+            media=media,
+            control=control,
+            page=page,
+            pqos=document["pqos"],
+            recording=recording,
+            log_video=document["log"]["video"],
+            expires_s=float(document["control"]["expires_s"]),
+        )
+
+    def finished(self, built: T | None) -> T:
+        """What was built, if nothing was wrong."""
+        if built is None or self.problems:
+            raise ConfigError(self.problems)
+        return built
+
+    # --- problems -----------------------------------------------------------------------------------------------------
+
+    def fine(self, *path: str | int) -> bool:
+        """Whether the schema found nothing wrong at or below a path, nor with what it is a part of."""
+        return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
+
+    def _told_once(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
+        """A name below cameras that no kind is mounted under is one mistake, not many missing keys."""
+        missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
+        unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
+        for path in sorted(unmounted, key=str):
+            others = [name for name in self.composed.document["cameras"] if ("cameras", name) not in unmounted]
+            hint = suggest(str(path[1]), others)
+            if "did you mean" not in hint:
+                hint = f"its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
+            yield schema.Finding(path, None, f"no camera of that name is mounted, {hint}")
+        yield from (f for f in wrong if f.path[:2] not in unmounted)
+
+    def attempt(self, path: schema.Path, make: Callable[[], T]) -> T | None:
+        try:
+            return make()
+        except ModelError as error:
+            self._report(path, error)
+            return None
+
+    def _report(self, path: schema.Path, error: ModelError) -> None:
+        where = (*path, *_split(error.key))
+        found = error.found if error.found is None or isinstance(error.found, str) else schema.shown(error.found)
+        self.broken[where] = self.composed.problem(where, found, error.rule)
+        self.problems.append(self.broken[where])
+
+    def _blame(self) -> None:
+        """Tell a rule that joins several values of the file or override whose word broke it.
+
+        The value that the rule names may stand in a file that is right by itself: leave out one by one what was said
+        after it, and see without which the rule holds.
+        """
+        for where, problem in list(self.broken.items()):
+            for part in self.composed.later_parts(where):
+                other = self._without(part)
+                if other and where not in other.broken and other.fine(*where[:-1]) and other.built >= self.built:
+                    path = self.composed.written(where)
+                    path = path[len(part.package) :] if path[: len(part.package)] == part.package else path
+                    blamed = replace(problem, file=part.file, path=schema.dotted(path))
+                    self.problems = [blamed if one == problem else one for one in self.problems]
+                    break
+
+    def _without(self, part: Part) -> Builder | None:
+        """What would be built if a part said nothing."""
+        if id(part) not in self.others:
+            composed = without(self.composed, part)
+            other = Builder(composed, self.runnable, self.check) if composed else None
+            if other:
+                other._vehicle()
+            self.others[id(part)] = other
+        return self.others[id(part)]
+
+    # --- parts --------------------------------------------------------------------------------------------------------
+
+    def _rule_list(self, mode: Mode) -> tuple[RuleCall, ...]:
+        calls = []
+        for index, entry in enumerate(self.composed.document["modes"][mode]):
+            ((name, parameters),) = entry.items()
+            call = self.attempt(("modes", mode.value, index), lambda n=name, p=parameters: call_rule(n, p))  # type: ignore[misc]
+            calls.append(call)
+        known = tuple(call for call in calls if call)
+        if len(known) == len(calls):
+            for error in check_order(mode, known):
+                self._report(("modes",), error)
+        return known
+
+    def _camera(self, name: str) -> Camera | None:
+        document = self.composed.document
+        data, path = document["cameras"][name], ("cameras", name)
+        # Parts that the schema accepts are looked at further, whatever is wrong beside them.
+        graph = self.part(self._of(name, "graph"), _graph)
+        source = self.part(self._of(name, "source"), _source)
+        model = self.part((*path, "rate_quality"), _rate_quality)
+        if graph is None or source is None or model is None or not (self.fine(*path) and self.fine("fps_max")):
+            return None
+        fps, limit = exact(data["fps"]), document.get("fps_max")
+        native = data.get("native")
+        pose, place = data.get("pose"), data.get("place")
+        options = _given(data, ("fov_deg", "lens")) | {k: exact(v) for k, v in _given(data, ("weight",)).items()}
+        return self.attempt(
+            path,
+            lambda: Camera(
+                name=name,
+                width=data["width_px"],
+                height=data["height_px"],
+                fps=fps if limit is None else min(fps, exact(limit)),
+                rate_quality=model,
+                graph=graph,
+                source=source,
+                native=(native["width_px"], native["height_px"]) if native else None,
+                crop=_crop(native, data["width_px"], data["height_px"]) if native else None,
+                mount=_given(data, MOUNT_KEYS),
+                place=Place(**place) if place else None,
+                pose=Pose(**pose) if pose else None,
+                **options,
+            ),
+        )
+
+    def part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
+        """What a part of the document describes, if the schema accepts it."""
+        if not self.fine(*path):
+            return None
+        data: Any = self.composed.document
+        for key in path:
+            data = data[key]
+        return self.attempt(path, lambda: make(data))
+
+    def check_link(self, kind: str) -> None:
+        """Whether all cameras go through a limited link of a kind."""
+        cameras = self.vehicle.cameras.values() if self.vehicle else ()
+        dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
+        if dialling:
+            rule = f"joins sides over RTSP, the graph of {dialling[0]} brings its own line"
+            self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
+
+    def _check_inputs(self, camera: Camera) -> None:
+        """Whether the clip, device or address that a camera's source asks for is named, and a clip is there."""
+        source = camera.source
+        for key in () if source.render else sorted(source.needs.intersection(MOUNT_KEYS)):
+            where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
+            given = camera.mount.get(key, source.settings.get(key))
+            if given is None:
+                self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
+            elif key == "clip" and not Path(str(given)).is_file():
+                self._report(where, ModelError(key, repr(given), why_no_file(Path(str(given)))))
+
+    def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
+        """Whether everything that source, graph and recording refer to is there."""
+        anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
+        try:
+            # One name for all: what differs in nothing else need not be checked against the registry again.
+            plan = compile_graph(replace(camera, name="camera", mount=anything), media, index, recording=recording)
+            for knob, value in SAMPLE_KNOBS.items():
+                assignments(camera, knob, value)
+            if self.composed.document["log"]["video"]:
+                check_video(camera.graph)
+            errors = list(self.check(plan)) if self.check else []
+        except ModelError as broken:
+            errors = [broken]
+        for error in errors:
+            section, _, key = error.key.partition(".")
+            self._report(self._of(camera.name, section), ModelError(key, error.found, error.rule))
+
+    def _of(self, camera: str, section: str) -> schema.Path:
+        """Where a camera's graph or source stands: its own one, else the one of all."""
+        data = self.composed.document["cameras"][camera]
+        return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
+
+    def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
+        """No two listeners on one port. Cameras count on from the first port of their graph."""
+        taken: dict[int, str] = {}
+        for path, port in servers.items():
+            if port in taken:
+                self._report((), ModelError(path, str(port), f"is already the port of {taken[port]}"))
+            taken[port] = path
+        for index, (name, camera) in enumerate(cameras.items()):
+            port = int(camera.graph.settings["first_port"]) + index
+            if port in taken:
+                own = ("cameras", name) if "graph" in self.composed.document["cameras"][name] else ()
+                rule = f"camera {name} would get port {port}, already the port of {taken[port]}"
+                self._report(own, ModelError("graph.first_port", str(port - index), rule))
+            taken[port] = f"camera {name}"
+
+
+def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """Those of some keys that the configuration states; the model has a default for each of the others."""
+    return {key: data[key] for key in keys if key in data}
+
+
+def _media(data: Mapping[str, Any]) -> Media:
+    first, last = data["rtp_ports"]
+    return Media(**{**data, "rtp_ports": (first, last)})
+
+
+def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
+    return RateQualityModel(
+        scaling=tuple(map(exact, data["scaling"])),
+        b_min=tuple(map(exact, data["b_min_kbps"])),
+        b_full=exact(data["b_full_kbps"]),
+    )
+
+
+def _crop(native: Mapping[str, int], width: int, height: int) -> Roi:
+    return Roi(native.get("left_px", 0), native.get("top_px", 0), width, height)
+
+
+def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
+    return tuple(Element(e["name"], e["element"], e.get("properties") or {}) for e in data or ())
+
+
+def _graph(data: Mapping[str, Any]) -> Graph:
+    for key, side in GRAPH_PARTS.items():
+        if key in data:
+            raise ModelError(key, None, f"is not used, the list {side} must refer to it as ${{..{key}}}")
+    wire = data.get("wire") or {}
+    settings: dict[str, Value] = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE}
+    return Graph(
+        transport=data["transport"],
+        vehicle=_elements(data["vehicle"]),
+        operator=_elements(data["operator"]),
+        wire_vehicle=_elements(wire.get("vehicle")),
+        wire_operator=_elements(wire.get("operator")),
+        knobs={knob: tuple(Turn(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
+        settings=settings,
+        mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
+        **_given(data, ("verified",)),
+    )
+
+
+def _source(data: Mapping[str, Any]) -> Source:
+    render = data.get("render")
+    return Source(
+        elements=_elements(data["elements"]),
+        settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
+        **_given(data, ("loop", "frozen_s")),
+        render=render["drive"] if render else "",
+        render_s=render["seconds"] if render else 0,
+        stand_in=_elements(data.get("stand_in")),
+    )
+
+
+def _recording(data: Mapping[str, Any]) -> Recording:
+    return Recording(data["codec"], data["of_raw"], _elements(data["elements"]))
+
+
+def _split(key: str) -> schema.Path:
+    """The path that a dotted key means: a.b[1].c."""
+    parts: list[str | int] = []
+    for piece in filter(None, key.replace("]", "").replace("[", ".#").split(".")):
+        parts.append(int(piece[1:]) if piece[0] == "#" else piece)
+    return tuple(parts)

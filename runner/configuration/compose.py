@@ -1,0 +1,237 @@
+"""Compose the YAML tree with Hydra, and remember which file or override each value came from."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from runner import schema
+from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
+from runner.configuration.origin import PICKED, Composed, Part, nested
+from runner.configuration.overrides import COMMAND_LINE, Override, choice_problems, parse_overrides
+from runner.configuration.resolve import resolved
+from runner.configuration.yaml_file import label, load_file, read
+from runner.core.model import suggest
+from runner.errors import ConfigError, Problem
+from runner.resources import directory
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+OF_THE_PLACE = ("place", "pose", "weight", "device", "address", "clip", "graph", "source")  # keys of a mount
+WHOLE = ("vehicle", "experiment")  # groups whose files speak of the whole document
+PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
+
+
+def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
+    """Compose conf/config.yaml with the user's overrides.
+
+    user    directory whose files shadow the packaged ones one by one
+    raises  ConfigError
+    """
+    from omegaconf import open_dict
+
+    parsed = parse_overrides(overrides)
+    directories = conf_directories(user)
+    problems = [p for override in parsed for p in choice_problems(override, directories)]
+    if problems:
+        raise ConfigError(problems)
+    _check_headers({o.key: str(o.value) for o in parsed if o.key == "experiment"}, directories)
+    config, choices = _compose(parsed, directories)
+    _check_headers(choices, directories)
+    parts = [_part(override) for override in reversed(parsed) if override.deletes or not override.choice]
+    parts += reversed(list(_file_parts(directories, choices)))
+    with open_dict(config):
+        del config["hydra"]
+    return resolved(config, parts)
+
+
+def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
+    """Whether files that speak of the whole document say so; Hydra would put them elsewhere without a word."""
+    for file in (find_file(directories, group, choices[group]) for group in WHOLE if group in choices):
+        if file.exists() and read(file).package != "_global_":
+            rule = f"must begin with the line {PACKAGE_HEADER}"
+            raise ConfigError([Problem(label(file), "", None, rule)])
+
+
+def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: Path | None = None) -> Composed:
+    """A configuration that was composed before, with the user's overrides on top; a group's file replaces that part.
+
+    base    the document, as a drive keeps it; name: where it stands, for messages
+    raises  ConfigError
+
+    What an earlier version did not state is as the packaged config.yaml states it.
+    """
+    base = _completed(base)
+    if not overrides:
+        return Composed(base, [Part(name, (), base)])
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    parsed = parse_overrides(overrides)
+    problems = [p for override in parsed for p in choice_problems(override, conf_directories(user))]
+    if problems:
+        raise ConfigError(problems)
+    config = OmegaConf.create(base)
+    for override in sorted(parsed, key=lambda o: not o.choice):
+        try:
+            if override.deletes or override.is_none:
+                above, _, key = override.key.rpartition(".")
+                (OmegaConf.select(config, above) if above else config).pop(key, None)
+            for key, value in _replaced(override, config, user):
+                OmegaConf.update(config, key, value, merge=not override.choice)
+        except (OmegaConfBaseException, ValueError, TypeError, AttributeError, KeyError) as error:
+            rule = str(error).partition("\n")[0]
+            raise ConfigError([Problem(COMMAND_LINE, override.key, None, rule)]) from None
+    parts = [_part(override) for override in reversed(parsed) if override.deletes or not override.choice]
+    document = cast("dict[str, Any]", OmegaConf.to_container(config))
+    return Composed(document, [*parts, Part(name, (), base)])
+
+
+def _completed(document: dict[str, Any]) -> dict[str, Any]:
+    """A document with the keys of config.yaml's own sections (media, control, ...) that it lacks."""
+    packaged = load_file(directory("conf") / "config.yaml")
+    sections = {key: value for key, value in packaged.items() if isinstance(value, dict)}
+    known = {key: document[key] for key in sections if isinstance(document.get(key), dict)}
+    return {**document, **{key: {**sections[key], **value} for key, value in known.items()}}
+
+
+def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str, Any]:
+    """Another kind of camera in the place of one that is mounted: what belongs to the place stays."""
+    from omegaconf import OmegaConf
+
+    before = OmegaConf.select(config, package) or {}
+    return {**{key: before[key] for key in OF_THE_PLACE if key in before}, **kind}
+
+
+def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iterator[tuple[str, Any]]:
+    """Keys that an override of a composed document sets, and to what."""
+    if override.deletes or override.is_none:
+        return
+    if not override.choice:
+        yield override.key, override.value
+        return
+    group, _, package = override.key.lstrip("/").partition("@")
+    if group == "experiment":
+        raise ValueError("an experiment is a configuration of its own: name what of it is to change")
+    if group == "vehicle":
+        document = compose([f"{group}={override.value}"], user).document
+        yield from ((key, document[key]) for key in ("name", "cameras"))
+    else:
+        document = compose([f"+{group}@{PICKED}={override.value}"], user).document
+        yield package or group, _mounted(document[PICKED], config, package) if group == "cameras" else document[PICKED]
+
+
+def _part(override: Override) -> Part:
+    return Part(COMMAND_LINE, (), nested(override.key, override.value))
+
+
+# --- Hydra ------------------------------------------------------------------------------------------------------------
+
+
+def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[DictConfig, dict[str, str]]:
+    """What Hydra composes, and by group the file that was chosen."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from runner.configuration.hydra_files import search
+
+    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
+    OmegaConf.clear_resolver("oc.env")
+    search(directories)
+    root = find_file(directories, "", "config")
+    chosen = {key for key, _ in chosen_by(root)}
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(directories[-1]), version_base="1.3"):
+            config = hydra_compose("config", [o.hydra(chosen) for o in overrides], return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError([_hydra_problem(error, directories)]) from None
+    except RecursionError:
+        rule = "files build on each other in a circle"
+        raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
+    choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
+    return config, choices
+
+
+def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
+    """Hydra's message as one problem; a file missing from a defaults list gets a suggestion."""
+    text = str(error)
+    missing = re.search(r"In '([\w/.-]+)': Could not (?:find|load) '([\w/.-]+)'", text)
+    if missing:
+        where, wanted = missing.groups()
+        group, name = _place(wanted)
+        known = options(group, directories)
+        hint = suggest(name, known) if known else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
+        overriding = _overriding(group, name, directories)
+        file = overriding or label(find_file(directories, *_place(where)))
+        return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
+    lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
+    rule = "; ".join(lines)
+    twice = re.search(r"Multiple values for ([\w/@.-]+?)\. ", text)
+    if twice:
+        rule = f"is chosen twice; to choose again write override /{twice[1]}: FILE"
+        return Problem(_chooser(twice[1], directories), "defaults", repr(f"/{twice[1]}"), rule)
+    inside = re.search(r"In '([\w/.-]+)': (?:\w+ raised while composing config:; )?(.*)", rule)
+    if inside:
+        rule = re.sub("Cannot merge.*", "a key is a list here and a mapping in a file that this builds on", inside[2])
+        return Problem(label(find_file(directories, *_place(inside[1]))), "", None, rule)
+    interpolation = re.search(r"Error resolving interpolation '(.+?)'", text)
+    if interpolation:
+        rule = "a defaults list may refer to a choice above it only, such as ${vehicle}"
+        for path, entries in defaults(directories):
+            if any(interpolation[1] in value for _, value in entries):
+                return Problem(label(path), "defaults", interpolation[1], rule)
+    return Problem(COMMAND_LINE, "", None, rule)
+
+
+def _place(name: str) -> tuple[str, str]:
+    """Group and file of a name like vehicle/tum_q7."""
+    group, _, file = name.rpartition("/")
+    return group, file
+
+
+def _chooser(key: str, directories: Sequence[Path]) -> str:
+    """The file whose defaults list speaks of a group and package most often, the user's files first."""
+
+    def times(of: tuple[Path, list[tuple[str, str]]]) -> int:
+        return sum(chosen.removeprefix("/") == key for chosen, _ in of[1])
+
+    return label(max(defaults(directories), key=times)[0])
+
+
+def _overriding(group: str, name: str, directories: Sequence[Path]) -> str:
+    """The file whose defaults list chooses a file of a group in place of another, or ""; Hydra names its reader."""
+    for path, entries in defaults(directories):
+        if any(key.replace(" /", " ") == f"override {group}" and value == name for key, value in entries):
+            return label(path)
+    return ""
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterator[Part]:
+    """The files behind a composition, in the order in which Hydra merged them."""
+    root = find_file(directories, "", "config")
+    yield Part(label(root), (), load_file(root), root)
+    # Mounted files first: a vehicle file says last what belongs to the place. An experiment has the last word.
+    for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
+        group, _, package = key.partition("@")
+        if group.startswith("hydra") or group not in GROUPS or name == "None":
+            continue
+        where = tuple(package.split(".")) if package else () if group in WHOLE else (group,)
+        yield from _with_bases(find_file(directories, group, name), group, where, directories)
+
+
+def _with_bases(path: Path, group: str, package: schema.Path, directories: Sequence[Path]) -> Iterator[Part]:
+    """A group's file after those of its own group that its defaults list builds on."""
+    for base in bases_of(path):
+        yield from _with_bases(find_file(directories, group, base), group, package, directories)
+    yield Part(label(path), package, load_file(path), path)

@@ -1,0 +1,113 @@
+"""One configuration: composed once, its parts checked and built when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.configuration.build import Builder, Check
+from runner.configuration.compose import compose, recompose
+from runner.configuration.files import conf_directories
+from runner.core.model import Vehicle
+
+if TYPE_CHECKING:
+    from runner.configuration.experiment import Experiment, LinkSettings
+    from runner.configuration.origin import Composed
+    from runner.pqos import Pqos
+    from runner.pqos.track import Track
+    from runner.rate_quality.study import Study
+
+Base = tuple[dict[str, Any], str]  # a configuration composed before, and where it stands
+
+
+class Configuration:
+    """What files and overrides compose to.
+
+    composed  with the origin of each value
+    user      directory whose files shadow the packaged ones and may add any
+    runnable  check also what only a run needs: that clips, devices and addresses are named and files exist
+    check     what else may be wrong with a compiled plan: the GStreamer registry's view
+    fits      sections that the schemas accept, as is known already
+
+    `vehicle()`, `pqos()`, `study()` and `experiment()` raise ConfigError with all problems of the vehicle and of the
+    parts asked for so far.
+    """
+
+    def __init__(
+        self,
+        composed: Composed,
+        user: Path | None = None,
+        *,
+        runnable: bool = True,
+        check: Check | None = None,
+        fits: Collection[str] = (),
+    ) -> None:
+        self._composed, self._user, self._runnable, self._check, self._fits = composed, user, runnable, check, fits
+        self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
+
+    def drivable(self, check: Check) -> Configuration:
+        """The same, checked for all that a run needs."""
+        return Configuration(self._composed, self._user, check=check)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The configuration as plain data, not yet checked."""
+        return self._composed.document
+
+    def vehicle(self) -> Vehicle:
+        return self._builder.finished(self._builder.vehicle)
+
+    def pqos(self) -> tuple[Pqos, Track | None]:
+        """The source of predictions, and the drive that gives positions where no GPS does."""
+        from runner.pqos import build_pqos
+        from runner.pqos.track import build_track
+
+        part = self._builder.part
+        pqos = part(("pqos",), lambda settings: build_pqos(settings, self._bases))
+        # A map that cannot be read is reported once, though the drive goes through its points.
+        track = part(("pqos",), lambda settings: build_track(settings, self._bases)) if pqos else None
+        return self._builder.finished(pqos), track
+
+    def study(self) -> Study:
+        """How rate-quality models of the cameras are measured."""
+        from runner.rate_quality.study import read_study
+
+        return self._builder.finished(self._builder.part(("study",), read_study))
+
+    def experiment(self) -> tuple[Experiment, LinkSettings | None]:
+        """What the demo drives, and the limited link between its sides."""
+        from runner.configuration.experiment import Experiment, read_experiment, read_link, truth
+
+        builder = self._builder
+        experiment = builder.part(("experiment",), read_experiment) if "experiment" in self.document else Experiment()
+        if "link" not in self.document:
+            return builder.finished(experiment), None
+        rates = builder.part(("pqos",), lambda settings: truth(settings, self._bases))
+        link = builder.part(("link",), lambda settings: read_link(settings, rates, self._bases)) if rates else None
+        if link:
+            builder.check_link(link.kind)
+        return builder.finished(experiment), builder.finished(link)
+
+    @cached_property
+    def _builder(self) -> Builder:
+        return Builder.of(self._composed, self._runnable, self._check, self._fits)
+
+
+def configuration(
+    overrides: Sequence[str] = (),
+    user: Path | None = None,
+    *,
+    base: Base | None = None,
+    runnable: bool = True,
+    check: Check | None = None,
+) -> Configuration:
+    """Compose files and overrides.
+
+    overrides  Hydra overrides, as on the command line
+    base       what the overrides change; None: the packaged and the user's files
+    raises     ConfigError where they cannot be composed
+    """
+    composed = recompose(*base, overrides, user) if base else compose(overrides, user)
+    return Configuration(composed, user, runnable=runnable, check=check)

@@ -1,0 +1,87 @@
+"""A drive that anyone can repeat: how long, how often, over which link; the `experiment` and `link` sections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from runner.core.events import ClockAdvanced, Event
+from runner.core.model import Kbps, exact
+from runner.link.limit import Limit
+from runner.pqos import Pqos, build_pqos, trace
+from runner.pqos.table import find_file
+from runner.pqos.track import Track, build_track
+
+Rates = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
+STEP_S = 0.1  # at which the rate of a link follows a map
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What the demo drives.
+
+    about       what it shows, in a sentence, or ""
+    duration_s  length of each drive, s
+    claims      name of what a publication reports of such a drive, or ""
+    runs        by name, the overrides that each of several drives adds; empty: one drive
+    """
+
+    about: str = ""
+    duration_s: float = 60
+    claims: str = ""
+    runs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """A link of limited rate between the two sides: its kind, netns or relay, and what it does to packets."""
+
+    kind: str
+    limit: Limit
+
+
+def read_experiment(data: Mapping[str, Any]) -> Experiment:
+    runs = {name: tuple(words) for name, words in (data.get("runs") or {}).items()}
+    return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs)
+
+
+def read_link(data: Mapping[str, Any], predicted: Rates, bases: Sequence[Path]) -> LinkSettings:
+    """The link that the `link` section describes.
+
+    predicted  the rates that it follows where it names no file, see `truth`
+    bases      directories in which a relative file is looked up
+    raises     ModelError with the key, what was found and what is right
+    """
+    rates = trace(find_file(data, "file", bases), data["loop"], exact(0)) if data["file"] else predicted
+    share = float(data["share"])
+
+    def kbps_at(t: float) -> float:
+        return share * float(rates(t))
+
+    return LinkSettings(data["kind"], Limit(kbps_at, float(data["queue_ms"]), float(data["delay_ms"])))
+
+
+def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> Rates:
+    """What the source of predictions in the `pqos` section states for each moment and place, not looking ahead.
+
+    raises  ModelError with the key, what was found and what is right
+    """
+    return _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
+
+
+def _known(source: Pqos, track: Track | None) -> Rates:
+    """What a source of predictions states for each moment of a drive; 0 where it states nothing."""
+    rates: list[Kbps] = []
+
+    def kbps_at(t: float) -> Kbps:
+        step = int(t / STEP_S + 1e-6)
+        while len(rates) <= step:
+            now = len(rates) * STEP_S
+            event: Event = ClockAdvanced(t=now) if track is None else track.at(now)
+            prediction = source.observe(event)
+            rates.append(prediction.kbps if prediction else rates[-1] if rates else exact(0))
+        return rates[step]
+
+    return kbps_at

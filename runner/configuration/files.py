@@ -1,0 +1,75 @@
+"""Where configuration files are, and which there are: the user's directory before the packaged one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from runner.configuration.yaml_file import load_file
+from runner.errors import ConfigError
+from runner.resources import directory
+
+GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
+
+
+def conf_directories(user: Path | None) -> list[Path]:
+    """Where configuration files are looked up, the user's directory first."""
+    packaged = directory("conf")
+    return [user, packaged] if user else [packaged]
+
+
+def options(group: str, directories: Sequence[Path]) -> list[str]:
+    """Names of the files that may be chosen for a group."""
+    return sorted({path.stem for d in directories for path in (d / group).glob("*.yaml")})
+
+
+def files(directories: Sequence[Path]) -> Iterator[Path]:
+    """Every configuration file, the user's first."""
+    return (path for d in directories for group in ("", *GROUPS) for path in sorted((d / group).glob("*.yaml")))
+
+
+def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
+    """The first file of that name; where there is none, the place where it would be."""
+    candidates = [d / group / f"{name}.yaml" for d in directories]
+    return next((path for path in candidates if path.exists()), candidates[0])
+
+
+def defaults(directories: Sequence[Path]) -> Iterator[tuple[Path, list[tuple[str, str]]]]:
+    """What the defaults list of each readable file chooses, as pairs of key and name; the user's files first."""
+    for path in files(directories):
+        with suppress(ConfigError):
+            yield path, chosen_by(path)
+
+
+def built_on(path: Path, directories: Sequence[Path]) -> set[Path]:
+    """A file, and those that its defaults list names, and theirs; one that cannot be read names none."""
+    found, open_ends = set[Path](), [path]
+    while open_ends:
+        path = open_ends.pop()
+        if path not in found and path.exists():
+            found.add(path)
+            with suppress(ConfigError):
+                group = path.parent.name
+                named = [(key.split()[-1].lstrip("/").partition("@")[0], name) for key, name in chosen_by(path)]
+                named += [(group, name) for name in bases_of(path)]
+                open_ends += [find_file(directories, *one) for one in named]
+    return found
+
+
+def bases_of(path: Path) -> list[str]:
+    """Files of its own group that a file builds on; raises ConfigError where it cannot be read."""
+    content = load_file(path)
+    entries = content.get("defaults") if isinstance(content, dict) else None
+    return [entry for entry in entries or () if isinstance(entry, str) and entry != "_self_"]
+
+
+def chosen_by(path: Path) -> list[tuple[str, str]]:
+    """What the defaults list of a file chooses, as pairs of key and name.
+
+    raises  ConfigError where it cannot be read
+    """
+    content = load_file(path)
+    entries = content.get("defaults") if isinstance(content, dict) else None
+    chosen = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    return [(str(key), str(value)) for entry in chosen for key, value in entry.items()]

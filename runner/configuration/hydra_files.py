@@ -1,0 +1,52 @@
+"""How Hydra finds and reads configuration files: the user's before the packaged ones, all through `yaml_file`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from pathlib import Path
+
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from runner.configuration.yaml_file import load_node, read
+
+SCHEME = "tod-runner"
+
+
+class CheckedFiles(FileConfigSource):
+    """A directory of files, each checked before Hydra sees its content."""
+
+    @staticmethod
+    def scheme() -> str:
+        return SCHEME
+
+    def is_config(self, config_path: str) -> bool:
+        """Whether there is anything of that name; `load_config` says why it cannot be read."""
+        return (Path(self.path) / self._normalize_file_name(config_path)).exists()
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """raises ConfigError"""
+        path = Path(self.path) / self._normalize_file_name(config_path)
+        # A copy, since Hydra takes the defaults list out of it and merges other files into it.
+        return ConfigResult(self.provider, self.full_path(), deepcopy(load_node(path)), {"package": read(path).package})
+
+
+class Directories(SearchPathPlugin):
+    """Hydra's own --config-dir only appends, so that a user's file could not shadow a packaged one."""
+
+    directories: Sequence[Path] = ()
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for directory in reversed(self.directories):
+            search_path.prepend(SCHEME, f"{SCHEME}://{directory}")
+
+
+def search(directories: Sequence[Path]) -> None:
+    """Let Hydra look in these directories, the first one first."""
+    Directories.directories = directories
+    for plugin in (CheckedFiles, Directories):
+        Plugins.instance().register(plugin)

@@ -1,0 +1,118 @@
+"""What interpolations, ${a.b}, refer to, and how large a configuration gets when they are written out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from runner.schema import Path
+
+_REFERENCE = re.compile(r"\$\{(\.*)([^${}:]+)\}")  # leading dots, key; the innermost of nested ones
+_STEP = re.compile(r"[^.\[\]]+")
+CHARACTERS = 100  # of text that count as a value
+
+
+def references(text: str, path: Path) -> Iterator[Path]:
+    """The paths that the interpolations in a text refer to; path: where the text stands, for relative ones."""
+    for dots, key in _REFERENCE.findall(text):
+        above = path[: -len(dots)] if dots else ()
+        yield (*above, *(int(step) if step.isdigit() else step for step in _STEP.findall(key)))
+
+
+def stays_inside(content: Any, path: Path = ()) -> bool:
+    """Whether every interpolation in a file's content refers to a place in that content, by a relative path."""
+    if isinstance(content, dict | list):
+        entries = content.items() if isinstance(content, dict) else enumerate(content)
+        return all(stays_inside(inner, (*path, key)) for key, inner in entries)
+    if not isinstance(content, str):
+        return True
+    found = _REFERENCE.findall(content)
+    return len(found) == content.count("${") and all(0 < len(dots) <= len(path) for dots, _ in found)
+
+
+def value_at(document: Any, path: Path) -> Any:
+    """The value at a path of a document; None where there is none."""
+    for key in path:
+        try:
+            document = document[key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return document
+
+
+def spliced(written: Any, resolved: Any) -> tuple[Any, dict[Path, Path]]:
+    """A resolved document in which the entries of a list take the place of an interpolation that stands for the list.
+
+    written   the document before its interpolations were resolved
+    resolved  the same afterwards
+    returns   the document, and by path in it where the entries of such lists are written
+    """
+    moved: dict[Path, Path] = {}
+
+    def followed(path: Path, kind: type) -> Path:
+        """Where a value of a kind is written that a path leads to."""
+        text = value_at(written, path)
+        target = next(references(text, path), path) if isinstance(text, str) else path
+        return followed(target, kind) if target != path and isinstance(value_at(resolved, target), kind) else path
+
+    def entries(path: Path) -> Iterator[tuple[Path, Any]]:
+        """Entries of a resolved list, each with the path at which it is written."""
+        for index, entry in enumerate(value_at(resolved, path)):
+            here = (*path, index)
+            there = followed(here, list) if isinstance(entry, list) else here
+            yield from entries(there) if there != here else ((here, entry),)
+
+    def copy(value: Any, path: Path, source: Path) -> Any:
+        source = followed(source, type(value))
+        if isinstance(value, dict):
+            return {key: copy(inner, (*path, key), (*source, key)) for key, inner in value.items()}
+        if not isinstance(value, list):
+            return value
+        made = []
+        for index, (origin, entry) in enumerate(entries(source)):
+            here = (*path, index)
+            stated = origin if origin[:-1] != source else (*path, origin[-1])
+            if stated != here:
+                moved[here] = stated
+            made.append(copy(entry, here, origin))
+        return made
+
+    return copy(resolved, (), ()), moved
+
+
+def written_out(document: Any, most: int) -> bool:
+    """Whether a document holds at most so many values with its interpolations written out.
+
+    Each value counts once for every place that it is referred to from, directly or through others: a dozen short lines
+    that double each other make millions.
+    """
+    try:
+        return _Sizes(document).of(()) <= most
+    except RecursionError:
+        return False
+
+
+class _Sizes:
+    """Values below each path, counted once. A circle counts as nothing: OmegaConf tells it."""
+
+    def __init__(self, document: Any) -> None:
+        self._document = document
+        self._known: dict[Path, int] = {}
+
+    def of(self, path: Path) -> int:
+        if path not in self._known:
+            self._known[path] = 0
+            self._known[path] = 1 + sum(self._inner(self._value(path), path))
+        return self._known[path]
+
+    def _inner(self, value: Any, path: Path) -> Iterator[int]:
+        if isinstance(value, dict | list):
+            keys = value if isinstance(value, dict) else range(len(value))
+            yield from (self.of((*path, key)) for key in keys)
+        elif isinstance(value, str):
+            yield len(value) // CHARACTERS
+            yield from map(self.of, references(value, path))
+
+    def _value(self, path: Path) -> Any:
+        return value_at(self._document, path)  # None: OmegaConf reports that there is no such key

@@ -1,0 +1,150 @@
+"""Which file or override each value of a composed configuration came from. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from runner import schema
+from runner.configuration.interpolation import value_at
+from runner.errors import Problem
+
+PICKED = "picked"  # package, or how its name begins, in which a group's file is composed alone
+GRAPH_PARTS = {"encoder": "vehicle", "sender": "vehicle", "receiver": "operator"}  # and the list that takes each in
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file or override that took part, with its content and the place in the whole where it landed."""
+
+    file: str
+    package: schema.Path
+    content: Any
+    path: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Composed:
+    """The whole configuration as plain data, and its parts, the one with the last word first.
+
+    moved  by path in the document, where entries are written that a list takes in from another one
+    """
+
+    document: dict[str, Any]
+    parts: list[Part] = field(default_factory=list)
+    moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
+
+    def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
+        """A problem of the whole, told of the file or override that it came from, by the path in there."""
+        path = self.written(path)
+        part = self._origin(path)
+        return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
+
+    def later_parts(self, path: schema.Path) -> list[Part]:
+        """The parts that have a word to say after the one that the value comes from, the last one first."""
+        return self.parts[: self._age(self.written(path))]
+
+    def written(self, path: schema.Path) -> schema.Path:
+        """Where a value of the document is written."""
+        lengths = (length for length in range(len(path), 0, -1) if path[:length] in self.moved)
+        length = next(lengths, 0)
+        return (*self.moved[path[:length]], *path[length:]) if length else path
+
+    def without_graph_parts(self) -> Composed:
+        """Without the parts of graphs that a list took in, or that a later list does without.
+
+        One that is left is a mistake: the file that has the last word on it meant it to be used.
+        """
+        used = {(path[:-2], origin[-2]) for path, origin in self.moved.items()}
+        mounts = self.document.get("cameras")
+        names = mounts if isinstance(mounts, dict) else ()
+        picked = ((key,) for key in self.document if key.startswith(PICKED))
+        for place in (("graph",), *picked, *(("cameras", name, "graph") for name in names)):
+            graph = value_at(self.document, place)
+            given = [key for key in GRAPH_PARTS if key in graph] if isinstance(graph, dict) else []
+            for key in given:
+                if (place, key) in used or self._age((*place, GRAPH_PARTS[key])) < self._age((*place, key)):
+                    del graph[key]
+        return self
+
+    def _age(self, path: schema.Path) -> int:
+        """How many parts have a word to say after the one that a value comes from."""
+        return self.parts.index(self._origin(path))
+
+    def _origin(self, path: schema.Path) -> Part:
+        """The part that has the value; for what is missing, the one that says most about its surroundings."""
+        inside = [part for part in self._visible(path) if path[: len(part.package)] == part.package]
+        for length in range(len(path), 0, -1):
+            makers = [part for part in inside if len(part.package) == length]
+            above = (part for part in inside if len(part.package) < length)
+            holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
+            # For a missing key ask who made its surroundings, the most local file first.
+            asked = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
+            if asked:
+                return asked[0]
+        vehicle = (part for part in self.parts if part.path and part.path.parent.name == "vehicle")
+        return next(vehicle, self.parts[-1]) if path[:1] in (("name",), ("cameras",)) else self.parts[-1]
+
+    def _visible(self, path: schema.Path) -> list[Part]:
+        """The parts down to the one whose list the path leads through: a list replaces those of all files before."""
+        lists = [path[:depth] for depth, key in enumerate(path) if isinstance(key, int)]
+        for index, part in enumerate(self.parts):
+            if any(isinstance(_held(part, place), list) for place in lists):
+                return self.parts[: index + 1]
+        return self.parts
+
+
+def merged(parts: Sequence[Part]) -> dict[str, Any]:
+    """All parts in one document, as OmegaConf merges them: mappings key by key, anything else as a whole."""
+    document: dict[str, Any] = {}
+    for part in reversed(parts):
+        content = {key: value for key, value in (part.content or {}).items() if key != "defaults" or part.path is None}
+        _merge(document, nested(".".join(map(str, part.package)), content) if part.package else content)
+    return document
+
+
+def _merge(document: dict[str, Any], added: Mapping[str, Any]) -> None:
+    for key, value in added.items():
+        if isinstance(value, dict):
+            inner = document[key] if isinstance(document.get(key), dict) else {}
+            document[key] = dict(inner)
+            _merge(document[key], value)
+        else:
+            document[key] = value
+
+
+def _locality(part: Part) -> int:
+    return -len(part.package)
+
+
+def _held(part: Part, path: schema.Path) -> Any:
+    """What a part says at a path of the whole document; None: nothing."""
+    inside = path[: len(part.package)] == part.package
+    return _value(part.content, path[len(part.package) :]) if inside else None
+
+
+def _holds(content: Any, path: schema.Path) -> bool:
+    return _value(content, path, _NOTHING) is not _NOTHING
+
+
+def _value(content: Any, path: schema.Path, otherwise: Any = None) -> Any:
+    for part in path:
+        # An override names the first entry of a list as a.0, a file has a list there.
+        key = str(part) if isinstance(content, dict) else part
+        try:
+            content = content[key]
+        except (KeyError, IndexError, TypeError):
+            return otherwise
+    return content
+
+
+def nested(key: str, value: Any) -> Any:
+    """{"a": {"b": value}} for a.b."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
+
+
+_NOTHING = object()

@@ -1,0 +1,103 @@
+"""Overrides: words of the command line as Hydra parses them, which choose a group's file or set a value."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runner import schema
+from runner.configuration.files import GROUPS, options
+from runner.configuration.yaml_file import label
+from runner.core.model import suggest
+from runner.errors import ConfigError, Problem
+
+COMMAND_LINE = "command line"
+OPTIONAL = ("link", "experiment")  # groups of which no file need be chosen
+LONGEST_WORD = 4096  # characters of an override, as of a path
+DEEPEST = 32  # brackets of a kind in an override
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One override: a choice of a group's file, or a value."""
+
+    text: str
+    key: str
+    value: Any
+    choice: bool
+
+    @property
+    def deletes(self) -> bool:
+        return self.text.startswith("~")
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it takes away a choice that need not be made."""
+        return self.choice and self.key in OPTIONAL and self.value == "null"
+
+    def hydra(self, chosen: Collection[str]) -> str:
+        """As Hydra is to read it: a plus is never needed and never wrong. The schema knows which keys there are.
+
+        chosen  groups of which conf/config.yaml chooses a file
+        """
+        if self.is_none:
+            return f"~{self.key}"
+        plain = self.text.lstrip("+")
+        if self.deletes or (self.choice and self.key in chosen):
+            return plain
+        return self.text if self.choice else f"++{plain}"
+
+
+def parse_overrides(overrides: Sequence[str]) -> list[Override]:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser, parsed, problems = OverridesParser.create(), [], []
+    for text in overrides:
+        try:
+            if len(text) > LONGEST_WORD or max(map(text.count, "[{(")) > DEEPEST:
+                raise HydraException("is too long or nested too deeply, write it into a file")
+            override = parser.parse_override(text)
+            group = override.key_or_group.split("@")[0].lstrip("/")
+            if override.is_sweep_override():
+                raise HydraException("a,b,c is a sweep; write [a,b,c] for a list")
+            if group.partition(".")[0].partition("/")[0] in ("", "hydra"):
+                raise HydraException("no such key")
+            value = None if override.is_delete() else override.value()
+            choice = group in GROUPS and not isinstance(value, dict)
+            if choice and value is None and not override.is_delete():
+                value = "null"
+            parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice))
+        except HydraException as error:
+            rule = str(error).partition("\n")[0]
+            plain = "sweep" in rule or "no such" in rule or "too long" in rule
+            hint = "" if plain else """; quote a value with special characters: 'key="value"'"""
+            problems.append(Problem(COMMAND_LINE, "", schema.shortened(text), rule + hint))
+    if problems:
+        raise ConfigError(problems)
+    return parsed
+
+
+def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
+    """A choice of a file that is not there, or a value for a key that belongs to the whole document."""
+    if not override.choice or override.value is None or override.is_none:
+        return
+    group = override.key.split("@")[0].lstrip("/")
+    known = options(group, directories)
+    if str(override.value) not in known:
+        folders = " or ".join(f"{label(directory / group)}/" for directory in reversed(directories))
+        rule = f"no such file in {folders}, {suggest(str(override.value), known)}"
+        if len(directories) == 1 and "did you mean" not in rule:
+            rule += "; files of your own need conf=DIR"
+        yield Problem(COMMAND_LINE, override.key, str(override.value), rule)
+
+
+def choosable(name: str) -> bool:
+    """Whether Hydra takes a word for the name of a file: not a,b, which is a sweep, nor 1e3, null or true."""
+    try:
+        (override,) = parse_overrides([f"vehicle={name}"])
+    except ConfigError:
+        return False
+    return override.value == name and name != "null"

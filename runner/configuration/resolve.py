@@ -1,0 +1,51 @@
+"""Write out the interpolations of a composed tree."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+from runner.configuration.interpolation import spliced, written_out
+from runner.configuration.origin import Composed, Part, merged
+from runner.errors import ConfigError, Problem
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+MOST_RESOLVED = 50_000  # values of a configuration, with its interpolations written out
+
+
+def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
+    """The composed tree as plain data, interpolations resolved.
+
+    raises  ConfigError
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    written = OmegaConf.to_container(config)
+    if not written_out(written, MOST_RESOLVED):
+        file = next(part.file for part in parts if "${" in str(part.content))
+        rule = f"interpolations, ${{...}}, refer to each other too deeply or come to more than {MOST_RESOLVED} values"
+        raise ConfigError([Problem(file, "", None, rule)])
+    try:
+        document = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        origin = Composed({}, list(parts))
+        path = tuple(int(p) if p.isdigit() else p for p in re.split(r"[.\[\]]+", str(error.full_key or "")) if p)
+        raise ConfigError([origin.problem(path, None, str(error).splitlines()[0])]) from None
+    document, moved = spliced(written, document)
+    return Composed(cast("dict[str, Any]", document), list(parts), moved).without_graph_parts()
+
+
+def without(composed: Composed, part: Part) -> Composed | None:
+    """What there would be if a part said nothing; None where that cannot be told from the parts."""
+    from omegaconf import OmegaConf
+
+    others = [other for other in composed.parts if other is not part]
+    try:
+        whole, other = (resolved(OmegaConf.create(merged(parts)), parts) for parts in (composed.parts, others))
+    except ConfigError:
+        return None
+    return other if whole.document == composed.document else None

@@ -1,0 +1,66 @@
+"""From a modes file to rule lists: rules are found, their parameters and their order checked, once.
+
+Rules of other packages are found by the entry point group `tod_runner.rules`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from runner.core import rules
+from runner.core.model import Mode, ModelError, exact, suggest
+from runner.core.rules import Rule, RuleCall
+
+
+def find_rule(name: str) -> Rule:
+    """The rule of that name, from here or from an entry point.
+
+    raises  ModelError with a suggestion
+    """
+    if name not in rules.RULES:
+        from importlib.metadata import entry_points
+
+        for entry in entry_points(group="tod_runner.rules", name=name):
+            entry.load()
+    if name not in rules.RULES:
+        raise ModelError("", repr(name), f"unknown rule, {suggest(name, rules.RULES)}")
+    return rules.RULES[name]
+
+
+def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
+    """A rule with its parameters checked against the rule's own signature.
+
+    Parameters are numbers >= 0, made exact, in the unit that their name ends in; `halve_every_s` and its like are > 0.
+    raises  ModelError
+    """
+    found = find_rule(name)
+    known = found.parameters
+    for key, value in parameters.items():
+        if key not in known:
+            hint = suggest(key, known) if known else f"{name} takes none"
+            raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter, {hint}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
+            raise ModelError(f"{name}.{key}", repr(value), "must be a number from 0")
+        if "_every_" in key and value == 0:
+            raise ModelError(f"{name}.{key}", value, "must be above 0")
+    for key, parameter in known.items():
+        if key not in parameters and parameter.default is inspect.Parameter.empty:
+            raise ModelError(f"{name}.{key}", "missing", "this rule needs it")
+    return RuleCall(found, {key: exact(value) for key, value in parameters.items()})
+
+
+def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:
+    """Problems of a rule list: a rule before what it needs, or a part of the decision that no rule gives."""
+    given: set[str] = set()
+    problems = []
+    for index, call in enumerate(calls):
+        for part in sorted(call.rule.needs - given):
+            rule_name = repr(call.rule.name)
+            problems.append(ModelError(f"{mode}[{index}]", rule_name, f"needs {part}, no rule before gives it"))
+        given |= call.rule.gives
+    missing = [part for part in rules.GIVEN if part not in given]
+    if missing:
+        problems.append(ModelError(f"{mode}", [c.rule.name for c in calls], f"no rule gives {', '.join(missing)}"))
+    return problems

@@ -1,0 +1,70 @@
+"""Bitrate demand and allocation (paper, section II-A). Exact: no bitrate on a bound is decided by float noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
+from math import lcm
+
+from runner.core.model import Kbps, Roi
+
+ZERO = Fraction(0)
+
+
+def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
+    """Bitrate that a camera asks for, in proportion to the pixels of its region of interest.
+
+        b_dem = p_set / p_full * b_full                                  (paper, Eq. 1)
+
+    b_full   kbit/s for the full image
+    roi      px, what the operator has set
+    full     px, the full image
+    returns  kbit/s; a camera that is off has p_set = 0, which the caller says by not asking
+    """
+    return Fraction(roi.pixels * b_full, full.pixels) if roi is not full and roi != full else b_full
+
+
+def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fraction]) -> dict[str, Kbps]:
+    """Share the total bitrate among the cameras in proportion to their demand.
+
+        b_alloc,i = b_dem,i / sum_j(b_dem,j) * b_pred                    (paper, Eq. 2)
+
+    and, with the explicit weights that the paper leaves to the reader,
+
+        b_alloc,i = min(b_dem,i, lambda * w_i * b_dem,i),   sum_i b_alloc,i = min(b_pred, sum_{w_i > 0} b_dem,i)
+
+    demands  kbit/s per camera, 0 for a camera that is off
+    total    kbit/s, predicted by pQoS or set by the operator
+    weights  >= 0 per camera; all 1 is the paper; 0 gives nothing
+    returns  kbit/s per camera, in the order of `demands`
+
+    The paper leaves two cases open. All cameras off: everyone gets 0. More than demanded: the surplus stays unused.
+    """
+    waiting = {name: own for name, own in demands.items() if own and weights[name]}
+    wanted = _sum(waiting.values())
+    if total >= wanted:
+        return {name: waiting.get(name, ZERO) for name in demands}
+    allocated = dict.fromkeys(demands, ZERO)
+    if _all_equal([weights[name] for name in waiting]):
+        share = total / wanted
+        return allocated | {name: own * share for name, own in waiting.items()}
+    left = total
+    # Heaviest first: once lambda does not fill a camera, it fills no lighter one, and the rest share what is left.
+    for name in sorted(waiting, key=weights.__getitem__, reverse=True):
+        share = left / sum(weights[other] * own for other, own in waiting.items())
+        if share * weights[name] < 1:
+            return allocated | {other: own * share * weights[other] for other, own in waiting.items()}
+        allocated[name] = waiting.pop(name)
+        left -= allocated[name]
+    return allocated
+
+
+def _sum(bitrates: Iterable[Kbps]) -> Kbps:
+    """Sum over a common denominator: bitrates are mostly whole, and adding fractions one by one is slow."""
+    terms = list(bitrates)
+    denominator = lcm(*(term.denominator for term in terms))
+    return Fraction(sum(term.numerator * (denominator // term.denominator) for term in terms), denominator)
+
+
+def _all_equal(weights: Sequence[Fraction]) -> bool:
+    return all(weight is weights[0] or weight == weights[0] for weight in weights)

@@ -1,0 +1,68 @@
+"""The difference between what is decided and what has been commanded, as commands to `apply`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from runner.core.decision import Decision, Setting
+from runner.core.model import Roi
+
+Size = tuple[int, int]
+KnobValue = bool | int | Roi | Size
+
+KNOBS = ("sending", "roi", "size", "bitrate")
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Turn one knob of one camera. All commands of a camera that come together act between the same two frames.
+
+    value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1
+    """
+
+    camera: str
+    knob: str
+    value: KnobValue
+
+    def to_json(self) -> dict[str, Any]:
+        value: Any = self.value
+        if isinstance(value, Roi):
+            value = {"x": value.x, "y": value.y, "width": value.width, "height": value.height}
+        elif isinstance(value, tuple):
+            value = {"width": value[0], "height": value[1]}
+        return {"camera": self.camera, "knob": self.knob, "value": value}
+
+
+Knobs = Mapping[str, KnobValue]  # value by knob, of one camera
+
+
+def wanted(setting: Setting) -> Knobs:
+    """Where a setting wants a camera's knobs. While nothing is sent the other knobs stay where they are."""
+    if not setting.sending:
+        return {"sending": False}
+    return {"sending": True, "roi": setting.roi, "size": (setting.width, setting.height), "bitrate": setting.kbps}
+
+
+def difference(decision: Decision, commanded: Mapping[str, Knobs]) -> list[Command]:
+    """Commands that take every camera from where its knobs were commanded to, to where the decision wants them."""
+    commands = []
+    for name, setting in decision.settings.items():
+        now = commanded.get(name, {})
+        for knob, value in wanted(setting).items():
+            held = now.get(knob)
+            # Most values are the very object that was commanded; comparing regions one by one is slow.
+            if held is not value and held != value:
+                commands.append(Command(name, knob, value))
+    return commands
+
+
+def after(commanded: Mapping[str, Knobs], commands: list[Command]) -> Mapping[str, Knobs]:
+    """Where the knobs are commanded to once these commands are given."""
+    if not commands:
+        return commanded
+    turned: dict[str, dict[str, KnobValue]] = {}
+    for command in commands:
+        turned.setdefault(command.camera, {})[command.knob] = command.value
+    return {**commanded, **{name: {**commanded.get(name, {}), **knobs} for name, knobs in turned.items()}}

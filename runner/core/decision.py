@@ -1,0 +1,80 @@
+"""What the rules decide: one `Setting` per camera, and the `Draft` that a mode's rules fill in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from runner.core.model import Kbps, Mode, Roi
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How one camera is to be sent.
+
+    sending        False: nothing is encoded (off, or allocated below 1 kbit/s), the stream stays connectable
+    demand         kbit/s, Eq. (1), 0 when off
+    kbps           whole kbit/s, rounded down; 0 while nothing is sent
+    given          the same, also while a rule stops all sending: what the camera resumes with
+    scaling        selected factor; None when off
+    width, height  px of the encoded picture, 0 when off
+    reason         why, for the operator; takes no part in comparison
+    """
+
+    on: bool
+    sending: bool
+    demand: Kbps
+    kbps: int
+    given: int
+    scaling: Fraction | None
+    roi: Roi
+    width: int
+    height: int
+    reason: str = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What is in force: the mode, its total before the cap at demand, and a setting for each camera."""
+
+    mode: Mode
+    total: Kbps
+    settings: Mapping[str, Setting]
+
+    def says_the_same(self, other: Decision) -> bool:
+        """Whether it is equal and for the same reasons."""
+        return self == other and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
+
+
+class Draft(NamedTuple):
+    """A decision in the making. A rule reads what earlier ones gave and returns a draft with its own part replaced.
+
+    total    kbit/s of all cameras
+    demand   kbit/s by camera, 0 when off
+    bitrate  exact kbit/s by camera
+    scaling  factor by camera that is on
+    sending  False stops all cameras, whatever their bitrate
+    notes    reasons that concern all cameras
+    reasons  reason by camera
+    """
+
+    total: Kbps | None = None
+    demand: Mapping[str, Kbps] = NOTHING
+    bitrate: Mapping[str, Kbps] = NOTHING
+    scaling: Mapping[str, Fraction] = NOTHING
+    sending: bool = True
+    notes: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = NOTHING
+
+    def but(self, **changes: Any) -> Draft:
+        """The draft with these parts replaced."""
+        return self._replace(**changes)
+
+    def noted(self, note: str, **changes: Any) -> Draft:
+        """The draft with these parts replaced and the reason for it."""
+        return self._replace(notes=(*self.notes, note), **changes)

@@ -1,0 +1,167 @@
+"""What can happen. One vocabulary for the control link, the drive log and `replay` (schemas/event.schema.json).
+
+`Event` objects are valid once built; `parse` turns JSON that the schema accepts into one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from typing import Any
+
+from runner.core.model import Kbps, Mode, Roi, exact, plain
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """Something that happened `t` seconds after the start of the run; `t` never falls."""
+
+    t: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeSelected(Event):
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BitratePredicted(Event):
+    """Prediction of the bitrate available for all cameras together, from pQoS.
+
+    kbps        the prediction
+    lower_kbps  what it will hardly fall below, where the source knows
+    valid_s     how long it may be used, where the source knows
+    """
+
+    kbps: Kbps
+    lower_kbps: Kbps | None = None
+    valid_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionReported(Event):
+    """WGS-84 position of the vehicle; heading in degrees clockwise from north."""
+
+    lat: float
+    lon: float
+    speed_mps: float | None = None
+    heading_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TotalSet(Event):
+    """The operator's total for mode collective."""
+
+    kbps: Kbps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSwitched(Event):
+    camera: str
+    on: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoiSet(Event):
+    camera: str
+    roi: Roi
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraConfigured(Event):
+    """The operator's bitrate and scaling factor of one camera, mode single; None keeps what is."""
+
+    camera: str
+    kbps: Kbps | None = None
+    scaling: Fraction | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeightsSet(Event):
+    weights: Mapping[str, Fraction]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkMeasured(Event):
+    """What arrived at the operator: kbit/s, share of packets lost, round trip and jitter."""
+
+    camera: str
+    kbps: Kbps
+    loss: float | None = None
+    rtt_ms: float | None = None
+    jitter_ms: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorConnected(Event):
+    pass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorDisconnected(Event):
+    pass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockAdvanced(Event):
+    """Nothing but time has passed; emitted every 100 ms while live, so that rules may wait without a clock."""
+
+
+EVENTS: dict[str, type[Event]] = {
+    "mode_selected": ModeSelected,
+    "bitrate_predicted": BitratePredicted,
+    "position_reported": PositionReported,
+    "total_set": TotalSet,
+    "camera_switched": CameraSwitched,
+    "roi_set": RoiSet,
+    "camera_configured": CameraConfigured,
+    "weights_set": WeightsSet,
+    "link_measured": LinkMeasured,
+    "operator_connected": OperatorConnected,
+    "operator_disconnected": OperatorDisconnected,
+    "clock_advanced": ClockAdvanced,
+}
+NAMES = {kind: name for name, kind in EVENTS.items()}
+
+_EXACT = ("kbps", "lower_kbps", "scaling")
+_ROI = ("x", "y", "width", "height")
+
+
+def parse(document: Mapping[str, Any]) -> Event:
+    """The event that a JSON object which satisfies the schema describes."""
+    values = dict(document)
+    kind = EVENTS[values.pop("event")]
+    for key in _EXACT:
+        if key in values:
+            values[key] = exact(values[key])
+    if kind is ModeSelected:
+        values["mode"] = Mode(values["mode"])
+    elif kind is RoiSet:
+        values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
+    elif kind is WeightsSet:
+        values["weights"] = {name: exact(weight) for name, weight in values["weights"].items()}
+    return kind(**values)
+
+
+def to_json(event: Event) -> dict[str, Any]:
+    """The JSON object that `parse` reads back as the same event; keys that are not known are left out."""
+    document: dict[str, Any] = {"t": event.t, "event": NAMES[type(event)]}
+    for name in (f.name for f in fields(event) if f.name != "t"):
+        value = getattr(event, name)
+        if value is None:
+            continue
+        if isinstance(value, Roi):
+            document |= {key: getattr(value, key) for key in _ROI}
+        elif isinstance(value, Mapping):
+            document[name] = {camera: plain(weight) for camera, weight in value.items()}
+        else:
+            document[name] = plain(value) if isinstance(value, Fraction) else value
+    return document
+
+
+def describe(event: Event) -> str:
+    """An event in a few words: its name and what it says."""
+    said = to_json(event)
+    words = (f"{key} {value}" for key, value in said.items() if key not in ("t", "event"))
+    return " ".join((said["event"], *words))

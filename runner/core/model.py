@@ -1,0 +1,375 @@
+"""What exists: cameras, their rate-quality models, pipeline graphs, the vehicle. Frozen, valid once built.
+
+Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), sizes are px, times are seconds.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+from difflib import get_close_matches
+from enum import StrEnum
+from fractions import Fraction
+from itertools import pairwise
+from typing import Any, Protocol
+
+Kbps = Fraction
+Value = bool | int | float | str  # what an element's property may hold in YAML
+
+PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
+SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
+
+
+class ModelError(ValueError):
+    """What was found at `key` (a path below the thing being built) and the rule that it breaks."""
+
+    def __init__(self, key: str, found: object, rule: str) -> None:
+        super().__init__(f"{key}: {found}: {rule}")
+        self.key, self.found, self.rule = key, found, rule
+
+
+def exact(number: float | str | Fraction) -> Fraction:
+    """The number a person wrote, without binary rounding: 0.1 is 1/10.
+
+    A float prints as the shortest decimal text that reads back as itself, which for up to 15 digits is what was typed.
+    """
+    if isinstance(number, int | Fraction):
+        return Fraction(number)
+    return Fraction(Decimal(str(number)))
+
+
+def plain(number: Fraction) -> int | float:
+    """The same number for JSON and for people: whole numbers without a decimal point."""
+    return number.numerator if number.denominator == 1 else float(number)
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
+    known = list(known)
+    near = get_close_matches(word, known, 1)
+    shown = [*known[:13], "..."] if len(known) > 13 else known
+    return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
+
+
+class RuleCall(Protocol):
+    """A rule with its parameters, as a mode lists it, see `runner.core.rules`.
+
+    reads  fields of the state whose change makes the mode decide again
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def reads(self) -> frozenset[str]: ...
+    def __call__(self, vehicle: Vehicle, state: Any, draft: Any, memory: Mapping[str, Any], /) -> Any: ...
+
+
+class Mode(StrEnum):
+    """Video rate control mode (paper, section II)."""
+
+    SINGLE = "single"
+    AUTOMATIC = "automatic"
+    COLLECTIVE = "collective"
+
+
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """Region of interest in px, counted from the top left of the camera's full (cropped) image."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+
+@dataclass(frozen=True, slots=True)
+class RateQualityModel:
+    """Scaling factor that looks best in each bitrate range (paper, Eq. 3 and Table I).
+
+    scaling  R factors in ]0, 1], rising
+    b_min    R lower bounds in kbit/s, rising from 0
+    b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
+    raises   ModelError
+
+    Made from them: `whole_b_min`, the bounds as integers where all are, else empty; `ranges`, each range B_r and its
+    factor as a person reads them: "range [300, 950) -> 0.25", "range [950, ...) -> 0.5".
+    """
+
+    scaling: tuple[Fraction, ...]
+    b_min: tuple[Kbps, ...]
+    b_full: Kbps
+    whole_b_min: tuple[int, ...] = field(init=False, repr=False)
+    ranges: tuple[str, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        bounds = [plain(b) for b in self.b_min]
+        factors = [plain(s) for s in self.scaling]
+        if not factors:
+            raise ModelError("scaling", factors, "must have at least one factor")
+        if len(factors) != len(bounds):
+            raise ModelError("b_min_kbps", bounds, f"must have {len(factors)} entries, one per scaling factor")
+        if any(a >= b for a, b in pairwise(factors)):
+            raise ModelError("scaling", factors, "must rise")
+        if factors[0] <= 0 or factors[-1] > 1:
+            raise ModelError("scaling", factors, "must lie in ]0, 1]")
+        if bounds[0] != 0 or any(a >= b for a, b in pairwise(bounds)):
+            raise ModelError("b_min_kbps", bounds, "must rise from 0")
+        if self.b_full <= self.b_min[-1]:
+            raise ModelError("b_full_kbps", plain(self.b_full), f"must be above the last b_min, {bounds[-1]}")
+        whole = tuple(bound for bound in bounds if isinstance(bound, int))
+        object.__setattr__(self, "whole_b_min", whole if len(whole) == len(bounds) else ())
+        ends = [*bounds[1:], "..."]
+        texts = (f"range [{a}, {b}) -> {s}" for a, b, s in zip(bounds, ends, factors, strict=True))
+        object.__setattr__(self, "ranges", tuple(texts))
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One GStreamer element of a graph. A property value may hold {placeholders}, filled per camera by `graph.py`."""
+
+    name: str
+    factory: str
+    properties: Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One property that a knob sets, and with what: kbps, bps, left, right, top, bottom, on, off or a caps template."""
+
+    element: str
+    property: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A camera's pipeline on both sides as the YAML states it.
+
+    transport  rtsp: a server on the vehicle, the operator's first element is its client;
+               pipeline: the vehicle's last element sends, the operator's first one receives
+    wire       what `print` puts in place of server and client, since gst-launch has neither (rtsp only)
+    settings   named numbers of the graph (mtu_bytes, jitter_buffer_ms, ...) that properties refer to as {name}
+    mutable    (element, property) that knobs set though GStreamer does not say that it may change while playing
+    verified   False: checked against its schema only, never run by this project's tests
+    """
+
+    transport: str
+    vehicle: tuple[Element, ...]
+    operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+    knobs: Mapping[str, tuple[Turn, ...]]
+    settings: Mapping[str, Value]
+    mutable: tuple[tuple[str, str], ...] = ()
+    verified: bool = True
+
+    def __post_init__(self) -> None:
+        names = [element.name for element in (*self.vehicle, *self.wire_vehicle)]
+        for side, elements in (("vehicle", self.vehicle), ("operator", self.operator)):
+            _check_unique(side, [element.name for element in elements])
+        if self.transport == "rtsp" and self.vehicle[-1].name != "pay0":
+            rule = "the last element must be named pay0, as the RTSP server asks"
+            raise ModelError("vehicle", repr(self.vehicle[-1].name), rule)
+        for knob, turns in self.knobs.items():
+            for index, turn in enumerate(turns):
+                if turn.element not in names:
+                    rule = f"no such element, {suggest(turn.element, names)}"
+                    raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
+        turned = {(turn.element, turn.property) for turns in self.knobs.values() for turn in turns}
+        for index, pair in enumerate(self.mutable):
+            if pair not in turned:
+                raise ModelError(f"mutable[{index}]", repr(".".join(pair)), "no knob sets this property")
+
+
+def _check_unique(key: str, names: list[str]) -> None:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise ModelError(f"{key}[{index}].name", repr(name), "is already the name of another element")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
+
+    settings  what the file itself gives for placeholders: clip, device, address
+    loop      start again at the end without a gap (a clip)
+    frozen_s  without a frame for so long, and for 10 frame intervals, the source is replaced while the camera plays;
+              None: it is not watched
+    render    name of the procedural drive that makes the clip, or ""
+    render_s  length of that drive, s
+    stand_in  elements that `print` shows where gst-launch cannot make the frames (born in Python, not rendered yet)
+    """
+
+    elements: tuple[Element, ...]
+    settings: Mapping[str, Value] = field(default_factory=dict)
+    loop: bool = False
+    frozen_s: float | None = None
+    render: str = ""
+    render_s: float = 0
+    stand_in: tuple[Element, ...] = ()
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Names of the placeholders in its elements."""
+        values = (value for element in self.elements for value in element.properties.values())
+        return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """How frames are kept without loss, as the YAML states it.
+
+    codec     its name, for people and for recording.json
+    of_raw    largest share of the raw frames' size that a file is planned to take
+    elements  from raw frames to a Matroska stream, may hold {placeholders}
+    """
+
+    codec: str
+    of_raw: float
+    elements: tuple[Element, ...]
+
+    def __post_init__(self) -> None:
+        _check_unique("elements", [element.name for element in self.elements])
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a camera sits on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
+
+    The origin is on the ground below the rear axle. Metres and degrees; yaw turns left,
+    pitch tips the view down, roll tips it clockwise.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Tile on the operator's page, counted from the top left."""
+
+    row: int
+    column: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A camera mounted in a vehicle.
+
+    width, height   px of the full image, after the crop of the native one
+    native          px size of what the source delivers, with the part that is kept; None: it is the full image
+    weight          explicit weight in the allocation, >= 0
+    mount           device, address, clip: what a placeholder of that name is filled with
+    """
+
+    name: str
+    width: int
+    height: int
+    fps: Fraction
+    rate_quality: RateQualityModel
+    graph: Graph
+    source: Source
+    weight: Fraction = Fraction(1)
+    native: tuple[int, int] | None = None
+    crop: Roi | None = None
+    mount: Mapping[str, Value] = field(default_factory=dict)
+    place: Place | None = None
+    pose: Pose | None = None
+    fov_deg: float = 90.0
+    lens: str = "pinhole"
+    full_roi: Roi = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "full_roi", Roi(0, 0, self.width, self.height))
+        if self.native and self.crop:
+            width, height = self.native
+            if self.crop.x + self.crop.width > width or self.crop.y + self.crop.height > height:
+                found = f"{self.crop.width}x{self.crop.height} at {self.crop.x},{self.crop.y}"
+                raise ModelError("native", found, f"must lie inside the native {width}x{height}")
+
+    @property
+    def source_size(self) -> tuple[int, int]:
+        return self.native or (self.width, self.height)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a server listens and where its clients find it."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class Media(Endpoint):
+    """The vehicle's RTSP server.
+
+    rtp_ports          first and last UDP port for RTP and RTCP; a camera takes two
+    session_timeout_s  a viewer that sends neither requests nor RTCP for so long is dropped
+    max_viewers        viewers of one camera outside the vehicle, at once
+    """
+
+    rtp_ports: tuple[int, int]
+    session_timeout_s: int
+    max_viewers: int
+
+    def __post_init__(self) -> None:
+        first, last = self.rtp_ports
+        if first >= last:
+            raise ModelError("rtp_ports", f"[{first}, {last}]", "must rise: the first and the last port")
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The operator's page, on 127.0.0.1.
+
+    late_ms  age of a picture when it is drawn, above which it is marked as late
+    """
+
+    serve: bool
+    port: int
+    late_ms: float
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return Endpoint("127.0.0.1", self.port)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vehicle:
+    """Everything the runner needs to know, valid once built.
+
+    modes      the rule list of each mode
+    pqos       the prediction source as the YAML states it, read by `pqos.py`
+    recording  how `record` keeps the frames of every camera
+    expires_s  age from which the vehicle drops a request, beyond the round trip
+    log_video  whether the log of a drive holds the video of every camera
+    """
+
+    name: str
+    cameras: Mapping[str, Camera]
+    mode: Mode
+    modes: Mapping[Mode, tuple[RuleCall, ...]]
+    media: Media
+    control: Endpoint
+    page: Page
+    pqos: Mapping[str, Any]
+    recording: Recording
+    expires_s: float
+    log_video: bool = False
+
+
+Progress = Callable[[str, float], None]  # what is being done, share done in [0, 1]

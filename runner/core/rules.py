@@ -1,0 +1,336 @@
+"""A mode is an ordered list of named rules; each takes the draft of a decision one step further.
+
+A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, made known by the
+decorator `rule`, which states what it needs from earlier rules, what it gives, and which fields of the state it reads.
+Memory is frozen and keyed by rule; only rules that need a past touch it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+from runner.core import allocation, scaling
+from runner.core.decision import Decision, Draft, Setting
+from runner.core.model import Kbps, Mode, Vehicle, exact, plain
+from runner.core.state import State
+from runner.errors import RunError
+
+Memory = Mapping[str, Any]
+Step = tuple[Draft, Memory]
+
+BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
+FACTOR_RULE = "must be a Fraction in ]0, 1]"
+GIVEN = ("total", "demand", "bitrate", "scaling")  # what the rules of a mode must have given at its end
+
+
+class RuleFailed(RunError):
+    """A rule raised an exception or gave a value that no camera can be sent with; the text names rule and value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A rule and what it states about itself.
+
+    needs  parts of the draft that earlier rules must have given
+    gives  parts of the draft that are there after it
+    reads  fields of the state whose change makes the mode decide again
+    """
+
+    name: str
+    function: Callable[..., Step]
+    needs: frozenset[str]
+    gives: frozenset[str]
+    reads: frozenset[str]
+
+    @property
+    def parameters(self) -> Mapping[str, inspect.Parameter]:
+        every = inspect.signature(self.function).parameters
+        return {name: p for name, p in every.items() if p.kind is inspect.Parameter.KEYWORD_ONLY}
+
+
+@dataclass(frozen=True, slots=True)
+class RuleCall:
+    """A rule with the parameters that a modes file gives it."""
+
+    rule: Rule
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.rule.name
+
+    @property
+    def reads(self) -> frozenset[str]:
+        return self.rule.reads
+
+    def __call__(self, vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+        return self.rule.function(vehicle, state, draft, memory, **self.parameters)
+
+
+RULES: dict[str, Rule] = {}
+
+
+EVERYTHING = frozenset(part.name for part in fields(State))
+
+
+def rule(
+    *, needs: Iterable[str] = (), gives: Iterable[str] = (), reads: Iterable[str] = EVERYTHING
+) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
+    """Make a function known as a rule under its own name.
+
+    reads  saves decisions that would come out the same: without it any change of the state makes the mode decide again
+    """
+
+    def register(function: Callable[..., Step]) -> Callable[..., Step]:
+        name = function.__name__
+        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), frozenset(reads))
+        return function
+
+    return register
+
+
+# --- the paper's rules ------------------------------------------------------------------------------------------------
+
+
+@rule(gives=["total"], reads=["prediction"])
+def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
+    """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one comes."""
+    return draft.but(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+
+
+@rule(gives=["total"], reads=["collective_total"])
+def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
+    """Mode C: the total is the operator's; `start_kbps` where a run starts in C and none was set yet."""
+    return draft.but(total=start_kbps if state.collective_total is None else state.collective_total), memory
+
+
+@rule(gives=["total"], reads=[])
+def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
+    """The total is what the file says, whatever is predicted: for comparison."""
+    return draft.but(total=kbps), memory
+
+
+@rule(gives=["demand"], reads=["on", "rois"])
+def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI."""
+    demands = {
+        name: allocation.demand(camera.rate_quality.b_full, state.rois[name], camera.full_roi)
+        if state.on[name]
+        else allocation.ZERO
+        for name, camera in vehicle.cameras.items()
+    }
+    return draft.but(demand=demands), memory
+
+
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
+def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
+    assert draft.total is not None
+    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+
+
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
+def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Each camera that is on gets the same, times its weight, and nobody more than the demand: for comparison."""
+    assert draft.total is not None
+    # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
+    wanted = {name: demand for name, demand in draft.demand.items() if demand}
+    weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
+    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
+
+
+@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
+def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (4): the factor whose bitrate range the allocation, seen as for the full image, falls into."""
+    factors, reasons = {}, {}
+    for name, camera in vehicle.cameras.items():
+        if not state.on[name]:
+            continue
+        allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
+        kbps, bitrate = _whole(allocated), scaling.as_full_image(allocated, roi, full)
+        # What cannot be sent is not a picture to look at: however few its pixels, the smallest factor.
+        factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
+        seen = "" if not kbps or roi is full or roi == full else f", as {_whole(bitrate)} for the full image"
+        reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
+    return draft.but(scaling=factors, reasons=reasons), memory
+
+
+@rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
+def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Mode S: each camera is sent as the operator has set it; the total is what that comes to."""
+    on = [name for name in vehicle.cameras if state.on[name]]
+    bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
+    factors = {name: state.manual[name].scaling for name in on}
+    reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
+    total = sum(bitrates.values(), allocation.ZERO)
+    return draft.but(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+
+
+# --- answers to inputs that are stale or lost: modes=safe -------------------------------------------------------------
+
+
+@rule(needs=["total"], gives=["total"], reads=["prediction"])
+def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """The total is at most what the prediction says the bitrate will hardly fall below, where it says so."""
+    lower = None if state.prediction is None else state.prediction.lower_kbps
+    assert draft.total is not None
+    if lower is None or lower >= draft.total:
+        return draft, memory
+    note = f"total {_short(draft.total)} -> {_short(lower)}: lower bound of the prediction"
+    return draft.noted(note, total=lower), memory
+
+
+@rule(needs=["total"], gives=["total"], reads=["prediction", "t"])
+def fade_when_stale(
+    vehicle: Vehicle,
+    state: State,
+    draft: Draft,
+    memory: Memory,
+    *,
+    after_s: Fraction,
+    halve_every_s: Fraction,
+    floor_kbps: Kbps,
+) -> Step:
+    """A prediction that is too old is trusted less and less.
+
+    Older than its own `valid_s`, else than `after_s`, the total is halved, and again every `halve_every_s`, down to
+    `floor_kbps`; never above the prediction. Where none has come yet, the age counts from the start of the run.
+    """
+    made = state.prediction
+    limit = after_s if made is None or made.valid_s is None else exact(made.valid_s)
+    age = exact(state.t) - (exact(made.t) if made else 0)
+    assert draft.total is not None
+    if age <= limit:
+        return draft, memory
+    halvings = int((age - limit) / halve_every_s) + 1
+    # 64 halvings are below any floor; more would only make the numbers long.
+    total = max(draft.total / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
+    why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
+    note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
+    return draft.noted(note, total=total), memory
+
+
+@rule(reads=["operator_lost", "t"])
+def pause_without_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, after_s: Fraction) -> Step:
+    """Nothing is sent while the operator's side has been gone for longer than `after_s`; it resumes with its return."""
+    lost = state.operator_lost
+    if lost is None or state.t - lost <= after_s:
+        return draft, memory
+    return draft.noted(f"not sending: operator gone for {state.t - lost:.1f} s", sending=False), memory
+
+
+# --- calmer pictures: modes=steady ------------------------------------------------------------------------------------
+
+
+@rule(needs=["scaling"], gives=["scaling"], reads=["t"])
+def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
+    """A greater factor is taken only after it has been called for without a break for `for_s`; a smaller one at once.
+
+    Memory: by camera, the factor in force and since when a greater one is called for (None: it is not).
+    """
+    past: Mapping[str, tuple[Fraction, float | None]] = memory.get("hold_upscaling", {})
+    now: dict[str, tuple[Fraction, float | None]] = {}
+    factors, reasons = dict(draft.scaling), dict(draft.reasons)
+    for name, called_for in draft.scaling.items():
+        held, since = past.get(name, (called_for, None))
+        if called_for is held or called_for <= held:
+            now[name] = (called_for, None)
+            continue
+        since = state.t if since is None else since
+        if state.t - since >= for_s:
+            now[name] = (called_for, None)
+        else:
+            now[name] = (held, since)
+            factors[name] = held
+            reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
+    return draft.but(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
+
+
+# --- running a list ---------------------------------------------------------------------------------------------------
+
+
+def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Memory]:
+    """Pure heart of the runner: run the rules of the mode in force, in order.
+
+    raises  RuleFailed, since rules may be the user's own
+    """
+    draft = Draft()
+    for call in vehicle.modes[state.mode]:
+        before = draft
+        try:
+            draft, memory = call(vehicle, state, draft, memory)
+        except (Exception, SystemExit) as error:
+            raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
+        if problem := _draft_problem(state, before, draft):
+            raise RuleFailed(f"rule {call.name} failed: {problem}")
+    assert draft.total is not None
+    return Decision(state.mode, draft.total, {name: _setting(state, draft, name) for name in vehicle.cameras}), memory
+
+
+def _draft_problem(state: State, before: Draft, draft: Any) -> str:
+    """Why the cameras cannot be sent with what a rule has changed in the draft, or ""."""
+    if not isinstance(draft, Draft):
+        return "it must return a Draft and the memory"
+    if draft.total is not before.total and not _is_bitrate(draft.total):
+        return f"total {draft.total!r}: {BITRATE_RULE}"
+    for part, fits, rule in PARTS:
+        values = getattr(draft, part)
+        if values is getattr(before, part):
+            continue
+        if not isinstance(values, Mapping):
+            return f"{part} {values!r}: must be a mapping by camera"
+        for name, on in state.on.items():
+            if on and not fits(values.get(name)):
+                return f"{part} of {name} {values.get(name)!r}: {rule}"
+    return ""
+
+
+def _is_bitrate(value: Any) -> bool:
+    """A float is refused even where it is whole: a bitrate on a bound must never be decided by rounding noise."""
+    return type(value) in (Fraction, int) and value.numerator >= 0  # comparing fractions is slow
+
+
+def _is_factor(value: Any) -> bool:
+    return type(value) is Fraction and 0 < value.numerator <= value.denominator
+
+
+# Parts of a draft by camera, what their values must be, and that in words.
+PARTS = (
+    ("demand", _is_bitrate, BITRATE_RULE),
+    ("bitrate", _is_bitrate, BITRATE_RULE),
+    ("scaling", _is_factor, FACTOR_RULE),
+)
+
+
+@cache
+def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
+    """Fields of the state whose change makes the mode decide again."""
+    return frozenset({"mode", "on", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
+
+
+def _setting(state: State, draft: Draft, name: str) -> Setting:
+    roi = state.rois[name]
+    if not state.on[name]:
+        return Setting(False, False, allocation.ZERO, 0, 0, None, roi, 0, 0, "switched off")
+    kbps, factor = _whole(draft.bitrate[name]), draft.scaling[name]
+    sending = draft.sending and kbps >= 1
+    width, height = scaling.output_size(roi, factor)
+    reason = draft.reasons.get(name, "")
+    if draft.sending and not sending:
+        reason += ", below 1 kbit/s: not sending"
+    reason = "; ".join((reason, *draft.notes))
+    return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
+
+
+def _whole(bitrate: Kbps) -> int:
+    """A bitrate rounded down."""
+    return bitrate.numerator // bitrate.denominator
+
+
+def _short(bitrate: Kbps) -> int | str:
+    return bitrate.numerator if bitrate.denominator == 1 else f"{float(bitrate):.1f}"

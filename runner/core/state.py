@@ -1,0 +1,161 @@
+"""What we know, and how an event changes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, assert_never
+
+from runner.core import events as ev
+from runner.core.decision import Decision
+from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain, suggest
+
+
+class Refused(Exception):
+    """A well-formed event that cannot be accepted now; the text says why and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Manual:
+    """A camera's bitrate (kbit/s) and factor in mode single."""
+
+    kbps: int
+    scaling: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Inputs of the rules. What no event has told yet is None.
+
+    t                 seconds, time of the last event
+    manual            by camera: what mode single sends, or what a camera that is off sent last
+    prediction        the last one, in whatever mode it came
+    total_set         kbit/s, the operator's last total
+    collective_total  kbit/s, total that mode collective runs at
+    operator_lost     t at which the operator's side went away
+    """
+
+    mode: Mode
+    on: Mapping[str, bool]
+    rois: Mapping[str, Roi]
+    weights: Mapping[str, Fraction]
+    manual: Mapping[str, Manual]
+    t: float = 0.0
+    prediction: ev.BitratePredicted | None = None
+    total_set: Kbps | None = None
+    collective_total: Kbps | None = None
+    operator_lost: float | None = None
+    links: Mapping[str, ev.LinkMeasured] | None = None
+
+    @staticmethod
+    def initial(vehicle: Vehicle, mode: Mode) -> State:
+        """Every camera on, with its full image as ROI."""
+        cameras = vehicle.cameras
+        return State(
+            mode=mode,
+            on=dict.fromkeys(cameras, True),
+            rois={name: camera.full_roi for name, camera in cameras.items()},
+            weights={name: camera.weight for name, camera in cameras.items()},
+            manual={},
+        )
+
+
+def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
+    """The state after an event.
+
+    in_force  the decision that is applied when the event comes: entering S or C starts from it
+    raises    Refused
+    """
+    return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
+
+
+def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> dict[str, Any]:  # noqa: PLR0911, PLR0912
+    """What an event changes in the state, by field."""
+    match event:
+        case ev.BitratePredicted():
+            return {"prediction": event}
+        case ev.ModeSelected(mode=mode):
+            return _enter(state, mode, in_force)
+        case ev.TotalSet(kbps=kbps):
+            _only_in(Mode.COLLECTIVE, state, event)
+            return {"total_set": kbps, "collective_total": kbps}
+        case ev.CameraSwitched(camera=name, on=on):
+            _known(vehicle, name)
+            # Switched on again in S, a camera gets its last values.
+            manual = state.manual if on else {**state.manual, **keep(in_force, name)}
+            return {"on": {**state.on, name: on}, "manual": manual}
+        case ev.RoiSet(camera=name, roi=roi):
+            _only_in(Mode.SINGLE, state, event)
+            _check_roi(_known(vehicle, name), roi)
+            return {"rois": {**state.rois, name: roi}}
+        case ev.CameraConfigured(camera=name):
+            _only_in(Mode.SINGLE, state, event)
+            configured = _configured(_known(vehicle, name), state.manual[name], event)
+            return {"manual": {**state.manual, name: configured}}
+        case ev.WeightsSet(weights=weights):
+            for name in weights:
+                _known(vehicle, name)
+            return {"weights": {**state.weights, **weights}}
+        case ev.LinkMeasured(camera=name):
+            _known(vehicle, name)
+            return {"links": {**(state.links or {}), name: event}}
+        case ev.OperatorConnected():
+            return {"operator_lost": None}
+        case ev.OperatorDisconnected():
+            return {} if state.operator_lost is not None else {"operator_lost": event.t}
+        case ev.PositionReported() | ev.ClockAdvanced():
+            return {}
+        case _:
+            assert_never(event)  # type: ignore[arg-type]
+
+
+def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
+    """What the cameras that are on send now, or would if an operator watched, as settings of mode single."""
+    settings = ((name, in_force.settings[name]) for name in names or in_force.settings)
+    return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
+
+
+def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
+    """Change the mode without a jump: S keeps what is sent, C keeps the total unless the operator has set one."""
+    if mode is state.mode:
+        return {}
+    match mode:
+        case Mode.SINGLE:
+            return {"mode": mode, "manual": {**state.manual, **keep(in_force)}}
+        case Mode.COLLECTIVE:
+            total = in_force.total if state.total_set is None else state.total_set
+            return {"mode": mode, "collective_total": total}
+        case Mode.AUTOMATIC:
+            return {"mode": mode}
+
+
+def _known(vehicle: Vehicle, name: str) -> Camera:
+    if name in vehicle.cameras:
+        return vehicle.cameras[name]
+    raise Refused(f"unknown camera {name!r}, {suggest(name, vehicle.cameras)}")
+
+
+def _only_in(mode: Mode, state: State, event: ev.Event) -> None:
+    if state.mode is not mode:
+        raise Refused(f"{ev.NAMES[type(event)]} is accepted in mode {mode} only, the mode is {state.mode}")
+
+
+def _check_roi(camera: Camera, roi: Roi) -> None:
+    found = f"{roi.width}x{roi.height} at {roi.x},{roi.y}"
+    if min(roi.width, roi.height) < SMALLEST_SIDE_PX:
+        raise Refused(f"ROI {found} is smaller than {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}")
+    if roi.x + roi.width > camera.width or roi.y + roi.height > camera.height:
+        raise Refused(f"ROI {found} leaves the {camera.width}x{camera.height} image of {camera.name}")
+
+
+def _configured(camera: Camera, now: Manual, event: ev.CameraConfigured) -> Manual:
+    b_full = camera.rate_quality.b_full
+    if event.kbps is not None and not 1 <= event.kbps <= b_full:
+        raise Refused(f"{plain(event.kbps)} kbit/s for {camera.name} is outside 1 to {plain(b_full)}, its b_full")
+    if event.scaling is not None and not 0 < event.scaling <= 1:
+        raise Refused(f"scaling {plain(event.scaling)} for {camera.name} is outside ]0, 1]")
+    return Manual(
+        kbps=now.kbps if event.kbps is None else int(event.kbps),
+        scaling=now.scaling if event.scaling is None else event.scaling,
+    )

@@ -1,0 +1,82 @@
+"""One event further: the pure step that live runs, dry runs, replay and simulation share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from runner.core import rules
+from runner.core.commands import Command, Knobs, after, difference
+from runner.core.decision import Decision
+from runner.core.events import Event
+from runner.core.model import Mode, Vehicle
+from runner.core.rules import Memory
+from runner.core.state import Refused, State, advance, keep
+
+NOTHING: Mapping[str, Knobs] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Where a run stands after an event.
+
+    commanded  by camera and knob, what has been commanded so far
+    commands   what this event made of it: the difference
+    refused    why the event was not accepted, or ""
+    fault      why the rules could not decide, so that an earlier decision stays in force, or ""
+    """
+
+    state: State
+    memory: Memory
+    decision: Decision
+    commanded: Mapping[str, Knobs] = field(default_factory=lambda: NOTHING)
+    commands: tuple[Command, ...] = ()
+    refused: str = ""
+    fault: str = ""
+
+
+def start(vehicle: Vehicle) -> Run:
+    """A run before its first event: decided, nothing commanded yet.
+
+    A run that starts in mode S takes what A would decide.
+
+    raises  RuleFailed
+    """
+    state = State.initial(vehicle, vehicle.mode)
+    if vehicle.mode is Mode.SINGLE:
+        automatic, _ = rules.decide(vehicle, replace(state, mode=Mode.AUTOMATIC), {})
+        state = replace(state, manual=keep(automatic))
+    decision, memory = rules.decide(vehicle, state, {})
+    return Run(state, memory, decision)
+
+
+def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
+    """Take one event: advance the state, decide if an input of the rules changed, command the difference.
+
+    Where a rule fails, the last decision stays in force and `fault` says why. A mode whose rules fail is not entered.
+    """
+    refused, fault = "", run.fault
+    state, memory, decision = run.state, run.memory, run.decision
+    try:
+        state = advance(vehicle, run.state, event, run.decision)
+    except Refused as reason:
+        refused = str(reason)
+        state = replace(run.state, t=event.t)
+    inputs = rules.reads(vehicle, state.mode)
+    if any(_differ(getattr(state, name), getattr(run.state, name)) for name in inputs):
+        try:
+            decision, memory = rules.decide(vehicle, state, run.memory)
+            fault = ""
+        except rules.RuleFailed as failed:
+            if state.mode is run.state.mode:
+                fault = str(failed)
+            else:
+                refused = f"mode {state.mode}: {failed}"
+                state = replace(run.state, t=event.t)
+    commands = difference(decision, run.commanded)
+    return Run(state, memory, decision, after(run.commanded, commands), tuple(commands), refused, fault)
+
+
+def _differ(now: object, before: object) -> bool:
+    return now is not before and now != before  # most fields are the very same object

@@ -1,0 +1,56 @@
+"""State changes that may never return, kept away from the thread that serves all cameras."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from gi.repository import Gst
+
+HUNG_S = 5.0  # a state change that takes longer hangs
+HUNG = f"has not stopped within {HUNG_S:g} s, and is left alone"
+
+_workers: set[threading.Thread] = set()
+_lock = threading.Lock()
+
+
+def set_state_aside(
+    element: Gst.Element,
+    state: Gst.State,
+    on_hung: Callable[[], None] = lambda: None,
+    after: threading.Thread | None = None,
+) -> threading.Thread:
+    """Change an element's state in a thread of its own, which ends with the change.
+
+    Network elements can lock up in it. Nothing ends such a thread, so that it is left alone.
+
+    on_hung  called once, from another thread, when the change has taken HUNG_S
+    after    an earlier change of this element, which has to be over first
+    """
+    watchdog = threading.Timer(HUNG_S, on_hung)
+    watchdog.daemon = True
+
+    def work() -> None:
+        if after:
+            after.join()
+        element.set_state(state)
+        watchdog.cancel()
+        with _lock:
+            _workers.discard(worker)
+
+    worker = threading.Thread(target=work, name=f"to {state.value_nick}", daemon=True)
+    watchdog.start()
+    with _lock:
+        worker.start()
+        _workers.add(worker)
+    return worker
+
+
+def settle(limit_s: float) -> None:
+    """Wait for all changes under way, but no longer than a limit."""
+    until = time.monotonic() + limit_s
+    with _lock:
+        workers = list(_workers)
+    for worker in workers:
+        worker.join(max(0.0, until - time.monotonic()))

@@ -1,0 +1,73 @@
+"""What is said of a camera that fails again and again: each reason once, and at the end how long it took."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from gi.repository import GLib
+
+GATHER_MS = 300
+
+
+class Outage:
+    """The present outage of one camera. Times are s by the monotonic clock.
+
+    report  told a sentence for each new reason, and one at the end
+    """
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
+        self._reasons: list[str] = []
+        self._began = 0.0
+
+    @property
+    def reason(self) -> str:
+        """Why it began; "" while there is none."""
+        return self._reasons[0] if self._reasons else ""
+
+    def failed(self, why: str, since: float) -> None:
+        """Another failure.
+
+        since  when the camera last worked; counts for the first failure
+        """
+        if not self._reasons:
+            self._began = since
+        if why not in self._reasons:
+            self._reasons.append(why)
+            self._report(why)
+
+    def over(self, now: float) -> None:
+        """The camera works."""
+        if self._reasons:
+            self._report(f"works again after {now - self._began:.0f} s")
+        self._reasons.clear()
+
+
+class Gathered:
+    """Reports of several cameras that say the same at about the same time, made one: `front, rear: no frame for 2 s`.
+
+    report  told, from GLib's thread: cameras, what happened to them
+    """
+
+    def __init__(self, report: Callable[[str, str], None]) -> None:
+        self._report = report
+        self._lock = threading.Lock()
+        self._cameras: dict[str, list[str]] = {}  # by what is said
+
+    def __call__(self, camera: str, what: str) -> None:
+        """From any thread."""
+        with self._lock:
+            first = not self._cameras
+            cameras = self._cameras.setdefault(what, [])
+            if camera not in cameras:
+                cameras.append(camera)
+        if first:
+            GLib.timeout_add(GATHER_MS, self.flush)
+
+    def flush(self) -> bool:
+        with self._lock:
+            gathered, self._cameras = self._cameras, {}
+        for what, cameras in gathered.items():
+            self._report(", ".join(cameras), what)
+        return False

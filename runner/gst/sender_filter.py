@@ -1,0 +1,132 @@
+"""UDP sockets that take packets from one sender only: a filter in the kernel, which also counts what it drops.
+
+An RTSP client binds its RTP and RTCP sockets to all addresses, so that anybody who reaches the machine could mix in
+packets of his own. No Python runs per packet.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ipaddress
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+SO_ATTACH_FILTER, SO_MEMINFO = 26, 55  # asm-generic/socket.h
+WAITING = 100_000  # packets that a socket may hold before it has its filter; more than any buffer
+MEMINFO_QUEUED, MEMINFO_BUFFER, MEMINFO_DROPS, MEMINFO_VALUES = 0, 1, 8, 9  # linux/sock_diag.h
+PROMPT_S = 0.5  # a client's buffer holds more than what comes in this time
+# Classic BPF (linux/filter.h, bpf_common.h). Loads from NET on begin at the IP header.
+LOAD_BYTE, LOAD_WORD, SHIFT_RIGHT, JUMP_EQUAL, JUMP, RETURN = 0x30, 0x20, 0x74, 0x15, 0x05, 0x06
+NET = 0xFFF00000
+IPV4_SOURCE, IPV6_SOURCE = NET + 12, NET + 8
+Instruction = tuple[int, int, int, int]  # code, jump if true, jump if false, operand
+
+
+class SenderFilter:
+    """The filter on all sockets of one client, for as long as it lives.
+
+    host    the only sender, name or address
+    raises  OSError where the name is unknown
+    """
+
+    def __init__(self, host: str) -> None:
+        found = {str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(host, None)}
+        self._program = program(sorted(map(ipaddress.ip_address, found), key=str))
+        self._sockets: dict[int, socket.socket] = {}  # by inode: copies, which outlive an element's own
+        self._dropped = self._seen = 0
+        self._overflows, self._looked = _overflows(), time.monotonic()
+
+    def attach(self, descriptor: int) -> None:
+        """Filter a bound socket; what waits in it from before is thrown away.
+
+        raises  OSError where the system has no such filter
+        """
+        inode = os.fstat(descriptor).st_ino
+        if inode in self._sockets:
+            return
+        taken = socket.socket(fileno=os.dup(descriptor))
+        self._sockets[inode] = taken
+        _attach(taken, self._program)
+        for _ in range(WAITING):
+            if not _waiting(taken):
+                break
+
+    def dropped(self) -> int:
+        """Packets dropped so far that came from elsewhere; to be called a few times a second.
+
+        The kernel counts packets that find a socket's buffer full with them. Where that may have happened, as after a
+        process that stood still, all that overflowed on this machine meanwhile is taken off.
+        """
+        looked, overflows = time.monotonic(), _overflows()
+        infos = [_memory_info(taken) for taken in list(self._sockets.values())]
+        seen = sum(info[MEMINFO_DROPS] for info in infos)
+        full = any(2 * info[MEMINFO_QUEUED] > info[MEMINFO_BUFFER] for info in infos)
+        other = overflows - self._overflows if full or looked - self._looked > PROMPT_S else 0
+        self._dropped += max(0, seen - self._seen - other)
+        self._seen, self._overflows, self._looked = seen, overflows, looked
+        return self._dropped
+
+    def close(self) -> None:
+        """Give up the copies, at the client's end; the count stays."""
+        self.dropped()
+        for taken in self._sockets.values():
+            taken.close()
+        self._sockets.clear()
+        self._seen = 0
+
+
+def program(senders: Iterable[Address]) -> list[Instruction]:
+    """A filter that takes packets of these senders, over IPv4 and IPv6, and drops all others."""
+    senders = list(senders)
+    four = [step for sender in senders if sender.version == 4 for step in _takes(sender, IPV4_SOURCE)]
+    six = [step for sender in senders if sender.version == 6 for step in _takes(sender, IPV6_SOURCE)]
+    drop = (RETURN, 0, 0, 0)
+    version = [(LOAD_BYTE, 0, 0, NET), (SHIFT_RIGHT, 0, 0, 4), (JUMP_EQUAL, 1, 0, 4), (JUMP, 0, 0, len(four) + 1)]
+    return [*version, *four, drop, (JUMP_EQUAL, 1, 0, 6), drop, *six, drop]
+
+
+def _takes(sender: Address, offset: int) -> list[Instruction]:
+    """Take a packet whose source is this address, else go on behind."""
+    words = struct.unpack(f">{len(sender.packed) // 4}I", sender.packed)
+    steps: list[Instruction] = []
+    for index, word in enumerate(words):
+        behind = 2 * (len(words) - index - 1) + 1
+        steps += [(LOAD_WORD, 0, 0, offset + 4 * index), (JUMP_EQUAL, 0, behind, word)]
+    return [*steps, (RETURN, 0, 0, 0xFFFFFFFF)]
+
+
+def _attach(taken: socket.socket, steps: Sequence[Instruction]) -> None:
+    code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
+    taken.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, struct.pack("HP", len(steps), ctypes.addressof(code)))
+
+
+def _waiting(taken: socket.socket) -> bool:
+    """Take one packet out of a socket, if there is one."""
+    try:
+        taken.recv(1, socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _memory_info(taken: socket.socket) -> tuple[int, ...]:
+    return struct.unpack(f"{MEMINFO_VALUES}I", taken.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * MEMINFO_VALUES))
+
+
+def _overflows() -> int:
+    """UDP packets that found a full buffer on this machine so far, over IPv4 and IPv6."""
+    names, values = (
+        line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")
+    )
+    six = dict(line.split() for line in Path("/proc/net/snmp6").read_text().splitlines()) if _has_six() else {}
+    return int(dict(zip(names, values, strict=True))["RcvbufErrors"]) + int(six.get("Udp6RcvbufErrors", 0))
+
+
+def _has_six() -> bool:
+    return Path("/proc/net/snmp6").exists()

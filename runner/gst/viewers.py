@@ -1,0 +1,67 @@
+"""Who may watch a camera over the uplink: each copy of its stream that leaves the vehicle costs the same bitrate again.
+
+A viewer on the vehicle itself (loopback) costs no uplink; it is always let in and never counted. The controller, the
+operator in control, is always let in. RTSP carries no operator of its own, so an operator's RTSP client states it as
+its User-Agent (RFC 2326, 12.41), which survives address translation and tells operators on one machine apart. It is a
+name and no proof; nothing on either link is authenticated yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from ipaddress import IPv6Address, ip_address
+from typing import NamedTuple
+
+_PRODUCT = "tod-runner/"
+
+
+class Viewer(NamedTuple):
+    """One viewer of one camera.
+
+    address   IP address that its requests come from
+    operator  id of the operator that it belongs to, "" where it states none
+    since     monotonic time at which it connected, s; tells viewers from one address apart
+    """
+
+    address: str
+    operator: str = ""
+    since: float = 0.0
+
+
+def user_agent(operator: str) -> str:
+    """What an operator's RTSP client states as its User-Agent."""
+    return f"{_PRODUCT}{operator}"
+
+
+def operator_of(agent: str | None) -> str:
+    """The operator that a User-Agent states, or ""."""
+    return agent.removeprefix(_PRODUCT) if agent and agent.startswith(_PRODUCT) else ""
+
+
+def over_uplink(address: str) -> bool:
+    """Whether what is sent to an IP address leaves this machine; an address of its own other than loopback counts."""
+    ip = ip_address(address.partition("%")[0])
+    mapped = ip.ipv4_mapped if isinstance(ip, IPv6Address) else None
+    return not (mapped or ip).is_loopback
+
+
+def admit(viewers: Sequence[Viewer], newcomer: Viewer, limit: int, controller: str) -> list[Viewer] | None:
+    """Which viewers of a camera have to leave for a newcomer, or None where the newcomer is refused.
+
+    viewers     of this camera, in the order in which they came
+    limit       viewers over the uplink at once, at least 1
+    controller  id of the operator in control, "" for none
+    returns     for the controller the newest of the others, and where all are the controller's own, the oldest: it is
+                what an operator leaves behind whose address changed
+    """
+    if not over_uplink(newcomer.address):
+        return []
+    counted = [viewer for viewer in viewers if over_uplink(viewer.address)]
+    excess = len(counted) + 1 - limit
+    if excess <= 0:
+        return []
+    if not controller or newcomer.operator != controller:
+        return None
+    others = [viewer for viewer in reversed(counted) if viewer.operator != controller]
+    own = [viewer for viewer in counted if viewer.operator == controller]
+    return (others + own)[:excess]

@@ -1,0 +1,177 @@
+"""A camera's source that is watched: where it freezes or fails, it is replaced while all that follows it goes on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from gi.repository import GLib, Gst
+
+from runner.graph import Plan, launch
+from runner.gst.aside import HUNG, set_state_aside
+from runner.gst.outage import Outage
+from runner.gst.source import fixed_rate
+
+CHECK_MS = 100
+FIRST_FRAME_S = 10.0  # a camera may offer UDP in vain for 5 s, and keep back its first key frame
+BACKOFF_S = (1.0, 10.0)  # between the beginnings of two attempts: doubled from the first to the second
+
+
+class WatchedSource(Gst.Bin):  # type: ignore[misc]
+    """Stands in the place of a source's elements and holds them as its child.
+
+    A source without a frame for `Plan.frozen_s` while the pipeline plays, or that fails or ends, is taken out and built
+    anew. What follows sees a pause: clock and running time go on, while the source's errors, its end and its
+    asynchronous state changes stay in here. The frames are counted in C in front of the gate, so that a camera which is
+    paused or off counts as fine.
+
+    Until the first frame nothing is replaced: errors fail the whole pipeline, and who asked for it is told.
+
+    report  told what happened
+    """
+
+    def __init__(self, plan: Plan, report: Callable[[str], None]) -> None:
+        super().__init__(name="watched-source")
+        assert plan.frozen_s is not None
+        self._frozen_s = plan.frozen_s
+        self._launch, self._last = launch(plan.source), plan.source[-1].name
+        self._report = report
+        self.outage = Outage(report)
+        self._counter = Gst.ElementFactory.make("identity", "source-frames")
+        self.add(self._counter)
+        self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
+        self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, self._on_event)
+        self._lock = threading.Lock()  # of the child: the server's threads start and stop, GLib's one replaces
+        self._child: Gst.Bin | None = None
+        self._timer = 0
+        self._failed = ""  # what the source itself said, from its threads
+        self._moved = (0, 0.0)  # frames at the last change of the counter, and when
+        self._attempts = 0  # of this outage
+        self._tried = (0, 0.0)  # frames when the last one began, and when
+
+    def take_place(self, pipeline: Gst.Bin, plan: Plan) -> None:
+        """Replace the plain elements of the source in a pipeline that was just built."""
+        for element in plan.source:
+            pipeline.remove(pipeline.get_by_name(element.name))
+        pipeline.add(self)
+        self.link(pipeline.get_by_name(plan.vehicle[0].name))
+
+    # --- called by GStreamer ------------------------------------------------------------------------------------------
+
+    def do_change_state(self, transition: Gst.StateChange) -> Gst.StateChangeReturn:
+        if transition == Gst.StateChange.READY_TO_PAUSED:
+            with self._lock:
+                self._fill()
+            self._moved = (self._frames(), time.monotonic())
+            self._timer = GLib.timeout_add(CHECK_MS, self._watch)
+        elif transition == Gst.StateChange.PAUSED_TO_READY:
+            with self._lock:
+                GLib.source_remove(self._timer)
+                self._timer = 0
+                self._empty()
+                self.outage, self._attempts = Outage(self._report), 0
+        return Gst.Bin.do_change_state(self, transition)
+
+    def do_handle_message(self, message: Gst.Message) -> None:
+        if self._frames():
+            if message.type == Gst.MessageType.ERROR:
+                self._failed = message.parse_error()[0].message
+                return
+            if message.type in (Gst.MessageType.ASYNC_START, Gst.MessageType.ASYNC_DONE):
+                return
+        Gst.Bin.do_handle_message(self, message)
+
+    def _on_event(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        if info.get_event().type == Gst.EventType.EOS and self._frames():
+            self._failed = "the stream ended"
+            return Gst.PadProbeReturn.DROP
+        return Gst.PadProbeReturn.OK
+
+    # --- in GLib's thread ---------------------------------------------------------------------------------------------
+
+    def _watch(self) -> bool:
+        now, frames = time.monotonic(), self._frames()
+        if frames != self._moved[0] or not self._plays():
+            self._moved, self._failed = (frames, now), ""  # an error that stops no frame is not the picture's
+        if not frames:
+            return True
+        if not self._attempts:
+            self._look(now)
+        elif frames > self._tried[0]:
+            self._attempts = 0
+            self.outage.over(now)
+        else:
+            self._look_again(now)
+        return True
+
+    def _look(self, now: float) -> None:
+        """While all is well."""
+        if now - self._moved[1] <= self._frozen_s:
+            return
+        if self._idle():
+            self.outage.failed(f"source: {self._failed or f'no frame for {self._frozen_s:g} s'}", self._moved[1])
+            self._replace(now)
+        else:
+            self._moved = (self._moved[0], now)  # its next frame comes when this one has gone
+
+    def _look_again(self, now: float) -> None:
+        """After an attempt that has not brought a frame yet."""
+        if self._failed:
+            self.outage.failed(f"source: {self._failed}", self._moved[1])
+        first, longest = BACKOFF_S
+        pause = min(first * 2 ** (self._attempts - 1), longest)
+        if now - self._tried[1] > (pause if self._failed else max(pause, FIRST_FRAME_S)):
+            self._replace(now)
+
+    def _replace(self, now: float) -> None:
+        self._tried = (self._moved[0], now)
+        self._attempts += 1
+        with self._lock:
+            if not self._timer:
+                return
+            self._empty()
+            self._failed = ""
+            child = self._fill()
+        child.sync_state_with_parent()
+
+    # --- the child, under its lock ------------------------------------------------------------------------------------
+
+    def _fill(self) -> Gst.Bin:
+        child = Gst.parse_bin_from_description(self._launch, ghost_unlinked_pads=False)
+        child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
+        for element in fixed_rate(child):
+            element.set_property("skip-to-first", True)  # else the first frame is repeated for the time before it
+        self.add(child)
+        child.link(self._counter)
+        self._child = child
+        return child
+
+    def _empty(self) -> None:
+        child, self._child = self._child, None
+        if child is not None:
+            self.remove(child)
+            set_state_aside(child, Gst.State.NULL, lambda: self._report(f"source: {HUNG}"))
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    def _frames(self) -> int:
+        frames: int = self._counter.get_property("stats").get_value("num-buffers")
+        return frames
+
+    def _plays(self) -> bool:
+        return bool(self._counter.get_state(0).state == Gst.State.PLAYING)
+
+    def _idle(self) -> bool:
+        """Whether no frame is held up behind the source, as by a sink that connects again."""
+        pad = self._counter.get_static_pad("src")
+        here: list[bool] = []
+        probe = pad.add_probe(Gst.PadProbeType.IDLE, _remember, here)
+        if not here:
+            pad.remove_probe(probe)
+        return bool(here)
+
+
+def _remember(_pad: Gst.Pad, _info: Gst.PadProbeInfo, here: list[bool]) -> Gst.PadProbeReturn:
+    here.append(True)
+    return Gst.PadProbeReturn.REMOVE

@@ -1,0 +1,146 @@
+"""Access units on their way to a viewer, and what one who comes late must decode first. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from runner.h264.keyframe import Bits, grey_idr
+
+SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
+RECOVERY_POINT = 6  # SEI payload type (D.1.8)
+H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
+PERIODS = 2  # of refresh, that make any picture exact: the second holds a whole wave, wherever the first began
+LATE = 4  # how much longer than stated a wave may take
+LONGEST_S = 20.0  # what is kept of a stream that never starts anew and states no refresh period
+
+
+class AccessUnit(NamedTuple):
+    """One encoded picture, H.264 or H.265, Annex B.
+
+    captured  when it was captured, s since 1970 by the vehicle's clock; None where the line does not carry it
+    arrived   when it came, s since 1970 by this machine's clock
+    key       whether a decoder can start with it (IDR; of H.265 any IRAP picture)
+    recovery  frames after which a decoder that follows from here is exact, where a refresh wave begins; else None
+    exact     False: decoded, it still shows something that was never sent
+    """
+
+    data: bytes
+    captured: float | None
+    arrived: float
+    key: bool
+    recovery: int | None = None
+    exact: bool = True
+
+
+def read_unit(
+    data: bytes, captured: float | None, arrived: float, *, damaged: bool = False, codec: str = "h264"
+) -> AccessUnit | None:
+    """An access unit that has come, in Annex B: whether it starts anew is read from its NAL units.
+
+    damaged  packets of it were lost
+    codec    h264 or h265
+    returns  None for one that is of no use: browsers' decoders give up on half a picture, and bear one that is missing.
+             Half an IDR picture of H.264 becomes a grey one, over which the next refresh wave paints.
+
+    Parameter sets do not tell an IDR picture: encoders repeat them at every wave.
+    """
+    if codec == "h265":
+        return None if damaged else _read_h265(data, captured, arrived)
+    recovery = None
+    for header, at in _nal_units(data):
+        kind = header & 0x1F
+        if kind == IDR and damaged:
+            grey = grey_idr(data)
+            return AccessUnit(grey, captured, arrived, key=True, exact=False) if grey else None
+        if SLICE <= kind <= IDR:
+            return None if damaged else AccessUnit(data, captured, arrived, kind == IDR, recovery)
+        if kind == SEI:
+            recovery = _recovery(data[at : at + 16]) if recovery is None else recovery
+    return None
+
+
+def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
+    """As `read_unit`. A recovery point is not looked for: who joins waits for the next IRAP picture."""
+    for header, _ in _nal_units(data):
+        kind = header >> 1 & 0x3F
+        if kind in H265_VCL:
+            return AccessUnit(data, captured, arrived, kind in H265_IRAP)
+    return None
+
+
+def _nal_units(data: bytes) -> Iterator[tuple[int, int]]:
+    """First byte of the header of each NAL unit, and the place behind it."""
+    at = data.find(b"\0\0\1")
+    while 0 <= at < len(data) - 3:
+        yield data[at + 3], at + 4
+        at = data.find(b"\0\0\1", at + 3)
+
+
+def _recovery(message: bytes) -> int | None:
+    """recovery_frame_cnt of an SEI message that is a recovery point (D.1.8)."""
+    return Bits(message[2:]).ue() if len(message) > 2 and message[0] == RECOVERY_POINT else None
+
+
+class Recent:
+    """The units of one camera that a late decoder needs: the last IDR, and what came since or in the last periods.
+
+    With intra-refresh an IDR comes only when the picture changes its size. Shown alone it mixes an old picture with
+    new changes; after two refresh periods, or one whole wave that the stream announces, nothing of the old one is left.
+    A stream that others watched before has no IDR at all for who joins: it starts from a grey one.
+
+    refresh_s  length of a refresh wave or distance of key frames, s; None where the graph does not state it
+    codec      h264 or h265; a stream of H.265 that others watched before starts with its next IRAP picture
+    """
+
+    def __init__(self, refresh_s: float | None, codec: str = "h264") -> None:
+        self._grey = grey_idr if codec == "h264" else lambda _unit: None
+        self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
+        self._key: AccessUnit | None = None
+        self._since: deque[AccessUnit] = deque()
+        self._exact_from = 0.0  # a grey start: when two periods have passed
+
+    def add(self, unit: AccessUnit) -> AccessUnit:
+        """Keep a unit that has just come; returns it with `exact` as it is for a decoder that follows from here."""
+        if unit.key:
+            self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
+            self._since.clear()
+            return unit
+        if self._key is None and (grey := self._grey(unit.data)):
+            self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
+            self._exact_from = unit.arrived + self._window
+        if self._key is None:
+            return unit._replace(exact=False)
+        self._since.append(unit)
+        self._forget(unit.arrived)
+        if unit.arrived < self._exact_from and self._wave() is not None:
+            self._exact_from = unit.arrived
+        if unit.arrived < self._exact_from:
+            self._since[-1] = unit = unit._replace(exact=False)
+        return unit
+
+    def _forget(self, now: float) -> None:
+        """Drop what is older than the window; waves that take longer, because frames come late, are kept whole."""
+        if any(unit.recovery is not None for unit in self._since):
+            spare, oldest = self._wave() or 0, now - LATE * self._window
+        else:
+            spare, oldest = len(self._since), now - self._window
+        while self._since[0].arrived < oldest or (spare > 0 and self._since[0].arrived < now - self._window):
+            self._since.popleft()
+            spare -= 1
+
+    def burst(self) -> list[AccessUnit]:
+        """Units to decode in order, of which the last is the newest; none before there is one to start with."""
+        if self._key is None:
+            return []
+        units = list(self._since)
+        return [self._key, *units[self._wave() or 0 :]]
+
+    def _wave(self) -> int | None:
+        """Where the last wave began that has run to its end by now; None if there is none."""
+        for at in range(len(self._since) - 1, -1, -1):
+            recovery = self._since[at].recovery
+            if recovery is not None and len(self._since) - 1 - at >= recovery:
+                return at
+        return None

@@ -1,0 +1,106 @@
+"""Compile a sequence and a camera's graph into one GStreamer line with many encoders. Pure text.
+
+Each lane is the live line of both sides with the wire cut out: what the vehicle does to a frame from the crop to the
+payloader, followed at once by what the operator does to a packet up to the decoder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from runner.core.commands import KnobValue
+from runner.core.model import Element, ModelError, Roi
+from runner.core.scaling import output_size
+from runner.graph import Plan, launch, turn_elements
+
+FRAMES = "frames"  # the tee that has every frame of the sequence
+QUEUE = "queue max-size-buffers=3 max-size-bytes=0 max-size-time=0"
+SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=true sync=false async=false max-buffers=2"
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One encoding: a scaling factor and a target bitrate."""
+
+    scaling: Fraction
+    kbps: int
+
+
+@dataclass(frozen=True, slots=True)
+class LaneNames:
+    """Elements of one lane as the line names them."""
+
+    encoder: str
+    counter: str
+    sink: str
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSet:
+    """A line to run and what to watch in it."""
+
+    line: str
+    fps: Fraction
+    lanes: tuple[LaneNames, ...]
+
+
+def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane]) -> LaneSet:
+    """One line for some lanes of a camera.
+
+    plan    the camera at the size and rate of the sequence
+    decode  the line that makes I420 frames of the sequence
+    roi     part of the full image that is encoded
+    raises  ModelError where the graph's bitrate knob names no element that frames pass
+    """
+    before, behind = cut(plan)
+    factors = sorted({lane.scaling for lane in lanes})
+    parts = [f"{decode} ! tee name={FRAMES}"]
+    for i, factor in enumerate(factors):
+        shared = _turned(plan, before, {"roi": roi, "size": output_size(roi, factor)}, f"_{i}")
+        parts.append(f"{FRAMES}. ! {QUEUE} ! {launch(shared)} ! tee name=scaled_{i}" if shared else "")
+    names = []
+    for j, lane in enumerate(lanes):
+        own = _turned(plan, behind, {"bitrate": lane.kbps}, f"_lane{j}")
+        parts.append(f"scaled_{factors.index(lane.scaling)}. ! {QUEUE} ! {launch(own)} ! {SINK.format(f'sink_{j}')}")
+        names.append(LaneNames(f"{encoder(plan)}_lane{j}", f"{_counter(plan)}_lane{j}", f"sink_{j}"))
+    return LaneSet(" ".join(parts), plan.camera.fps, tuple(names))
+
+
+def fragment(plan: Plan, roi: Roi, lane: Lane) -> str:
+    """What makes one lane's pictures, as text that any change of graph or settings changes."""
+    before, behind = cut(plan)
+    knobs: dict[str, KnobValue] = {"roi": roi, "size": output_size(roi, lane.scaling), "bitrate": lane.kbps}
+    return launch(turn_elements(plan.camera, (*before, *behind), knobs))
+
+
+def cut(plan: Plan) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
+    """The live line without its wire, up to the encoder and from it on."""
+    vehicle = plan.vehicle if plan.serves else plan.vehicle[:-1]
+    at = next(i for i, element in enumerate(vehicle) if element.name == encoder(plan))
+    operator = plan.operator[1:-1]
+    taken = {element.name for element in vehicle}
+    named = tuple(replace(e, name=f"{e.name}_received") if e.name in taken else e for e in operator)
+    return vehicle[:at], (*vehicle[at:], *named)
+
+
+def encoder(plan: Plan) -> str:
+    """Name of the element whose bitrate is set."""
+    names = [turn.element for turn in plan.camera.graph.knobs.get("bitrate", ())]
+    for element in plan.vehicle:
+        if element.name in names:
+            return element.name
+    raise ModelError("graph.knobs.bitrate", repr(names), "must set an element that frames pass")
+
+
+def _counter(plan: Plan) -> str:
+    """The identity that counts coded bytes: the one behind the encoder, else the operator's."""
+    return "sent" if any(element.name == "sent" for element in plan.vehicle) else "received"
+
+
+def _turned(
+    plan: Plan, elements: Iterable[Element], knobs: Mapping[str, KnobValue], suffix: str
+) -> tuple[Element, ...]:
+    turned = turn_elements(plan.camera, elements, knobs)
+    return tuple(replace(element, name=element.name + suffix) for element in turned)

@@ -1,0 +1,120 @@
+"""A private MQTT broker as a child process, for the demo and for tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from runner.core.model import Endpoint
+from runner.errors import RunError
+from runner.system import children, signals
+from runner.system.ports import check_port_free
+
+START_S = 5.0
+END_S = 0.3  # the broker keeps nothing that would take time to write
+KEPT_LINES = 20
+# Errors alone: each connection would be a line.
+SETTINGS = (
+    "allow_anonymous true",
+    "persistence false",
+    "set_tcp_nodelay true",
+    "connection_messages false",
+    "user root",  # where root starts it: with another user the kernel forgets to end it with this process
+    "log_type error",
+    "log_timestamp false",
+)
+
+
+class Broker:
+    """mosquitto as a child process that ends with this one."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._address = (endpoint.host, endpoint.port)
+        self._where = f"{endpoint.host}:{endpoint.port}"
+        self._said: deque[str] = deque(maxlen=KEPT_LINES)
+        settings = (f"listener {endpoint.port} {endpoint.host}", *SETTINGS, "")
+        file = os.memfd_create("mosquitto.conf")
+        try:
+            os.write(file, "\n".join(settings).encode())
+            self._process = subprocess.Popen(
+                children.bound([find_mosquitto(), "-c", f"/proc/self/fd/{file}"]),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                pass_fds=[file],
+                start_new_session=True,  # Ctrl-C is for this process, and both sides say goodbye first
+            )
+        finally:
+            os.close(file)
+        # A pipe that nobody reads fills up, and the broker then stands still.
+        self._reader = threading.Thread(target=self._read, name="broker", daemon=True)
+        self._reader.start()
+
+    def check(self) -> None:
+        """raises RunError where the broker has ended"""
+        status = self._process.poll()
+        if status is not None:
+            said = "; ".join(filter(None, (children.ending(status), self._last_words())))
+            raise RunError(f"the MQTT broker on {self._where} ended: {said}")
+
+    def wait_until_it_answers(self) -> None:
+        """raises RunError where it does not within `START_S`"""
+        until = time.monotonic() + START_S
+        while time.monotonic() < until and self._process.poll() is None:
+            signals.check()
+            with socket.socket() as probe:
+                probe.settimeout(START_S)
+                if probe.connect_ex(self._address) == 0 and self._process.poll() is None:
+                    return
+            time.sleep(0.02)
+        said = self._last_words() if self._process.poll() is not None else "it does not answer"
+        raise RunError(f"mosquitto does not come up on {self._where}: {said}; choose another control.port")
+
+    def end(self) -> None:
+        self._process.terminate()
+        children.end(self._process, END_S)
+        self._reader.join(END_S)
+
+    def _last_words(self) -> str:
+        self._reader.join(END_S)
+        return self._said[-1] if self._said else ""
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        with self._process.stdout as lines:
+            self._said.extend(line.strip() for line in lines)
+
+
+@contextmanager
+def private_broker(endpoint: Endpoint) -> Iterator[Broker]:
+    """mosquitto, listening on one address for anybody there, remembering nothing; gone at the end.
+
+    raises  RunError where mosquitto is missing or does not come up
+    """
+    check_port_free(endpoint)
+    broker = Broker(endpoint)
+    try:
+        broker.wait_until_it_answers()
+        yield broker
+    finally:
+        broker.end()
+
+
+def find_mosquitto() -> str:
+    """Path of the broker, which Debian puts where only root looks.
+
+    raises  RunError
+    """
+    program = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/local/sbin:/usr/sbin")
+    if program is None:
+        raise RunError("mosquitto is not installed; on Debian: apt-get install mosquitto")
+    return program

@@ -1,0 +1,184 @@
+"""One side's connection to the MQTT broker: kept up, repeated after a loss, survived."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+
+from runner.core.model import Endpoint
+from runner.errors import RunError
+from runner.mqtt.messages import Document, Message
+
+CONNECT_S = 1.0  # one attempt to connect
+RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
+STALLED_S = 2  # a connection without progress for so long is dropped
+KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
+LOOP_S = 0.25  # how often the keepalive is looked at
+CLOSE_S = 2.0  # for the goodbye
+FAULTS = 100  # different faults of messages that are reported; others are counted only
+RETAINED = ("state", "telemetry", "configuration")
+
+
+class _Client(Client):
+    """A client whose loop survives a broker that breaks the protocol.
+
+    on_broken  called with what was wrong
+    """
+
+    on_broken: Callable[[Exception], None]
+
+    def loop_forever(self, timeout: float = LOOP_S, retry_first_connection: bool = False) -> MQTTErrorCode:
+        """Runs in the thread that `loop_start` starts."""
+        while True:
+            try:
+                return super().loop_forever(timeout, retry_first_connection)
+            except Exception as error:
+                self.on_broken(error)
+                time.sleep(RETRY_S[-1])
+                with suppress(OSError):  # the loop tries again
+                    self.reconnect()
+
+
+class Link:
+    """One side's connection to the broker, kept for as long as it is open. Callbacks come from the link's own thread.
+
+    will          topic and message that the broker publishes when this side is lost
+    listen        by topic filter, what takes its messages
+    on_connected  called with True when messages for this side will reach it, with False when the connection is lost
+    report        called with one line when the broker cannot be reached, once for each reason, and when it can again
+
+    A message whose callback raises is reported, counted in `dropped`, and ends nothing.
+    """
+
+    def __init__(
+        self,
+        broker: Endpoint,
+        will: tuple[str, Document],
+        listen: Mapping[str, Callable[[Message], None]],
+        on_connected: Callable[[bool], None],
+        report: Callable[[str], None],
+    ) -> None:
+        self._broker, self._will, self._listen = broker, will, listen
+        self._on_connected, self._report = on_connected, report
+        self._trouble = ""  # why there is no connection, as reported
+        self._faults: set[str] = set()  # as reported
+        self.dropped = 0
+        self._listening, self._closing = threading.Event(), threading.Event()
+        self._client = self._new_client()
+
+    def connect(self) -> None:
+        """Connect, and from then on stay connected; returns at once."""
+        self._client.connect_async(self._broker.host, self._broker.port, KEEPALIVE_S)
+        self._client.loop_start()
+
+    def wait_connected(self, seconds: float) -> bool:
+        """Whether messages for this side will reach it, by then."""
+        return self._listening.wait(seconds)
+
+    def publish(self, topic: str, message: Document) -> None:
+        """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
+
+        Without a connection nothing is sent and nothing queued: after a reconnection the present counts, not the past.
+        """
+        if self._listening.is_set():
+            self._send(topic, message)
+
+    def close(self, *goodbye: tuple[str, Document]) -> None:
+        """Disconnect; with messages to send before, as the will would have said it."""
+        self._closing.set()
+        for topic, message in goodbye if self._listening.is_set() else ():
+            with suppress(ValueError, RuntimeError):  # the connection is lost just now
+                self._send(topic, message).wait_for_publish(CLOSE_S / 2)
+        self._client.disconnect()
+        ending = threading.Thread(target=self._client.loop_stop, daemon=True)  # waits without a limit
+        ending.start()
+        ending.join(CLOSE_S)
+
+    def _new_client(self) -> _Client:
+        client = _Client(CallbackAPIVersion.VERSION2)
+        client.on_broken = self._on_broken
+        client.connect_timeout = CONNECT_S
+        client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
+        topic, message = self._will
+        client.will_set(topic, json.dumps(message), qos=1, retain=_kept(topic))
+        client.on_socket_open = _settle
+        client.on_connect_fail = lambda *_: self._failed_to_connect(sys.exception())
+        client.on_connect = self._connected
+        client.on_subscribe = self._subscribed
+        client.on_disconnect = lambda *_: self._disconnected()
+        for wanted, function in self._listen.items():
+            client.message_callback_add(wanted, self._guarded(function))
+        return client
+
+    def _guarded(self, function: Callable[[Message], None]) -> Callable[[Client, object, MQTTMessage], None]:
+        def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
+            try:
+                function(Message(message.topic, bytes(message.payload), message.retain))
+            except ValueError as error:  # of the reader of a message: it is not what it should be
+                self._drop(message, str(error))
+            except Exception as error:
+                self._drop(message, f"{type(error).__name__}: {error}")
+
+        return on_message
+
+    def _drop(self, message: MQTTMessage, why: str) -> None:
+        self.dropped += 1
+        fault = f"a message on {message.topic} was dropped: {why}"
+        if fault not in self._faults and len(self._faults) < FAULTS:
+            self._faults.add(fault)
+            self._report(fault)
+
+    def _send(self, topic: str, message: Document) -> MQTTMessageInfo:
+        qos = 0 if topic.endswith("/telemetry") else 1
+        return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
+
+    def _connected(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+        if code.is_failure:
+            self._failed_to_connect(RunError(f"refused: {code}".lower()))
+        else:
+            client.subscribe([(wanted, 1) for wanted in self._listen])
+
+    def _subscribed(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
+        if refused := [wanted for wanted, code in zip(self._listen, codes, strict=False) if code.is_failure]:
+            self._failed_to_connect(RunError(f"refuses to send {', '.join(refused)}"))
+            return
+        if self._trouble:
+            self._trouble = ""
+            self._report(f"connected to the MQTT broker at {self._broker}")
+        self._listening.set()
+        self._on_connected(True)
+
+    def _disconnected(self) -> None:
+        if self._listening.is_set():
+            self._listening.clear()
+            self._on_connected(False)
+
+    def _on_broken(self, error: Exception) -> None:
+        self._disconnected()
+        self._failed_to_connect(error)
+
+    def _failed_to_connect(self, error: BaseException | None) -> None:
+        why = str(getattr(error, "strerror", None) or error).lower()
+        if why != self._trouble and not self._closing.is_set():
+            self._trouble = why
+            self._report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
+
+
+def _kept(topic: str) -> bool:
+    return topic.split("/")[2:] in [[name] for name in RETAINED]
+
+
+def _settle(_client: object, _data: object, sock: Any) -> None:
+    if isinstance(sock, socket.socket):
+        # Without this, small messages wait 20 ms for company (Nagle's algorithm).
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)

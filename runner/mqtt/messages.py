@@ -1,0 +1,135 @@
+"""Control link between operators and vehicle over MQTT: requests, replies, applied state, telemetry.
+
+Topics of a vehicle, below tod/<vehicle>/:
+
+    request/<operator>   to the vehicle: an event of schemas/event.schema.json with `id` and `as_of`, without `t`; never
+                         retained. The vehicle stamps it on receipt.
+    reply/<operator>     to that operator: the same id, and applied (read back from the elements), refused, expired or
+                         timed out
+    state, telemetry     from the vehicle, retained, so that late subscribers receive them
+    configuration        from the vehicle, retained: what both sides must agree on
+
+Last wills say that a side is gone: the vehicle's state says {"online": false}, the operator's request says
+operator_disconnected. schemas/control.schema.json has what the vehicle sends.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from runner.records import Reply, Settings, Telemetry, VehicleState, from_json
+from runner.schema import message_problem, read_json
+
+OFFLINE = {"online": False}
+OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
+OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # it is shown to people and logged
+MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
+MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
+APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
+MAX_ROUND_TRIP_S = 0.5  # a longer round trip is no excuse for an old request: nobody can drive by it
+
+Document = Mapping[str, Any]
+
+
+def topic(vehicle: str, *parts: str) -> str:
+    """A topic of a vehicle, or a filter where a part is +."""
+    return "/".join(("tod", vehicle, *parts))
+
+
+class Message(NamedTuple):
+    """A message as it came.
+
+    retained  whether the broker had kept it
+    """
+
+    topic: str
+    payload: bytes
+    retained: bool
+
+    @property
+    def sender(self) -> str:
+        """The operator's id, last part of the topic of a request."""
+        return self.topic.rpartition("/")[2]
+
+
+def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, Any]:
+    """A mapping, as JSON from somebody who may send anything.
+
+    raises  ValueError that says what is wrong
+    """
+    if len(payload) > limit:
+        raise ValueError(f"{len(payload)} bytes: must be at most {limit}")
+    try:
+        document = read_json(payload)
+    except ValueError as error:
+        raise ValueError(f"not JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise ValueError("must be a mapping with id and event")
+    return document
+
+
+def read_state(payload: bytes) -> VehicleState | None:
+    """A vehicle's state; None: it is offline. Like the three below, raises ValueError that says what is wrong."""
+    document = _checked("state", payload)
+    return from_json(VehicleState, document) if document["online"] else None
+
+
+def read_telemetry(payload: bytes) -> Telemetry:
+    return from_json(Telemetry, _checked("telemetry", payload))
+
+
+def read_settings(payload: bytes) -> Settings:
+    return from_json(Settings, _checked("configuration", payload))
+
+
+def read_reply(payload: bytes) -> Reply:
+    return from_json(Reply, _checked("reply", payload))
+
+
+def _checked(kind: str, payload: bytes) -> dict[str, Any]:
+    """A message of the vehicle that satisfies schemas/control.schema.json."""
+    document = read_message(payload, MAX_MESSAGE_BYTES)
+    if problem := message_problem(kind, document):
+        raise ValueError(problem)
+    return document
+
+
+class Asked(NamedTuple):
+    """A request as it came.
+
+    document  the event without id and as_of, not yet checked
+    identity  its id, "" if it has none
+    as_of     see `runner.vehicle.operators`; None where it need not say it
+    problem   why it is no request, or ""
+    """
+
+    document: dict[str, Any]
+    identity: str = ""
+    as_of: float | None = None
+    problem: str = ""
+
+
+def read_request(message: Message) -> Asked:
+    """A request as it came. The event itself is checked when its time is known."""
+    try:
+        document = read_message(message.payload)
+    except ValueError as error:
+        return Asked({}, problem=str(error))
+    if not OPERATOR.fullmatch(message.sender):
+        return Asked({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
+    identity, as_of = document.pop("id", None), document.pop("as_of", None)
+    if not isinstance(identity, str) or not identity:
+        return Asked(document, problem="id: must be given, as text")
+    problem = ""
+    if message.retained:
+        problem = "must not be retained: a request is for now"
+    elif "t" in document:
+        problem = "t: must not be given, the vehicle stamps events on receipt"
+    elif document == {"event": OPERATOR_GONE["event"]}:
+        return Asked(document, identity)  # a last will cannot know when it is published
+    elif isinstance(as_of, bool) or not isinstance(as_of, int | float) or not math.isfinite(as_of):
+        problem = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
+    return Asked(document, identity, None if problem else float(as_of), problem)

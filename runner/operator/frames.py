@@ -1,0 +1,116 @@
+"""Decoded pictures for programs: numpy arrays with the camera's name and the time of capture.
+
+    with live_frames(["vehicle=delivery_robot"], cameras=["front"]) as frames:
+        for frame in frames:                          # waits for the next; ends when the with block is left
+            detect(frame.image, frame.captured)       # uint8, height x width x 3, RGB
+
+Runs beside an operator or alone. A program that is slower than the cameras gets the newest picture of each and misses
+others; nothing queues up.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.configuration.config import configuration
+from runner.core.model import suggest
+from runner.errors import UserError
+from runner.plans import compile_plans
+
+CHECK_S = 0.25  # how often silent cameras are looked for
+STOP_S = 1.0  # how long the last look may take
+
+
+class Frame(NamedTuple):
+    """One decoded picture.
+
+    captured  s since 1970 by the vehicle's clock; None where the line does not carry it
+    image     uint8, height x width x 3, RGB; its size is the one the camera is sent in
+    """
+
+    camera: str
+    captured: float | None
+    image: NDArray[np.uint8]
+
+
+class Frames:
+    """The newest picture of each camera, each given once, in the order in which they came."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, Frame] = {}
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __iter__(self) -> Iterator[Frame]:
+        while (frame := self.next()) is not None:
+            yield frame
+
+    def next(self, timeout_s: float | None = None) -> Frame | None:
+        """The next picture; None after the timeout, or once this is closed."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._newest or self._closed, timeout_s) or self._closed:
+                return None
+            return self._newest.pop(next(iter(self._newest)))
+
+    def put(self, camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
+        """A picture as it comes from the decoder, rows padded to whatever."""
+        rows = np.frombuffer(data, np.uint8).reshape(height, -1)[:, : width * 3]
+        with self._changed:
+            self._newest[camera] = Frame(camera, captured, rows.reshape(height, width, 3))
+            self._changed.notify()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+@contextmanager
+def live_frames(
+    overrides: Sequence[str] = (),
+    conf: Path | None = None,
+    *,
+    cameras: Sequence[str] | None = None,
+    report: Callable[[str, str], None] = lambda camera, what: None,
+) -> Iterator[Frames]:
+    """Receive and decode cameras of a vehicle that streams; lines that fail or fall silent are built anew.
+
+    overrides  Hydra overrides, as on the command line
+    cameras    names; None: all
+    report     told camera and what happened to it
+    raises     ConfigError, UserError for an unknown camera
+    """
+    from runner import apply
+
+    vehicle = configuration(overrides, conf, runnable=False, check=apply.check_plan).vehicle()
+    for name in cameras or ():
+        if name not in vehicle.cameras:
+            raise UserError("cameras", "", name, f"unknown camera, {suggest(name, vehicle.cameras)}")
+    plans = [plan for plan in compile_plans(vehicle) if cameras is None or plan.camera.name in cameras]
+    frames, stopped = Frames(), threading.Event()
+    side = apply.OperatorSide(plans, report, on_picture=frames.put)
+    wanted = {plan.camera.name: True for plan in plans}
+
+    def watch() -> None:
+        try:
+            while not stopped.wait(CHECK_S):
+                side.sample(wanted)
+        finally:
+            frames.close()  # nobody waits for pictures of a side that has failed
+
+    watcher = threading.Thread(target=watch, name="watch", daemon=True)
+    watcher.start()
+    try:
+        yield frames
+    finally:
+        stopped.set()
+        frames.close()
+        watcher.join(STOP_S)
+        side.stop()

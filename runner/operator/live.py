@@ -1,0 +1,134 @@
+"""An operator's side that runs: control link, receivers and log together. The verb `operator` runs it; so may yours.
+
+with live_operator(["vehicle=delivery_robot"]) as operator:
+    operator.station.listeners.append(mine)       # a runner.operator.station.Listener
+    operator.start()                              # receives and samples in threads of their own
+    operator.station.ask({"event": "mode_selected", "mode": "collective"}, print)
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from runner.configuration import agreement
+from runner.configuration.config import configuration
+from runner.core.model import Vehicle
+from runner.drive.log import Log
+from runner.errors import RunError
+from runner.operator.log import DriveLog
+from runner.operator.station import Station
+from runner.plans import compile_plans
+
+if TYPE_CHECKING:
+    from runner.apply import OnUnit, OperatorSide
+
+SAMPLE_S = 0.25
+END_S = 1.0  # how long the last sample may take
+
+
+class LiveOperator:
+    """The parts of an operator's side.
+
+    vehicle  as this side's configuration describes it
+    station  the end of the control link; its listeners are to be added before `start`
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, station: Station, log: Log, build: Callable[[OnUnit | None], OperatorSide]
+    ) -> None:
+        self.vehicle, self.station = vehicle, station
+        self._log, self._build = log, build
+        self._side: OperatorSide | None = None
+        self._stopped = threading.Event()
+        self._until = float("inf")
+        self._failure: RunError | None = None
+        self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
+
+    def start(self, on_unit: OnUnit | None = None, duration_s: float | None = None) -> None:
+        """Connect, receive, and sample, until stopped or for a time.
+
+        on_unit  called, from the camera's streaming thread, with each access unit that arrives
+        """
+        self.station.connect()
+        self._side = self._build(on_unit)
+        self._log.begin()
+        self._until = float("inf") if duration_s is None else time.monotonic() + duration_s
+        self._thread.start()
+
+    def runs(self, wait_s: float = 0.0) -> bool:
+        """Whether it still samples after a time; returns at once when it does not.
+
+        raises  RunError where it has ended by itself, before its time
+        """
+        self._thread.join(wait_s)
+        if self._failure:
+            raise self._failure
+        return self._thread.is_alive()
+
+    def end(self) -> None:
+        """Stop sampling soon. From any thread, any number of times."""
+        self._stopped.set()
+
+    def stop(self) -> None:
+        """End, with a goodbye to the vehicle."""
+        self.end()
+        if self._thread.ident:
+            self._thread.join(END_S)
+        self.station.close()
+        if self._side:
+            self._side.stop()
+        self._log.close()
+
+    def _run(self) -> None:
+        """In a thread of its own: a terminal that takes nothing (Ctrl-S) holds up nobody."""
+        noted = ""
+        assert self._side
+        while not self._stopped.wait(SAMPLE_S) and time.monotonic() < self._until:
+            try:
+                self.station.take(self._side.sample(self.station.sending()))
+            except RunError as error:  # GStreamer hangs; kept for the main thread
+                self._failure = error
+                return
+            except Exception as error:  # must not end the operator's view of a vehicle that moves
+                if noted != (noted := f"a sample failed: {type(error).__name__}: {error}"):
+                    self.station.note(noted)
+
+
+@contextmanager
+def live_operator(
+    overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
+) -> Iterator[LiveOperator]:
+    """Everything that an operator's side needs, stopped at the end with a goodbye to the vehicle.
+
+    overrides  Hydra overrides, as on the command line
+    log        directory that the drive is recorded to
+    raises     ConfigError, RunError, UserError where the directory holds a drive already
+    """
+    from runner import apply
+
+    config = configuration(overrides, conf, runnable=False, check=apply.check_plan)
+    vehicle, document = config.vehicle(), config.document
+    plans = compile_plans(vehicle)
+    station = Station(vehicle, agreement.settings(document))
+    versions = apply.versions(element for plan in plans for element in plan.operator)
+    drive = Log(log, "operator", document if log else {}, versions, station.note)
+    if log:
+        station.listeners.append(DriveLog(station, drive))
+    video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+
+    def build(on_unit: OnUnit | None) -> OperatorSide:
+        logged = log is not None
+        return apply.OperatorSide(
+            plans, station.report, on_unit, arrivals=logged, video=video, operator=station.identity
+        )
+
+    operator = LiveOperator(vehicle, station, drive, build)
+    try:
+        yield operator
+    finally:
+        operator.stop()

@@ -1,0 +1,114 @@
+"""From counters to what a person reads: rates over the last second, and a summary of a run. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Protocol
+
+WINDOW_S = 1.0
+SETTLE_S = 1.5  # a window counts for the comparison only if the decision is older than window and rate control
+
+
+class Counters(Protocol):
+    """Running counters of one camera as the receiver has them."""
+
+    @property
+    def frames(self) -> int: ...
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def lost(self) -> int: ...
+    @property
+    def foreign(self) -> int: ...
+    @property
+    def rebuilt(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def latency_ms(self) -> float | None: ...
+
+
+class Decided(Protocol):
+    """What the vehicle has decided for a camera."""
+
+    @property
+    def sending(self) -> bool: ...
+    @property
+    def kbps(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Frames a second and kbit/s over the last second."""
+
+    fps: float = 0.0
+    kbps: float = 0.0
+
+
+@dataclass
+class Meter:
+    """Watches one camera: rates over a sliding window, and how well what comes follows what was decided.
+
+    followed  kbit/s received over kbit/s allocated, one entry per settled window
+    """
+
+    fps: float
+    followed: list[float] = field(default_factory=list)
+    latencies_ms: list[float] = field(default_factory=list)
+    sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that came, with their count
+    short: int = 0  # settled windows with fewer frames than the camera's rate asks for
+    windows: int = 0
+    _past: deque[tuple[float, Counters]] = field(default_factory=deque)
+    _decided: tuple[object, ...] | None = None
+    _since: float = 0.0
+    _counted: float = 0.0
+
+    def add(self, t: float, counters: Counters, decided: Decided | None) -> Rates:
+        """Take a sample of the counters at time t, s; a few of them a second."""
+        settled_for = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
+        if settled_for != self._decided:
+            self._decided, self._since = settled_for, t
+        self._past.append((t, counters))
+        while len(self._past) > 2 and self._past[1][0] <= t - WINDOW_S:
+            self._past.popleft()
+        rates = self._rates()
+        # Windows that overlap would count the same frames again.
+        if decided and decided.sending and t - self._since >= SETTLE_S and t - self._counted >= WINDOW_S:
+            self._counted = t
+            self._compare(rates, counters, decided)
+        return rates
+
+    def _rates(self) -> Rates:
+        (t0, first), (t1, last) = self._past[0], self._past[-1]
+        if t1 <= t0:
+            return Rates()
+        return Rates((last.frames - first.frames) / (t1 - t0), (last.bytes - first.bytes) * 8 / 1000 / (t1 - t0))
+
+    def _compare(self, rates: Rates, counters: Counters, decided: Decided) -> None:
+        self.windows += 1
+        self.followed.append(rates.kbps / decided.kbps)
+        self.short += rates.fps < 0.9 * self.fps
+        size = (counters.width, counters.height)
+        if size == (decided.width, decided.height):
+            self.sizes[size] = self.sizes.get(size, 0) + 1
+        if counters.latency_ms is not None:
+            self.latencies_ms.append(counters.latency_ms)
+
+
+def percentile(values: Iterable[float], share: float) -> float | None:
+    """The value below which a share of all lie; None of none."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
+
+
+def middle(values: list[float]) -> float | None:
+    return median(values) if values else None

@@ -1,0 +1,75 @@
+"""A decision of the vehicle as one phrase for the operator. Pure."""
+
+from __future__ import annotations
+
+from runner.records import CameraState, VehicleState
+
+# How a note begins, by the event that the decision follows; the fields are those of `runner.core.events.describe`.
+CAUSES = {
+    "bitrate_predicted": "Prediction {kbps} kbit/s",
+    "mode_selected": "Mode {mode}",
+    "position_reported": "New position",
+    "total_set": "Total set to {kbps} kbit/s",
+    "camera_switched": "{camera} switched",
+    "roi_set": "ROI of {camera} set",
+    "camera_configured": "{camera} configured",
+    "weights_set": "Weights set",
+    "link_measured": "Link measured",
+    "operator_connected": "Operator connected",
+    "operator_disconnected": "Operator disconnected",
+    "clock_advanced": "Time elapsed",
+}
+
+
+def decision_note(before: VehicleState, state: VehicleState) -> str | None:
+    """What a decision changes, and why.
+
+        Prediction 900 kbit/s: rear 0.5 -> 0.25 (300 of 4000 kbit/s, range [0, 400) -> 0.25)
+        Prediction 3000 kbit/s: front, rear 0.5 -> 0.25; mast off -> 0.125 (3 of 8 cameras, total 3000 kbit/s)
+
+    before, state  as the vehicle publishes them
+    returns        None where neither mode nor what is sent of any camera changes
+    """
+    cameras = state.cameras
+    changes = {name: _change(before.cameras.get(name, now), now) for name, now in cameras.items()}
+    changed = {name: change for name, change in changes.items() if change}
+    cause = _cause(state.cause)
+    if before.mode != state.mode and not cause.startswith("Mode "):
+        cause = f"Mode {state.mode}; {cause}"
+    if not changed:
+        return None if before.mode == state.mode else f"{cause}: total {state.total_kbps} kbit/s"
+    reasons = [cameras[name].reason for name in changed]
+    if len(changed) > 1:
+        each = [reason.split("; ")[1:] for reason in reasons]  # after the camera's own, those of the whole decision
+        shared = [part for part in each[0] if all(part in others for others in each)]
+        total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_kbps} kbit/s"
+        reasons = ["; ".join([total, *shared])]
+    alike: dict[str, list[str]] = {}
+    for name, change in changed.items():
+        alike.setdefault(change, []).append(name)
+    listed = "; ".join(f"{', '.join(names)} {change}" for change, names in alike.items())
+    return f"{cause}: {listed} ({reasons[0]})"
+
+
+def _cause(described: str) -> str:
+    """The event's phrase; its own words where the vehicle knows events that this side does not."""
+    event, *words = described.split(" ")
+    try:
+        return CAUSES[event].format_map(dict(zip(words[::2], words[1::2], strict=False)))
+    except KeyError:
+        return described
+
+
+def _change(was: CameraState, now: CameraState) -> str:
+    """What changes for one camera; "" for nothing."""
+    factors = [_factor(was), _factor(now)]
+    parts = [" -> ".join(factors)] if factors[0] != factors[1] else []
+    if was.roi != (roi := now.roi):
+        parts.append(f"ROI {roi.width}x{roi.height} at {roi.x}, {roi.y}")
+    return ", ".join(parts)
+
+
+def _factor(camera: CameraState) -> str:
+    if not camera.on:
+        return "off"
+    return f"{camera.scaling:g}" if camera.sending else "paused"

@@ -1,0 +1,327 @@
+"""What the operator's side knows: what the vehicle says and what comes of each camera. Feeds table and page."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from runner.configuration import agreement
+from runner.core.model import Vehicle
+from runner.mqtt.link import Link
+from runner.mqtt.messages import (
+    APPLY_S,
+    MAX_ROUND_TRIP_S,
+    OPERATOR_GONE,
+    Document,
+    Message,
+    read_reply,
+    read_settings,
+    read_state,
+    read_telemetry,
+    topic,
+)
+from runner.operator.meter import Counters, Meter, Rates
+from runner.operator.notes import decision_note
+from runner.records import CameraSample, CameraState, Note, Outcome, Sample, Telemetry, VehicleState
+from runner.system.clocks import Clocks
+
+SLACK_S = 0.5  # the vehicle's answer to a request that it carries out at the last moment is still waited for
+SILENT_S = 0.7  # a vehicle that sends nothing for so long is offline; it sends telemetry five times a second
+REPORT_EVERY_S = 1.0  # how often what arrives is reported to the vehicle
+MOST_VEHICLES = 100  # whose names are remembered
+FOUND_S = 2.0  # a vehicle that the broker knows nothing of by then is probably misspelt
+
+OnReply = Callable[[Outcome], None]
+
+
+class Listener:
+    """Is called, from any thread, with what is new; a subclass overrides what it needs. Times are s since 1970."""
+
+    def on_state(self, state: VehicleState | None) -> None:
+        """The vehicle's state; None: it is offline."""
+
+    def on_sample(self, sample: Sample) -> None:
+        """What arrives, a few times a second."""
+
+    def on_note(self, note: Note) -> None:
+        """What a person should know."""
+
+
+class CameraRow(NamedTuple):
+    """One camera: its rates and counters, and what the vehicle says of it, if anything."""
+
+    name: str
+    rates: Rates
+    received: Counters
+    state: CameraState | None
+
+
+class _Asked(NamedTuple):
+    on_reply: OnReply | None
+    event: str
+    until: float
+
+
+class Station:
+    """One operator's end of the control link, and the measurements of what arrives.
+
+    settings   what the vehicle's configuration must agree with, see `runner.configuration.agreement`
+    listeners  are to be added before `connect`
+
+    Requests go out by `ask`; samples of the cameras' counters come in by `take`.
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: agreement.Settings) -> None:
+        self._vehicle, self._settings = vehicle, settings
+        self.identity = uuid.uuid4().hex[:12]  # of this operator
+        self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
+        self.listeners: list[Listener] = []
+        self.state: VehicleState | None = None  # None: the vehicle is offline
+        self._published: VehicleState | None = None  # the last state that the vehicle published
+        self._telemetry: Telemetry | None = None
+        self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it came
+        self._heard = 0.0
+        self._vehicles: dict[str, bool] = {}  # by name of those that the broker knows, whether they are online
+        self._connected_at: float | None = None
+        self._differences = ""
+        self._asked: dict[str, _Asked] = {}
+        self._lock = threading.Lock()
+        self.meters = {name: Meter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
+        self.clocks = Clocks()
+        self.samples: Mapping[str, Counters] = {}
+        self._rates: dict[str, Rates] = {}
+        self._reported = 0.0
+        listen = {
+            topic("+", "state"): self._on_any_state,
+            topic(vehicle.name, "reply", self.identity): self._on_reply,
+            topic(vehicle.name, "telemetry"): self._on_telemetry,
+            topic(vehicle.name, "configuration"): self._on_configuration,
+        }
+        self._requests = topic(vehicle.name, "request", self.identity)
+        self._link = Link(vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note)
+
+    def connect(self) -> None:
+        """Connect to the broker, and stay connected; returns at once."""
+        self._link.connect()
+
+    def close(self) -> None:
+        self.state = None  # a goodbye is no loss
+        self._link.close((self._requests, OPERATOR_GONE))
+
+    def ask(self, event: Document, on_reply: OnReply | None = None) -> None:
+        """Send a request to the vehicle.
+
+        on_reply  called with what became of it: applied (read back from the elements), refused, expired or timed out
+        """
+        if self.state is None:
+            if on_reply:
+                on_reply(Outcome(self._vehicle_time[0], "refused", "the vehicle is offline"))
+            return
+        identity, now = uuid.uuid4().hex, time.monotonic()
+        with self._lock:
+            self._asked[identity] = _Asked(on_reply, event["event"], now + self.answer_s)
+        self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
+
+    def _vehicle_now(self, now: float) -> float:
+        """The vehicle's time in the newest telemetry, plus the time since."""
+        t, came = self._vehicle_time
+        return round(t + now - came, 6)
+
+    def note(self, text: str) -> None:
+        note = Note(time.time(), text)
+        for listener in self.listeners:
+            listener.on_note(note)
+
+    def report(self, camera: str, what: str) -> None:
+        """What happened to a camera, as `OperatorSide` reports it."""
+        self.note(f"{camera}: {what}")
+
+    def sending(self) -> dict[str, bool]:
+        """Which cameras should send, by the vehicle's word; empty while the vehicle is offline.
+
+        One whose source is being replaced sends nothing, and its session stays.
+        """
+        cameras = self.state.cameras if self.state else {}
+        return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
+
+    def take(self, samples: Mapping[str, Counters]) -> None:
+        """A sample of every camera's counters; to be called a few times a second, since time is judged here too."""
+        now = time.monotonic()
+        if self.state and now - self._heard > SILENT_S:
+            self._lose(f"the vehicle has been silent for {SILENT_S:g} s")
+        self._time_out(now)
+        self._look_for_vehicle(now)
+        self.ask({"event": "operator_connected"})  # the sign of life
+        samples = self._with_known_ages(now, samples)
+        for name, received in samples.items():
+            self._rates[name] = self.meters[name].add(now, received, self._camera(name))
+        self.samples = samples
+        if now - self._reported >= REPORT_EVERY_S:
+            self._reported = now
+            for name, rates in self._rates.items():
+                self.ask({"event": "link_measured", "camera": name, "kbps": round(rates.kbps, 1)})
+        sample = self._sample()
+        for listener in self.listeners:
+            listener.on_sample(sample)
+
+    def rows(self) -> list[CameraRow]:
+        return [
+            CameraRow(name, self._rates[name], received, self._camera(name)) for name, received in self.samples.items()
+        ]
+
+    def headline(self) -> str:
+        state = self.state  # another thread may replace it
+        if state is None:
+            return f"{self._vehicle.name}: offline"
+        ahead = self.clocks.ahead_ms
+        clock = "" if ahead is None else f"; its clock is ahead by at least {ahead:.0f} ms: latencies are unknown"
+        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_kbps} kbit/s{clock}"
+
+    def _with_known_ages(self, now: float, samples: Mapping[str, Counters]) -> Mapping[str, Counters]:
+        before = self.clocks.ahead_ms
+        samples = self.clocks.checked(now, samples)
+        after = self.clocks.ahead_ms
+        if before is None and after is not None:
+            rule = "synchronise both clocks (NTP, PTP)"
+            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: ages of pictures are unknown; {rule}")
+        elif before is not None and after is None:
+            self.note("the vehicle's clock is no longer ahead: ages of pictures are known")
+        return samples
+
+    def _sample(self) -> Sample:
+        cameras = {row.name: _camera_sample(row) for row in self.rows()}
+        telemetry = self._telemetry if self.state else None
+        ahead = self.clocks.ahead_ms
+        return Sample(
+            t=time.time(),
+            predicted_kbps=telemetry.predicted_kbps if telemetry else None,
+            allocated_kbps=sum(camera.allocated_kbps for camera in cameras.values()),
+            actual_kbps=round(sum(camera.kbps for camera in cameras.values()), 1),
+            position=telemetry.position if telemetry else None,
+            refused=telemetry.refused if telemetry else 0,
+            cameras=cameras,
+            dropped=self._link.dropped,
+            clock_ahead_ms=None if ahead is None else round(ahead, 1),
+        )
+
+    def _camera(self, name: str) -> CameraState | None:
+        return self.state.cameras.get(name) if self.state else None
+
+    def _on_any_state(self, message: Message) -> None:
+        """The state of any vehicle at the broker: of another one only its name is of use."""
+        name, state = message.topic.split("/")[1], read_state(message.payload)
+        if len(self._vehicles) < MOST_VEHICLES or name in self._vehicles:
+            self._vehicles[name] = state is not None
+        if name != self._vehicle.name:
+            return
+        if state and (missing := self._vehicle.cameras.keys() - state.cameras.keys()):
+            raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")
+        self._published = state
+        if state:
+            self._hear()
+        else:
+            self._lose("the vehicle is offline")
+
+    def _hear(self) -> None:
+        """The vehicle is online, once state and telemetry have come."""
+        before, state = self.state, self._published
+        self._heard = time.monotonic()
+        if state is None or before is state or not self._telemetry:
+            return
+        self._set_state(state)
+        if before:
+            self._note_changes(before, state)
+        else:
+            self.note(f"the vehicle is online, mode {state.mode}")
+            self.ask({"event": "operator_connected"})
+
+    def _set_state(self, state: VehicleState | None) -> None:
+        self.state = state
+        for listener in self.listeners:
+            listener.on_state(state)
+
+    def _note_changes(self, before: VehicleState, state: VehicleState) -> None:
+        """One note of a decision, and one where the rules fail or are back."""
+        if state.fault != before.fault:
+            self.note(f"{state.fault}; the decision before stays in force" if state.fault else "the rules decide again")
+        if text := decision_note(before, state):
+            self.note(text)
+
+    def _on_telemetry(self, message: Message) -> None:
+        telemetry = read_telemetry(message.payload)
+        self._vehicle_time = (telemetry.t, time.monotonic())
+        self._telemetry = telemetry
+        if self._published:  # else it is the retained telemetry of a vehicle that is gone
+            self._hear()
+
+    def _on_configuration(self, message: Message) -> None:
+        """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""
+        differences = agreement.differences(self._settings, read_settings(message.payload).settings)
+        if differences and differences != self._differences:
+            self.note(f"the vehicle has another configuration: {differences}")
+        self._differences = differences
+
+    def _look_for_vehicle(self, now: float) -> None:
+        """Say once which vehicles the broker knows, where this one is none of them."""
+        if self._connected_at is None or now - self._connected_at < FOUND_S:
+            return
+        self._connected_at = None
+        if self._vehicle.name not in self._vehicles:
+            online = sorted(name for name, is_online in self._vehicles.items() if is_online)
+            known = f"online are {', '.join(online)}" if online else "no vehicle is online"
+            self.note(f"the broker knows no vehicle named {self._vehicle.name}, {known}")
+
+    def _on_reply(self, message: Message) -> None:
+        reply = read_reply(message.payload)
+        with self._lock:
+            asked = self._asked.pop(reply.id, None)
+        if asked is None:
+            return
+        if asked.on_reply:
+            asked.on_reply(reply)
+        elif reply.result == "refused":
+            self.note(f"{asked.event} refused: {reply.reason}")
+
+    def _time_out(self, now: float) -> None:
+        with self._lock:
+            late = {identity: asked for identity, asked in self._asked.items() if now > asked.until}
+            for identity in late:
+                del self._asked[identity]
+        for asked in late.values():
+            if asked.on_reply:
+                reason = f"no answer from the vehicle within {self.answer_s:g} s"
+                asked.on_reply(Outcome(self._vehicle_now(now), "timed out", reason))
+
+    def _on_connected(self, here: bool) -> None:
+        self._connected_at = time.monotonic() if here else None
+        if not here:
+            self._published = None
+            self._lose("the control link is lost")
+
+    def _lose(self, why: str) -> None:
+        if self.state:
+            self.note(why)
+        self._telemetry = None
+        self._set_state(None)
+
+
+def _camera_sample(row: CameraRow) -> CameraSample:
+    received, state = row.received, row.state
+    return CameraSample(
+        fps=round(row.rates.fps, 1),
+        kbps=round(row.rates.kbps, 1),
+        allocated_kbps=state.kbps if state else 0,
+        demand_kbps=state.demand_kbps if state else 0,
+        scaling=state.scaling if state else None,
+        width=received.width,
+        height=received.height,
+        latency_ms=received.latency_ms,
+        lost=received.lost,
+        rebuilt=received.rebuilt,
+        foreign=received.foreign,
+        frames=received.frames,
+        bytes=received.bytes,
+    )

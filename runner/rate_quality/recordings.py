@@ -1,0 +1,138 @@
+"""The directory of a recording: one file per camera under its own name only when it is complete, and recording.json."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from runner.core.model import Camera, Recording
+from runner.errors import RunError, UserError
+from runner.redact import redacted
+from runner.system.files import unfinished
+
+INDEX = "recording.json"
+LEAST_S = 60  # a recording without an end needs space for so long at least
+MARGIN_BYTES = 64_000_000  # never filled; and what comes raw in the next seconds
+MARGIN_S = 2
+
+
+def raw_rate(cameras: Iterable[Camera]) -> float:
+    """Bytes that the frames of some cameras take in a second, I420 of the sources' sizes."""
+    return float(sum(c.source_size[0] * c.source_size[1] * c.fps * 3 / 2 for c in cameras))
+
+
+def margin(cameras: Iterable[Camera]) -> float:
+    """Bytes that stay free: a recording ends before the disk is full."""
+    return MARGIN_BYTES + MARGIN_S * raw_rate(cameras)
+
+
+def check_space(directory: Path, cameras: Iterable[Camera], recording: Recording, duration_s: float | None) -> None:
+    """Whether a recording has room, for its whole length or, where that is open, for a minute.
+
+    raises  RunError with what it needs and what there is
+    """
+    cameras = list(cameras)
+    seconds = LEAST_S if duration_s is None else duration_s
+    raw = raw_rate(cameras) * seconds
+    needed = raw * recording.of_raw + margin(cameras)
+    free = shutil.disk_usage(directory).free
+    if free < needed:
+        plan = (
+            f"{recording.of_raw:g} of {gigabytes(raw)} raw in {seconds:g} s, and {gigabytes(margin(cameras))} kept free"
+        )
+        raise RunError(f"{directory}: {gigabytes(free)} free, a recording needs {gigabytes(needed)}: {plan}")
+
+
+def gigabytes(size: float) -> str:
+    return f"{size / 1e9:.2f} GB"
+
+
+def make_directory(path: Path) -> None:
+    """raises UserError where no directory can be made"""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        rule = "must be a directory" if path.exists() else (error.strerror or "").lower()
+        raise UserError("command line", "output", repr(str(path)), rule) from None
+
+
+def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
+    """By camera, the file that will be written; each is made, empty, so that no other recording writes it too.
+
+    raises  UserError where something would be overwritten, or nothing can be written
+    """
+    cameras = list(cameras)
+    wanted = [directory / INDEX, *(final(directory, name) for name in cameras)]
+    taken = [path.name for path in (*wanted, *(part(directory, name) for name in cameras)) if path.exists()]
+    if taken:
+        rule = f"{', '.join(taken)} there already; nothing is overwritten, choose another directory"
+        raise UserError("command line", "output", repr(str(directory)), rule)
+    claimed: dict[str, Path] = {}
+    try:
+        for name in cameras:
+            part(directory, name).touch(exist_ok=False)
+            claimed[name] = part(directory, name)
+    except OSError as error:
+        remove_empty(claimed.values())
+        raise UserError("command line", "output", repr(str(directory)), (error.strerror or "").lower()) from None
+    return claimed
+
+
+def final(directory: Path, camera: str) -> Path:
+    return directory / f"{camera}.mkv"
+
+
+def part(directory: Path, camera: str) -> Path:
+    """The file as long as it is incomplete."""
+    return directory / f".{camera}.mkv.part"
+
+
+def keep(directory: Path, camera: str) -> Path:
+    """Give a complete file its name, once it is on the disk.
+
+    raises  RunError where that name was taken meanwhile, or the disk fails
+    """
+    incomplete, path = part(directory, camera), final(directory, camera)
+    try:
+        if path.exists():
+            raise RunError(f"{path} came into being meanwhile; the recording is {incomplete}")
+        _flush(incomplete)
+        incomplete.rename(path)
+        _flush(directory)
+    except OSError as error:
+        raise RunError(f"{incomplete} cannot become {path.name}: {error.strerror}") from None
+    return path
+
+
+def remove_empty(paths: Iterable[Path]) -> None:
+    """Remove files into which nothing was written."""
+    for path in paths:
+        if path.exists() and not path.stat().st_size:
+            path.unlink()
+
+
+def write_index(directory: Path, document: Mapping[str, Any]) -> None:
+    """Write recording.json, whole or not at all; passwords in addresses are left out.
+
+    raises  RunError
+    """
+    text = json.dumps(redacted(document), indent=2, ensure_ascii=False)
+    try:
+        with unfinished(directory / INDEX) as new:
+            new.write_text(text + "\n", encoding="utf-8")
+            _flush(new)
+    except OSError as error:
+        raise RunError(f"{directory / INDEX} cannot be written: {error.strerror}; the videos are complete") from None
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file or a directory is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

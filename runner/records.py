@@ -1,0 +1,378 @@
+"""What both sides publish and log: state, telemetry, replies, samples, lines of a drive. Pure.
+
+Each record is a frozen dataclass whose fields are the keys of its JSON, which is made and read here and nowhere else;
+schemas/control.schema.json and schemas/drive.schema.json describe the same records. Bitrates are kbit/s, sizes px,
+times s. `t` counts from the beginning of the run or of the log that holds the record; at an operator's station, which
+has no such beginning, from 1970.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from runner.core.commands import Command, Knobs
+from runner.core.decision import Decision, Setting
+from runner.core.events import PositionReported
+from runner.core.model import Mode, Roi, plain
+
+Number = int | float
+Json = dict[str, Any]
+Applied = Mapping[str, Any]  # by knob, the value that was read back; a camera without a pipeline has none
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where the vehicle is: degrees (WGS-84), and where it is known the speed in m/s and the course in degrees."""
+
+    lat: float
+    lon: float
+    speed_mps: float | UnsetType = UNSET
+    heading_deg: float | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, event: PositionReported) -> Position:
+        known = {"speed_mps": event.speed_mps, "heading_deg": event.heading_deg}
+        return cls(event.lat, event.lon, **{key: value for key, value in known.items() if value is not None})
+
+
+# --- what is decided --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDecision:
+    """What is decided for one camera, see `runner.core.decision.Setting`."""
+
+    on: bool
+    sending: bool
+    demand_kbps: Number
+    kbps: int
+    scaling: Number | None
+    roi: Roi
+    width: int
+    height: int
+    reason: str
+
+    @classmethod
+    def of(cls, setting: Setting) -> CameraDecision:
+        return cls(**_decided(setting))
+
+
+@dataclass(frozen=True, slots=True)
+class InForce:
+    """The decision in force."""
+
+    mode: Mode
+    total_kbps: Number
+    cameras: Mapping[str, CameraDecision]
+
+    @classmethod
+    def of(cls, decision: Decision) -> InForce:
+        cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
+        return cls(decision.mode, plain(decision.total), cameras)
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionMade:
+    """Line of a log: a decision, what caused it, and the commands that followed from it."""
+
+    t: float
+    cause: str
+    mode: Mode
+    total_kbps: Number
+    cameras: Mapping[str, CameraDecision]
+    commands: list[Json]
+
+    @classmethod
+    def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
+        made = InForce.of(decision)
+        return cls(t, cause, made.mode, made.total_kbps, made.cameras, [command.to_json() for command in commands])
+
+
+# --- from the vehicle -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CameraState(CameraDecision):
+    """What is decided for one camera, what of it was read back as applied, and what is wrong with its source."""
+
+    weight: Number
+    applied: Applied
+    fault: str | None = None
+
+    @classmethod
+    def at(cls, setting: Setting, weight: Number, applied: Applied, fault: str | None) -> CameraState:
+        return cls(**_decided(setting), weight=weight, applied=applied, fault=fault)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """State of a vehicle that is online.
+
+    cause  the event that the decision came from
+    fault  why the rules could not decide, so that an earlier decision stays in force
+    """
+
+    t: float = field(compare=False)
+    cause: str
+    mode: Mode
+    total_kbps: Number
+    cameras: Mapping[str, CameraState]
+    fault: str | None = None
+    online: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Offline:
+    """Line of an operator's log: the vehicle is offline."""
+
+    t: float
+    online: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTelemetry:
+    """What was read back as applied, and what the encoder has put out since its pipeline was built."""
+
+    applied: Applied
+    frames: int
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """Measured on the vehicle, a few times a second: also its sign of life.
+
+    refused  requests since the start
+    errors   exceptions that the control loop survived since the start
+    """
+
+    t: float
+    predicted_kbps: Number | None
+    position: Position | None
+    cameras: Mapping[str, CameraTelemetry]
+    refused: int
+    errors: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a request: applied, refused, expired or timed out, and why."""
+
+    t: float
+    result: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reply(Outcome):
+    """The answer to the request of that id."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the configurations of both sides must agree on, by path; `run` tells vehicles of one name apart."""
+
+    run: str
+    settings: Mapping[str, Any]
+
+
+# --- from the operator's side -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSample:
+    """What comes of one camera. Rates are those of the last second, counters run since the start.
+
+    lost        RTP packets that never came
+    foreign     packets that came from elsewhere than the vehicle and were dropped
+    rebuilt     how often the receiver's pipeline was built anew
+    latency_ms  capture to decode of the last frame looked at; None: unknown
+    arrivals    of each access unit since the sample before, in a log: time, and ms since its capture if known
+    """
+
+    fps: float
+    kbps: float
+    allocated_kbps: Number
+    demand_kbps: Number
+    scaling: Number | None
+    width: int
+    height: int
+    latency_ms: float | None
+    lost: int
+    rebuilt: int
+    foreign: int = 0
+    frames: int = 0
+    bytes: int = 0
+    arrivals: tuple[tuple[float, float | None], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What the operator's side measures a few times a second.
+
+    dropped         messages of the control link that were none
+    clock_ahead_ms  by how much the vehicle's clock is ahead at least; None: nothing tells so
+    """
+
+    t: float
+    predicted_kbps: Number | None
+    allocated_kbps: Number
+    actual_kbps: float
+    position: Position | None
+    refused: int
+    cameras: Mapping[str, CameraSample]
+    dropped: int = 0
+    clock_ahead_ms: float | None = None
+
+
+# --- other lines of a log ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Began:
+    """First line of a log: what was driven with what. `time`: its beginning, s since 1970."""
+
+    t: float
+    side: str
+    format: int
+    time: float
+    versions: Mapping[str, str]
+    config: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What a person should know."""
+
+    t: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class VideoBegan:
+    """A video file has its first frame, captured then, s since 1970."""
+
+    t: float
+    camera: str
+    file: str
+    captured: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSample:
+    """A limited link: its rate, the wait of a packet, and what it has passed on and dropped so far."""
+
+    t: float
+    kbps: float
+    queue_ms: float
+    bytes: int
+    packets: int
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
+class LinesDropped:
+    """So many lines were not written, since the disk was too slow."""
+
+    t: float
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """Last line of a log that was closed."""
+
+    t: float
+
+
+Record = (
+    Began
+    | DecisionMade
+    | Telemetry
+    | VehicleState
+    | Offline
+    | Sample
+    | Note
+    | VideoBegan
+    | LinkSample
+    | LinesDropped
+    | Ended
+)
+KINDS: dict[type[Any], str] = {  # what a line's key `log` says
+    Began: "began",
+    DecisionMade: "decision",
+    Telemetry: "telemetry",
+    VehicleState: "state",
+    Offline: "state",
+    Sample: "sample",
+    Note: "note",
+    VideoBegan: "video",
+    LinkSample: "link",
+    LinesDropped: "dropped",
+    Ended: "ended",
+}
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
+
+
+def to_json(record: Any) -> Json:
+    """The JSON object of a record."""
+    document: Json = msgspec.to_builtins(record)
+    return document
+
+
+def from_json(kind: type[T], document: Mapping[str, Any]) -> T:
+    """The record that a JSON object describes which satisfies its schema.
+
+    raises  msgspec.ValidationError, a ValueError
+    """
+    return msgspec.convert(document, kind)
+
+
+def state_to_json(state: VehicleState | None) -> Json:
+    """The JSON object of a vehicle's state; None: it is offline."""
+    return {"online": False} if state is None else to_json(state)
+
+
+def line_to_json(record: Record) -> Json:
+    """A record as a line of a log."""
+    document = to_json(record)
+    return {"t": document.pop("t"), "log": KINDS[type(record)], **document}
+
+
+def line_from_json(document: Mapping[str, Any]) -> Record:
+    """The record that a line of a log describes which satisfies its schema."""
+    kind = _BY_KIND[document["log"]]
+    record: Record = from_json(Offline if kind is VehicleState and not document["online"] else kind, document)
+    return record
+
+
+_BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if kind is not Offline}
+
+
+def applied_to_json(camera: str, knobs: Knobs) -> Applied:
+    """Where a camera's knobs are, by name."""
+    return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
+
+
+def _decided(setting: Setting) -> Json:
+    return {
+        "on": setting.on,
+        "sending": setting.sending,
+        "demand_kbps": plain(setting.demand),
+        "kbps": setting.kbps,
+        "scaling": None if setting.scaling is None else plain(setting.scaling),
+        "roi": setting.roi,
+        "width": setting.width,
+        "height": setting.height,
+        "reason": setting.reason,
+    }

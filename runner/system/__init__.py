@@ -1,0 +1,1 @@
+"""Processes, signals, files and ports of the operating system."""

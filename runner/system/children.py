@@ -1,0 +1,105 @@
+"""Child processes that do not outlive this one, however it ends, and that are never waited for without a limit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+from runner.errors import RunError
+from runner.system.signals import LIFELINE
+
+ROOT = Path(__file__).resolve().parents[2]
+KILLED_S = 1.0  # a killed process is gone by then, unless the kernel itself holds it
+
+
+def bound(command: Sequence[str]) -> list[str]:
+    """A command of any program that the kernel kills when this process, or the thread that starts it, ends."""
+    launcher = str(Path(__file__).with_name("bound.py"))
+    return [sys.executable, "-I", "-S", launcher, str(os.getpid()), *command]
+
+
+def environment() -> dict[str, str]:
+    """This process's environment, in which `python -m runner` finds this package from any directory."""
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def end(process: subprocess.Popen[bytes] | subprocess.Popen[str], within_s: float) -> bool:
+    """Wait for a process that was asked to end, and kill it after a time.
+
+    returns  whether it ended by itself
+    """
+    try:
+        process.wait(within_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(KILLED_S)
+        return False
+    return True
+
+
+def ending(status: int) -> str:
+    """How a process ended, in words."""
+    if status >= 0:
+        return f"status {status}"
+    try:
+        return f"killed by {signal.Signals(-status).name}"
+    except ValueError:
+        return f"killed by signal {-status}"
+
+
+class VerbProcess:
+    """A verb as a process with the same Python. It ends in an orderly way when it is asked to or this process ends.
+
+    A pipe whose other end this process holds tells it both. Signals of the terminal reach this process alone, which
+    decides what ends first.
+
+    name    for people
+    before  comes before its command line
+    said    file that takes its standard error; None: it goes where this process's goes
+    """
+
+    def __init__(
+        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), said: IO[str] | None = None
+    ) -> None:
+        self.name, self._said = name, said
+        read, self._lifeline = os.pipe()
+        try:
+            self.process = subprocess.Popen(
+                [*before, sys.executable, "-m", "runner", verb, *words],
+                stderr=said,
+                env={**environment(), LIFELINE: str(read)},
+                pass_fds=[read],
+                start_new_session=True,
+            )
+        finally:
+            os.close(read)
+
+    def poll(self) -> int | None:
+        """Its exit status, None while it runs."""
+        return self.process.poll()
+
+    def check(self) -> None:
+        """raises RunError where it has ended, with what it has said"""
+        status = self.poll()
+        if status is None:
+            return
+        text = ""
+        if self._said:
+            self._said.seek(0)
+            text = self._said.read().strip()
+        raise RunError(f"{self.name} ended early ({ending(status)})" + (f":\n{text}" if text else ""))
+
+    def ask(self) -> None:
+        """Ask it to end; more than once does no harm."""
+        if self._lifeline >= 0:
+            os.close(self._lifeline)
+            self._lifeline = -1
+
+    def kill(self) -> None:
+        self.process.kill()

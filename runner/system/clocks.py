@@ -1,0 +1,49 @@
+"""Whether the clocks of two machines agree well enough to tell the age of a picture. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+CLOCKS_APART_MS = -1.0  # an age below it tells that the vehicle's clock is ahead; above it, it is noise
+TRUSTED_AGAIN_S = 10.0  # for so long no age may be negative before ages are told again
+CURRENT_S = 1.0  # a picture that came longer ago has no age to tell
+
+
+@dataclass
+class Clocks:
+    """Whether the ages of pictures can be told: each is the difference of two machines' clocks.
+
+    A negative age tells that the vehicle's clock is ahead, by at least as much. All ages are too small then: unknown.
+    A clock that is behind makes them too large; nothing tells that.
+
+    ahead_ms  by how much the vehicle's clock is ahead at least; None: nothing tells so
+    """
+
+    ahead_ms: float | None = None
+    _negative: float = field(default=float("-inf"))  # when an age was negative last
+    _frames: dict[str, tuple[int, float]] = field(default_factory=dict)  # by camera, the count and when it last rose
+
+    def checked(self, t: float, samples: Mapping[str, Any]) -> dict[str, Any]:
+        """Samples with `frames` and `latency_ms` at time t, s: an age is None where unknown or no longer current."""
+        risen = {name for name, sample in samples.items() if self._rose(name, sample.frames, t)}
+        lowest = min((samples[name].latency_ms or 0.0 for name in risen), default=0.0)
+        if lowest < CLOCKS_APART_MS:
+            self.ahead_ms, self._negative = max(-lowest, self.ahead_ms or 0.0), t
+        elif t - self._negative > TRUSTED_AGAIN_S:
+            self.ahead_ms = None
+        return {
+            name: sample if self._known(name, sample, t) else replace(sample, latency_ms=None)
+            for name, sample in samples.items()
+        }
+
+    def _rose(self, name: str, frames: int, t: float) -> bool:
+        before = self._frames.get(name, (0, t))[0]
+        if frames != before:
+            self._frames[name] = (frames, t)
+        return frames != before
+
+    def _known(self, name: str, sample: Any, t: float) -> bool:
+        current = name in self._frames and t - self._frames[name][1] <= CURRENT_S
+        return current and self.ahead_ms is None and (sample.latency_ms or 0.0) >= 0

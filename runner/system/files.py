@@ -1,0 +1,107 @@
+"""Files that are there whole or not at all, and one that another package brings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TextIO
+
+from runner.errors import RunError, UserError
+from runner.system.signals import urgent
+
+
+@contextmanager
+def unfinished(path: Path) -> Iterator[Path]:
+    """Another name to write a file under; what is there at the end takes its place, what ends early is removed."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    with urgent(lambda: part.unlink(missing_ok=True)):
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_file(path: Path, argument: str = "output", *, partly: bool = False) -> Iterator[TextIO]:
+    """A text file for `argument` of the command line, there when it is whole.
+
+    What is there and no file, such as /dev/null, is written to as it is. What was there before stays where the writing
+    ends early.
+
+    partly  keep what was written before a mistake in the input, a UserError
+    raises  UserError where it cannot be opened, RunError where it cannot be written
+    """
+    mistake = None
+    try:
+        special = path.exists() and not path.is_file()
+        with nullcontext(path) if special else unfinished(path) as part, _opened(part, path, argument) as file:
+            try:
+                yield file
+            except UserError as error:
+                if not partly:
+                    raise
+                mistake = error
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    if mistake:
+        raise mistake
+
+
+def _opened(part: Path, path: Path, argument: str) -> TextIO:
+    try:
+        return part.open("w", encoding="utf-8")
+    except OSError as error:
+        raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
+
+
+def why_no_file(path: Path) -> str:
+    """The rule that a path breaks which names no regular file: a device, a pipe or a directory is none."""
+    return "must be a file" if path.exists() else "no such file"
+
+
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """Content of a regular file of limited size.
+
+    raises  ValueError with the rule that it breaks
+    """
+    if not path.is_file():
+        raise ValueError(why_no_file(path))
+    try:
+        with path.open("rb") as file:
+            content = file.read(most_bytes + 1)
+    except OSError as error:
+        raise ValueError((error.strerror or str(error)).lower()) from None
+    if len(content) > most_bytes:
+        raise ValueError(f"must be at most {most_bytes // 1000} kB long")
+    return content
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """A file that is there wholly or not at all.
+
+    raises  RunError
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished(path) as part:
+            part.write_bytes(content)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+
+
+def plotly_script(extra: str) -> Path:
+    """The script that plotly's wheel brings.
+
+    extra   of this package, that installs it
+    raises  RunError
+    """
+    spec = find_spec("plotly")
+    if spec is None or spec.origin is None:
+        raise RunError(f"the Python module plotly is not installed: install the extra {extra}, see docs/install.md")
+    return Path(spec.origin).parent / "package_data" / "plotly.min.js"

@@ -1,0 +1,251 @@
+"""SIGINT and SIGTERM, the same for every verb.
+
+The first signal asks the verb to end. It raises KeyboardInterrupt in the main thread or, after `stopping`, sets what
+the verb looks at. A second signal ends the process at once, and so does an orderly end that takes longer than its
+limit; files are then still whole or not there, since `urgent` says what must be cleaned up.
+
+No handler does any of this. The interpreter writes the number of each signal to a pipe (signal.set_wakeup_fd), and a
+thread reads it there: nothing is entered again by a second signal, and a main thread that is busy in a C library
+delays nothing.
+
+A process with a lifeline (see `runner.system.children`) takes the end of its parent as SIGTERM.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end the parent holds
+END_S = 2.0  # how long an orderly end may take
+URGENT_S = 0.5  # how long it may take to clean up where there is no orderly end
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+Action = Callable[[], object]
+
+
+class Stop:
+    """Set when the verb is to end. May be used from any thread.
+
+    limit_s  how long the end may take from then on; None: as long as it takes
+    action   called once when it is set, from another thread
+    """
+
+    def __init__(self, limit_s: float | None = END_S, action: Action = lambda: None) -> None:
+        self.limit_s, self._action = limit_s, action
+        self._event = threading.Event()
+
+    def is_set(self) -> bool:
+        return self._event.is_set()
+
+    @property
+    def status(self) -> int:
+        """Exit status of a verb whose ordinary end this is: 130 for Ctrl-C, 0 for SIGTERM and where nothing came."""
+        return 128 + signal.SIGINT if self.is_set() and _watch.number == signal.SIGINT else 0
+
+    def set(self) -> None:
+        if not self._event.is_set():
+            self._event.set()
+            self._action()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it is set, for some time at most; returns whether it is."""
+        return self._event.wait(timeout_s)
+
+
+class _Watch:
+    """What came of signals so far in this process, and the thread that reads them."""
+
+    def __init__(self) -> None:
+        self.number = 0  # of the first signal
+        self.stop: Stop | None = None
+        self.urgent: list[Action] = []
+        self.told = False  # whether the main thread knows of it
+        self.interrupted = False  # by an exception
+        self._deadline: float | None = None
+
+    @contextmanager
+    def handled(self) -> Iterator[None]:
+        """Take the signals, and give them back at the end."""
+        self.number, self.stop, self._deadline = 0, Stop(), None
+        self.told = self.interrupted = False
+        read, write = os.pipe()
+        os.set_blocking(write, False)
+        self._wakeup, self._over = write, False
+        before = [signal.signal(number, self._on_signal) for number in NUMBERS]
+        wakeup = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        thread = threading.Thread(target=self._run, args=(read, _lifeline()), name="signals", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(wakeup)
+            for number, handler in zip(NUMBERS, before, strict=True):
+                signal.signal(number, handler)
+            self._over = True
+            self._rouse()
+            thread.join(END_S)
+            if not thread.is_alive():
+                os.close(write)
+                os.close(read)
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        """Called by the interpreter in the main thread, before or after the thread has read the number."""
+        self.number = self.number or number  # the thread may not have read it yet
+        if self.stop is None and not self.told:
+            self.told = self.interrupted = True
+            raise KeyboardInterrupt
+
+    def _run(self, wakeup: int, lifeline: int | None) -> None:
+        ready = select.poll()
+        ready.register(wakeup, select.POLLIN)
+        if lifeline is not None:
+            ready.register(lifeline, select.POLLIN)
+        while not self._over:
+            found = {number for number, _ in ready.poll(self._left_ms())}
+            if lifeline in found and lifeline is not None:
+                ready.unregister(lifeline)
+                if not self.number:
+                    os.kill(os.getpid(), signal.SIGTERM)
+            if wakeup in found:
+                for number in filter(NUMBERS.__contains__, os.read(wakeup, 64)):
+                    self._take(number)
+            if self._deadline is not None and time.monotonic() >= self._deadline:
+                self._end("no orderly end in time: ending at once")
+
+    def _take(self, number: int) -> None:
+        if self._deadline is not None or (self.stop and self.stop.is_set()):
+            self._end("a second signal: ending at once")
+        self.number = self.number or number
+        self.ask()
+
+    def ask(self) -> None:
+        """Let the verb end: the time for it runs from now on. From any thread."""
+        stop = self.stop
+        limit_s = stop.limit_s if stop else END_S
+        self._deadline = None if limit_s is None else time.monotonic() + limit_s
+        self._rouse()
+        if stop:
+            self.told = True
+            stop.set()
+
+    def _rouse(self) -> None:
+        """Let the thread look at what has changed."""
+        with suppress(BlockingIOError):  # the pipe is full: it is about to look anyway
+            os.write(self._wakeup, b"\0")
+
+    def _left_ms(self) -> float | None:
+        return None if self._deadline is None else max(0.0, 1000 * (self._deadline - time.monotonic())) + 1
+
+    def _end(self, why: str) -> None:
+        """End the process here and now: no thread is waited for and no library is asked."""
+        cleaning = threading.Thread(target=self._clean, daemon=True)
+        cleaning.start()
+        cleaning.join(URGENT_S)
+        if select.select([], [2], [], 0)[1]:  # nobody may read there
+            with suppress(OSError):
+                os.write(2, f"{why}\n".encode())
+        os._exit(128 + self.number)
+
+    def _clean(self) -> None:
+        for action in reversed(self.urgent):
+            with suppress(Exception):
+                action()
+
+
+_watch = _Watch()
+
+
+@contextmanager
+def handled() -> Iterator[None]:
+    """Within, signals are taken, and interrupt what is `interruptible`. Outside the main thread this does nothing."""
+    if threading.current_thread() is threading.main_thread():
+        with _watch.handled():
+            yield
+    else:
+        yield
+
+
+@contextmanager
+def stopping(limit_s: float | None = END_S, action: Action = lambda: None) -> Iterator[Stop]:
+    """From here on a signal interrupts nothing but sets what this yields, and the verb ends in an orderly way.
+
+    What comes behind the block is taken for a part of that end, unless it is `interruptible`.
+
+    limit_s, action  see `Stop`
+    """
+    stop = _watch.stop = Stop(limit_s, action)
+    if _watch.number:  # it came just before
+        _watch.ask()
+    try:
+        yield stop
+    finally:
+        stop.limit_s = END_S if limit_s is None else limit_s
+        if _watch.number and limit_s is None:
+            _watch.ask()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Within, a signal raises KeyboardInterrupt; one that came before does so at once.
+
+    Libraries in C make other errors of it; what they raise is taken for it.
+    """
+    stop, _watch.stop = _watch.stop, None
+    try:
+        if _watch.number:
+            _watch.told = True
+            raise KeyboardInterrupt
+        yield
+    except Exception:
+        if _watch.interrupted:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        _watch.stop = stop
+
+
+def hold() -> None:
+    """From here on a signal raises nothing before the next `check`.
+
+    For what comes before `stopping` and uses PyGObject, which crashes where an exception comes from inside it.
+    """
+    _watch.stop = Stop()
+    if _watch.number:
+        _watch.ask()
+
+
+@contextmanager
+def urgent(action: Action) -> Iterator[None]:
+    """Within, what is to be done, quickly and from any thread, before the process ends without an orderly end."""
+    _watch.urgent.append(action)
+    try:
+        yield
+    finally:
+        _watch.urgent.remove(action)
+
+
+def check() -> None:
+    """For loops that wait while a signal interrupts nothing, after `hold` and `stopping`.
+
+    raises  KeyboardInterrupt, in the main thread alone, where the verb is to end
+    """
+    if _watch.stop and _watch.stop.is_set() and threading.current_thread() is threading.main_thread():
+        raise KeyboardInterrupt
+
+
+def received() -> int:
+    """The first signal that came, 0 for none."""
+    return _watch.number
+
+
+def _lifeline() -> int | None:
+    """The descriptor that the parent gave; not for children of this process."""
+    number = os.environ.pop(LIFELINE, "")
+    return int(number) if number.isdecimal() else None

@@ -1,0 +1,120 @@
+"""What waits for the vehicle's loop: bounded, fair between senders, in order for each of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from runner.records import Outcome
+
+WAITING = 64  # requests of one sender; further ones are refused
+ROUND_S = 0.1
+TAKEN = 32  # requests of one sender that are taken in a round: a flood leaves the processor to others
+SENDERS = 64  # senders with requests waiting; those of a further one are refused
+MODE_CHANGING = "mode_selected"
+MEASUREMENTS = ("position_reported", "bitrate_predicted", "link_measured")  # only the newest one counts
+
+Answer = Callable[[Outcome], None]
+
+
+class Request(NamedTuple):
+    """An event as JSON without `t`, and how to answer it.
+
+    sender  operator's id from the topic; "" for this process
+    as_of   see `runner.vehicle.operators`; None for a sender that need not say it: this process
+    """
+
+    sender: str
+    document: Mapping[str, Any]
+    answer: Answer | None = None
+    as_of: float | None = None
+
+    @property
+    def measures(self) -> tuple[Any, Any] | None:
+        """What it measures, where a newer measurement makes it worthless."""
+        name = self.document.get("event")
+        return (name, self.document.get("camera")) if name in MEASUREMENTS else None
+
+
+class Inbox:
+    """Requests of all senders, one of each in turn. May be used from any thread.
+
+    Requests are never merged or reordered, except that a measurement takes the place of an older one of the same
+    quantity, unless a request in between changes the mode.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, deque[Request]] = {}  # by sender, in the order of their turns
+        self._filled = threading.Condition()
+        self._woken = False
+        self._taken: dict[str, int] = {}  # by sender, in this round
+        self._round_ends = 0.0
+
+    def put(self, request: Request) -> Request | None:
+        """Queue a request; returns the one that is refused for it: itself, an older measurement, or None."""
+        with self._filled:
+            waiting = self._waiting.get(request.sender)
+            if waiting is None:
+                if len(self._waiting) >= SENDERS:
+                    return request
+                waiting = self._waiting[request.sender] = deque()
+            older = _superseded(waiting, request)
+            if older is None and len(waiting) >= WAITING:
+                return request
+            superseded = None if older is None else waiting[older]
+            if older is not None:
+                del waiting[older]
+            waiting.append(request)
+            self._filled.notify()
+            return superseded
+
+    def wake(self) -> None:
+        """Let `get` return though nothing has come."""
+        with self._filled:
+            self._woken = True
+            self._filled.notify()
+
+    def full(self, sender: str) -> bool:
+        """Whether a further request of a sender would probably be refused."""
+        return len(self._waiting.get(sender, ())) >= WAITING
+
+    def get(self, until: float) -> Request | None:
+        """The next request, as soon as there is one; None once woken or after a time of `time.monotonic()`."""
+        with self._filled:
+            while True:
+                now = time.monotonic()
+                sender = self._turn(now)
+                if sender is not None or self._woken or now >= until:
+                    break
+                self._filled.wait(min(until, self._round_ends if self._waiting else until) - now)
+            self._woken = False
+            if sender is None:
+                return None
+            waiting = self._waiting.pop(sender)
+            request = waiting.popleft()
+            if waiting:
+                self._waiting[sender] = waiting  # behind all others
+            self._taken[sender] = self._taken.get(sender, 0) + 1
+            return request
+
+    def _turn(self, now: float) -> str | None:
+        """The sender whose turn it is."""
+        if now >= self._round_ends:
+            self._taken.clear()
+            self._round_ends = now + ROUND_S
+        return next((sender for sender in self._waiting if self._taken.get(sender, 0) < TAKEN), None)
+
+
+def _superseded(waiting: deque[Request], newer: Request) -> int | None:
+    """Index of the older measurement of the same quantity since the last change of the mode."""
+    if newer.measures is None:
+        return None
+    for index in range(len(waiting) - 1, -1, -1):
+        if waiting[index].document.get("event") == MODE_CHANGING:
+            return None
+        if waiting[index].measures == newer.measures:
+            return index
+    return None

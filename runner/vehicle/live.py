@@ -1,0 +1,271 @@
+"""A vehicle that streams: cameras, loop and control link together. The verb `vehicle` runs it; so may your program.
+
+with live_vehicle(["source=appsrc"]) as vehicle:
+    vehicle.start()                               # the loop runs in a thread of its own
+    while driving:
+        vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.configuration import agreement
+from runner.configuration.config import configuration
+from runner.core.model import Progress, Vehicle
+from runner.drive.log import Log
+from runner.errors import RunError
+from runner.graph import rtsp_url
+from runner.mqtt.link import Link
+from runner.mqtt.messages import OFFLINE, Message, read_request, read_settings, read_state, read_telemetry, topic
+from runner.plans import compile_plans, render_missing
+from runner.records import Outcome, Settings, Telemetry, VehicleState, to_json
+from runner.vehicle.inbox import Request
+from runner.vehicle.loop import Loop
+
+if TYPE_CHECKING:
+    from runner.apply import VehicleSide
+
+STUCK_S = 2.0  # a loop that finishes nothing for so long is stuck
+WATCH_S = 0.25  # how often that is looked at
+END_S = 5.0  # a loop that does not end within this is left behind
+ANOTHER_S = 0.5  # a vehicle sends telemetry five times a second; who hears none of this name by then has it
+CONSOLE_LINES = 1000
+TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
+
+
+class LiveVehicle:
+    """The parts of a vehicle that streams.
+
+    side     the cameras
+    loop     events in, commands out; `loop.post` takes events from any thread
+    failure  why the vehicle had to end; None: it runs, or was stopped
+    """
+
+    def __init__(self, side: VehicleSide, loop: Loop) -> None:
+        self.side, self.loop = side, loop
+        self.failure: RunError | None = None
+        self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
+        self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+
+    def start(self) -> None:
+        """Run the loop in a thread, until the vehicle is left."""
+        self._thread = threading.Thread(target=self._run_apart, name="loop", daemon=True)
+        self._thread.start()
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Run the loop here, until `stop` or for a time.
+
+        raises  RunError where the vehicle had to end, as where another one has its name
+        """
+        self._watchdog.start()
+        try:
+            self.loop.run(duration_s)
+        finally:
+            self._ended.set()
+        if self.failure:
+            raise self.failure
+
+    def _run_apart(self) -> None:
+        try:
+            self.run()
+        except RunError as error:
+            self.failure = error
+            self.loop.report(str(error))
+
+    def push(self, camera: str, frame: Any) -> bool:
+        """One frame of a camera whose source is `appsrc`, captured now.
+
+        frame    I420 of the camera's (native) size: width * height * 3 / 2 bytes
+        returns  False where nobody watches, so that the frame went nowhere
+        raises   ValueError for a frame of another length or an unknown camera
+        """
+        return self.side.push(camera, frame)
+
+    def fail(self, error: RunError) -> None:
+        """End with an error, from any thread."""
+        self.failure = error
+        self.loop.stop()
+
+    def stop(self) -> None:
+        self.loop.stop()
+        if self._thread:
+            self._thread.join(END_S)
+
+    def _watch(self) -> None:
+        """Report a loop that hangs, as in a rule that never returns, and its return."""
+        stuck = False
+        while not self._ended.wait(WATCH_S):
+            silent = time.monotonic() - self.loop.beat
+            if (silent > STUCK_S) != stuck:
+                stuck = not stuck
+                doing = self.loop.busy_with or "nothing"
+                self.loop.report(f"the control loop hangs in {doing}" if stuck else "the control loop runs again")
+
+
+class _Console:
+    """Passes lines on in a thread of its own: a terminal that takes nothing (Ctrl-S) holds up nobody."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._lines: queue.Queue[str | None] = queue.Queue(CONSOLE_LINES)
+        self._thread = threading.Thread(target=self._run, name="console", daemon=True)
+        self._thread.start()
+
+    def say(self, line: str) -> None:
+        with suppress(queue.Full):
+            self._lines.put_nowait(line)
+
+    def close(self) -> None:
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=WATCH_S)
+        self._thread.join(WATCH_S)
+
+    def _run(self) -> None:
+        while (line := self._lines.get()) is not None:
+            self._say(line)
+
+
+class _ControlEnd:
+    """The vehicle's end of the control link: requests in, replies, state, telemetry and configuration out.
+
+    Nothing is published before it is known that no other vehicle of this name is at the broker.
+    """
+
+    def __init__(self, vehicle: Vehicle, document: Mapping[str, Any], report: Callable[[str], None]) -> None:
+        self._name, self._report = vehicle.name, report
+        self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
+        self._others: set[str] = set()
+        self._alone = threading.Event()
+        self._asked: threading.Timer | None = None
+        listen = {
+            self._topic("request", "+"): self._on_request,
+            self._topic("telemetry"): self._on_telemetry,
+            self._topic("state"): self._on_state,
+            self._topic("configuration"): self._on_configuration,
+        }
+        self._link = Link(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
+
+    def connect(self, live: LiveVehicle) -> None:
+        self._live = live
+        self._link.connect()
+
+    def publish(self, record: VehicleState | Telemetry | Settings) -> None:
+        if self._alone.is_set():
+            self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
+
+    def close(self) -> None:
+        if self._asked:
+            self._asked.cancel()
+        self._link.close(*([(self._topic("state"), OFFLINE)] if self._alone.is_set() else []))
+
+    def _topic(self, *parts: str) -> str:
+        return topic(self._name, *parts)
+
+    def _on_connected(self, here: bool) -> None:
+        if here and self._alone.is_set():
+            self._announce()
+        elif here:
+            self._asked = threading.Timer(ANOTHER_S, self._announce)
+            self._asked.daemon = True
+            self._asked.start()
+
+    def _announce(self) -> None:
+        if self._live.failure:
+            return
+        self._alone.set()
+        self.publish(self._settings)
+        self._live.loop.publish_again()  # the broker may have published the last will, or forgotten everything
+
+    def _on_request(self, message: Message) -> None:
+        if self._live.loop.overrun(message.sender):
+            return
+        asked = read_request(message)
+        reply = self._topic("reply", message.sender)
+
+        def answer(outcome: Outcome) -> None:
+            self._link.publish(reply, {"id": asked.identity, **to_json(outcome)})
+
+        request = Request(message.sender, asked.document, answer, asked.as_of)
+        if asked.problem:
+            self._live.loop.refuse(request, asked.problem)
+        else:
+            self._live.loop.take(request)
+
+    def _on_telemetry(self, message: Message) -> None:
+        """Before anything was published, telemetry that comes now is another vehicle's."""
+        if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
+            rule = "choose another `name`, or stop the other vehicle"
+            self._live.fail(RunError(f"a vehicle named {self._name} is at the broker already; {rule}"))
+
+    def _on_state(self, message: Message) -> None:
+        """A last will that the broker publishes late, when the vehicle is back already."""
+        if self._alone.is_set() and read_state(message.payload) is None:
+            self._live.loop.publish_again()
+
+    def _on_configuration(self, message: Message) -> None:
+        run = read_settings(message.payload).run
+        own = run == self._settings.run
+        if self._alone.is_set() and not message.retained and not own and run not in self._others:
+            self._others.add(run)
+            self._report(f"another vehicle named {self._name} has come to the broker: operators see both")
+
+
+@contextmanager
+def live_vehicle(
+    overrides: Sequence[str] = (),
+    conf: Path | None = None,
+    *,
+    log: Path | None = None,
+    say: Callable[[str], None] = print,
+    progress: Progress = lambda what, done: None,
+) -> Iterator[LiveVehicle]:
+    """Everything that the vehicle's side needs, stopped and said goodbye for at the end.
+
+    log       directory that the drive is recorded to
+    say       called, from a thread of its own, with one line on what happens
+    progress  called with how far the rendering of a synthetic drive is
+    raises    ConfigError, RunError
+    """
+    from runner import apply
+
+    config = configuration(overrides, conf, check=apply.check_plan)
+    (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
+    render_missing(vehicle, progress)
+    plans = compile_plans(vehicle)
+    apply.check_machine(plans)
+    console = _Console(say)
+    versions = apply.versions(e for p in plans for e in (*p.source, *p.vehicle))
+    drive = Log(log, "vehicle", document if log else {}, versions, console.say)
+
+    def report(what: str) -> None:
+        console.say(what)
+        drive.note(what)
+
+    video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
+    control = _ControlEnd(vehicle, document, report)
+    loop = Loop(vehicle, side, pqos, track, drive, control.publish, report)
+    side.on_turned = loop.wake
+    live = LiveVehicle(side, loop)
+    try:
+        control.connect(live)
+        for plan in plans:
+            console.say(
+                f"{plan.camera.name}: {rtsp_url(vehicle.media, plan.camera.name) if plan.serves else 'dials out'}"
+            )
+        yield live
+    finally:
+        live.stop()
+        control.close()
+        side.stop()
+        drive.close()
+        console.close()

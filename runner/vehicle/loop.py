@@ -1,0 +1,347 @@
+"""The live loop of the vehicle: take an event, step, apply, log, publish. It stays dull, and it survives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
+
+from runner.core.commands import Command, Knobs
+from runner.core.events import (
+    ClockAdvanced,
+    Event,
+    OperatorConnected,
+    OperatorDisconnected,
+    PositionReported,
+    describe,
+    parse,
+)
+from runner.core.model import Vehicle, plain
+from runner.core.step import Run, start, step
+from runner.drive.log import Log, log_run
+from runner.mqtt.messages import APPLY_S
+from runner.pqos import Pqos
+from runner.pqos.track import Track
+from runner.records import (
+    CameraState,
+    CameraTelemetry,
+    Outcome,
+    Position,
+    Telemetry,
+    VehicleState,
+    applied_to_json,
+)
+from runner.schema import event_problem
+from runner.vehicle.inbox import WAITING, Answer, Inbox, Request
+from runner.vehicle.operators import SILENT_S, Operators
+
+TICK_S = 0.1  # time between clock_advanced events
+TELEMETRY_TICKS = 2  # also the vehicle's sign of life
+REPEAT_S = 10.0  # the same fault is reported no more often than this
+REFUSALS = 10  # refusals that a sender is answered between two ticks; beyond, they are counted only
+
+
+class Applier(Protocol):
+    """What the loop asks of the side that streams."""
+
+    def turn(self, commands: Iterable[Command]) -> None: ...
+    def applied(self) -> Mapping[str, Knobs]: ...
+    def sent(self) -> Mapping[str, tuple[int, int]]: ...
+    def faults(self) -> list[str]: ...
+    def sources(self) -> Mapping[str, str]: ...
+    def give_control(self, operator: str) -> None: ...
+
+
+class _Asked(NamedTuple):
+    """A request that was accepted and is not answered before its commands are read back as applied."""
+
+    answer: Answer
+    knobs: Sequence[tuple[str, str]]  # camera, knob
+    until: float
+
+
+@dataclass
+class Loop:
+    """Events in, commands out, in one thread. Other threads `post` what they have.
+
+    publish  called with the state (decided and applied) whenever it changed, and telemetry a few times a second
+    report   called with one line on what happened and what came of it
+
+    An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
+    something (time.monotonic), `busy_with` what it is doing.
+    """
+
+    vehicle: Vehicle
+    applier: Applier
+    pqos: Pqos
+    track: Track | None
+    log: Log
+    publish: Callable[[VehicleState | Telemetry], None]
+    report: Callable[[str], None]
+    refused: int = 0
+    errors: int = 0
+    beat: float = 0.0
+    busy_with: str = ""
+    _inbox: Inbox = field(default_factory=Inbox)
+    _stopped: bool = False
+    _ticks: int = 0
+    _asked: list[_Asked] = field(default_factory=list)
+    _published: VehicleState | None = None  # the state as last published
+    _publish_again: bool = False
+    _cause: str = ""  # the event that the decision in force came from
+    _position: PositionReported | None = None
+    _reported: dict[str, float] = field(default_factory=dict)  # by fault, when it was last reported
+    _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
+
+    def __post_init__(self) -> None:
+        self._operators = Operators(self.vehicle.expires_s)
+        self._began = time.monotonic()
+
+    def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
+        """An event as JSON without `t`, from this process, from any thread.
+
+        answer  called with what became of it: applied, refused, expired or timed out
+        """
+        self.take(Request("", document, answer))
+
+    def take(self, request: Request) -> None:
+        """A request, from any thread. A sender whose requests wait already is refused further ones."""
+        dropped = self._inbox.put(request)
+        if dropped is request:
+            self.refuse(request, f"too many: {WAITING} requests of this sender are waiting")
+        elif dropped:
+            self.refuse(dropped, "superseded: a newer one came before this was taken")
+
+    def overrun(self, sender: str) -> bool:
+        """Whether a sender floods the vehicle, so that its message is counted and not even read. From any thread."""
+        answers = self._refusals.get(sender, 0)
+        if answers < REFUSALS or not self._inbox.full(sender):
+            return False
+        self.refused += 1
+        return True
+
+    def refuse(self, request: Request, problem: str) -> None:
+        """Count and answer what is not even queued, from any thread; only so many answers between two ticks."""
+        self.refused += 1
+        answers = self._refusals[request.sender] = self._refusals.get(request.sender, 0) + 1
+        if request.answer and answers <= REFUSALS:
+            request.answer(Outcome(self._now(), "refused", problem))
+
+    def wake(self) -> None:
+        """Knobs were turned: look what is applied now. From any thread."""
+        self._inbox.wake()
+
+    def publish_again(self) -> None:
+        """Publish the state though nothing changed, since the broker may have lost it. From any thread."""
+        self._publish_again = True
+        self._inbox.wake()
+
+    def stop(self) -> None:
+        """End soon. From any thread or signal handler's thread, any number of times."""
+        self._stopped = True
+        self._inbox.wake()
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Work until stopped, or for a time.
+
+        raises  RuleFailed where the first decision cannot be made
+        """
+        self._began = self.beat = time.monotonic()
+        self.log.begin()
+        self._warned = 0
+        self._run = start(self.vehicle)
+        self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
+        next_tick = TICK_S
+        while not self._stopped and (duration_s is None or self._now() < duration_s):
+            if self._now() >= next_tick:
+                self._guarded("clock_advanced", self._tick)
+                next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
+            request = self._inbox.get(self._began + next_tick)
+            if request:
+                self._guarded(str(request.document.get("event")), lambda r=request: self._take_request(r))  # type: ignore[misc]
+            self._guarded("state", self._publish_state)
+
+    def _guarded(self, what: str, work: Callable[[], None]) -> None:
+        """Do a piece of work; an exception in it must not end the streams of a vehicle that moves."""
+        self.busy_with = what
+        try:
+            work()
+        except Exception as error:
+            self.errors += 1
+            self._report_once(f"{what}: {type(error).__name__}: {error}")
+        self.busy_with, self.beat = "", time.monotonic()
+
+    def _report_once(self, text: str) -> None:
+        """Report what went wrong, but the same no more often than every REPEAT_S."""
+        now = self._now()
+        if now - self._reported.get(text, -REPEAT_S) >= REPEAT_S:
+            self._reported = {t: at for t, at in self._reported.items() if now - at < REPEAT_S} | {text: now}
+            self.report(text)
+
+    def _now(self) -> float:
+        return round(time.monotonic() - self._began, 6)
+
+    def _tick(self) -> None:
+        """Time passes: where the drive comes from a track, the position with it."""
+        t = self._now()
+        self._refusals = {}
+        if self.track is not None:
+            self._take(replace(self.track.at(t), t=t))
+        self._take(ClockAdvanced(t=t))
+        for fault in self.applier.faults():
+            self.report(fault)
+        self._ticks += 1
+        if self._ticks % TELEMETRY_TICKS == 0:
+            self._publish_measured(t)
+        self._watch_operators(t)
+        self._publish_state()
+
+    def _take_request(self, request: Request) -> None:
+        try:
+            self._answer_request(request)
+        except Exception as error:
+            if request.answer:
+                request.answer(Outcome(self._now(), "refused", f"failed: {type(error).__name__}: {error}"))
+            raise
+
+    def _answer_request(self, request: Request) -> None:
+        t = self._now()
+        stamped = {**request.document, "t": t}
+        problem = event_problem(stamped)
+        event = None if problem else parse(stamped)
+        self._hear(request.sender, t, event)
+        if event is None:
+            self._refuse(problem, t, request.answer)
+        elif request.as_of is not None and (late := self._operators.expired(request.sender, t, request.as_of)):
+            self.refused += 1
+            self._answer(request.answer, Outcome(t, "expired", late))
+        elif isinstance(event, OperatorConnected | OperatorDisconnected):
+            self._answer(request.answer, Outcome(t, "applied", ""))  # presence has been looked at
+        else:
+            self._take(event, request.answer)
+
+    def _hear(self, sender: str, t: float, event: Event | None) -> None:
+        """Any message of an operator shows its presence. The core sees the first that comes and the last that goes."""
+        before = self._operators.present
+        if isinstance(event, OperatorConnected):
+            self._operators.connected(sender, t)
+        elif isinstance(event, OperatorDisconnected):
+            self._operators.disconnected(sender)
+        else:
+            self._operators.heard(sender, t)
+        self._presence_changed(before, t, "said goodbye")
+
+    def _watch_operators(self, t: float) -> None:
+        before = self._operators.present
+        self._operators.silent(t)
+        self._presence_changed(before, t, f"has been silent for {SILENT_S:g} s")
+
+    def _presence_changed(self, before: frozenset[str], t: float, why: str) -> None:
+        now = self._operators.present
+        if now != before:
+            self.applier.give_control(self._operators.in_control)
+        for name in sorted(now - before):
+            self.report(f"operator {name} is present")
+        for name in sorted(before - now):
+            self.report(f"operator {name} {why}")
+        if now and not before:
+            self._take(OperatorConnected(t=t))
+        elif before and not now:
+            self._take(OperatorDisconnected(t=t))
+
+    def _refuse(self, problem: str, t: float, answer: Answer | None) -> None:
+        self.refused += 1
+        self._answer(answer, Outcome(t, "refused", problem))
+
+    def _answer(self, answer: Answer | None, outcome: Outcome) -> None:
+        if answer:
+            answer(outcome)
+
+    def _take(self, event: Event, answer: Answer | None = None) -> None:
+        self._take_run(step(self.vehicle, self._run, event), event, answer)
+        prediction = self.pqos.observe(event)
+        for warning in self.pqos.warnings[self._warned :]:
+            self._warned += 1
+            self.report(warning)
+        if prediction is not None:
+            self._take_run(step(self.vehicle, self._run, prediction), prediction)
+
+    def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:
+        before, self._run = self._run, after
+        try:
+            self.applier.turn(after.commands)
+        except Exception:
+            self._run = replace(after, commanded=before.commanded)  # so that the next event commands it again
+            raise
+        log_run(self.log, event, before, after)
+        if isinstance(event, PositionReported):
+            self._position = event
+        if after.fault:
+            self._report_once(f"{after.fault}; the decision before stays in force")
+        elif before.fault:
+            self.report("the rules decide again")
+        if after.refused:
+            self.refused += 1
+            self._report_once(f"refused: {after.refused}")
+            self._answer(answer, Outcome(event.t, "refused", after.refused))
+        elif answer:
+            knobs = [(command.camera, command.knob) for command in after.commands]
+            self._asked.append(_Asked(answer, knobs, event.t + APPLY_S))
+        if after.commands or after.decision != before.decision:
+            self._report_decision(before, event)
+
+    def _report_decision(self, before: Run, event: Event) -> None:
+        self._cause = describe(event)
+        for name, now in self._run.decision.settings.items():
+            was = before.decision.settings[name]
+            if (was.scaling, was.sending) != (now.scaling, now.sending):
+                self.report(f"{self._cause} -> {name}: {now.reason}")
+
+    def _publish_state(self) -> None:
+        """Publish what is decided and what is applied, where either changed; answer requests that are applied now."""
+        applied = self.applier.applied()
+        state = self._state(applied)
+        if state != self._published or self._publish_again:
+            self._publish_again = False
+            self._published = state
+            self.publish(state)
+        self._asked = [asked for asked in self._asked if not self._answered(asked, applied)]
+
+    def _state(self, applied: Mapping[str, Knobs]) -> VehicleState:
+        decision, weights, faults = self._run.decision, self._run.state.weights, self.applier.sources()
+        cameras = {
+            name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name))
+            for name, setting in decision.settings.items()
+        }
+        fault = self._run.fault or None
+        return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
+
+    def _answered(self, asked: _Asked, applied: Mapping[str, Knobs]) -> bool:
+        """Answer a request, if all that it made of knobs is applied, or time is up."""
+        now, commanded = self._now(), self._run.commanded
+        watched = [(name, knob) for name, knob in asked.knobs if applied[name]]
+        waiting = [f"{name} {knob}" for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
+        if waiting and now < asked.until:
+            return False
+        if waiting:
+            asked.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {', '.join(waiting)}"))
+            return True
+        unwatched = dict.fromkeys(name for name, _ in asked.knobs if not applied[name])
+        reason = f"nobody watches {', '.join(unwatched)}: kept until somebody does" if unwatched else ""
+        asked.answer(Outcome(now, "applied", reason))
+        return True
+
+    def _publish_measured(self, t: float) -> None:
+        """What was read back from the elements, and what the encoders have put out so far."""
+        sent = self.applier.sent()
+        cameras = {
+            name: CameraTelemetry(applied_to_json(name, knobs), *sent[name])
+            for name, knobs in self.applier.applied().items()
+        }
+        prediction = self._run.state.prediction
+        predicted = plain(prediction.kbps) if prediction else None
+        position = Position.of(self._position) if self._position else None
+        telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors)
+        self.log.record(telemetry)
+        self.publish(telemetry)

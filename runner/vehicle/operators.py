@@ -1,0 +1,100 @@
+"""Which operators are present, and whether a request is too old to be carried out. Pure: time is given.
+
+An operator is whoever sends requests under an id of its own, which is part of the topic. It is present from its
+`operator_connected` on. It leaves by its own silence or its own `operator_disconnected`; any later message of its own
+brings it back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from runner.mqtt.messages import MAX_ROUND_TRIP_S
+
+SILENT_S = 1.0  # an operator who sends nothing for so long has left; a present one sends four messages a second
+AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks that drift apart
+DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
+MOST = 64  # operators remembered; the one that has been silent longest is forgotten for a new one
+
+
+@dataclass(slots=True)
+class _Operator:
+    heard: float
+    since: float = 0.0
+    present: bool = False
+    announced: bool = False
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
+
+
+class Operators:
+    """All operators that the vehicle has heard of.
+
+    expires_s  age from which a request is dropped, beyond the measured round trip
+    """
+
+    def __init__(self, expires_s: float) -> None:
+        self._expires_s = expires_s
+        self._known: dict[str, _Operator] = {}
+
+    @property
+    def present(self) -> frozenset[str]:
+        return frozenset(name for name, operator in self._known.items() if operator.present)
+
+    @property
+    def in_control(self) -> str:
+        """The operator who has been present longest without a break, "" for none."""
+        present = {name: operator.since for name, operator in self._known.items() if operator.present}
+        return min(present, key=lambda name: present[name], default="")
+
+    def connected(self, name: str, t: float) -> bool:
+        """An operator announces itself, or does so again as its sign of life; returns whether it was away."""
+        operator = self._operator(name, t)
+        operator.announced = True
+        return self.heard(name, t)
+
+    def heard(self, name: str, t: float) -> bool:
+        """Any message of an operator at time t, s; returns whether it brings a present operator back."""
+        operator = self._operator(name, t)
+        operator.heard = t
+        returns = operator.announced and not operator.present
+        if returns:
+            operator.present, operator.since = True, t
+        return returns
+
+    def disconnected(self, name: str) -> bool:
+        """An operator says goodbye, or its last will does; returns whether it was present."""
+        operator = self._known.get(name)
+        was_present = operator is not None and operator.present
+        if operator:
+            operator.present = False
+        return was_present
+
+    def silent(self, t: float) -> list[str]:
+        """Operators who have been silent for too long since the last call; they count as away now."""
+        gone = [name for name, o in self._known.items() if o.present and t - o.heard > SILENT_S]
+        for name in gone:
+            self._known[name].present = False
+        return gone
+
+    def expired(self, name: str, t: float, as_of: float) -> str:
+        """Why a request is too old to be carried out at time t, or "".
+
+        as_of  the vehicle's time in the newest telemetry that the sender had, plus the time since by the sender's
+               clock. So `t - as_of` is one round trip for a request that nothing held up; no clocks are compared.
+        """
+        delay = t - as_of
+        if delay < -AHEAD_S:
+            return f"as_of {as_of:g} is ahead of the vehicle's time, {t:g}"
+        operator = self._operator(name, t)
+        round_trip = min(operator.delays, default=0.0)
+        operator.delays.append(max(0.0, delay))
+        limit = self._expires_s + min(round_trip, MAX_ROUND_TRIP_S)
+        return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else ""
+
+    def _operator(self, name: str, t: float) -> _Operator:
+        if name not in self._known:
+            if len(self._known) >= MOST:
+                del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].heard))]
+            self._known[name] = _Operator(heard=t)
+        return self._known[name]

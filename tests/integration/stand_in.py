@@ -1,0 +1,84 @@
+"""Both sides without GStreamer: what they are told is recorded, and answered as if every camera streamed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from runner.apply import Received
+from runner.core.commands import Command, Knobs, KnobValue
+from runner.graph import Plan
+
+FRAMES = 5  # that a camera which sends has delivered from one look to the next
+FRAME_BYTES = 1000
+
+
+class RecordingVehicle:
+    """Stands in for `runner.apply.VehicleSide`.
+
+    watched   cameras that have a pipeline: what is commanded of them counts as applied
+    commands  all that came, in order
+    """
+
+    def __init__(self, plans: Sequence[Plan], *_: Any) -> None:
+        self._names = [plan.camera.name for plan in plans]
+        self._lock = threading.Lock()
+        self._wanted: dict[str, dict[str, KnobValue]] = {name: {} for name in self._names}
+        self._sent = dict.fromkeys(self._names, 0)
+        self.watched: set[str] = set()
+        self.commands: list[Command] = []
+        self.controller = ""
+        self.on_turned: Callable[[], None] = lambda: None
+
+    def watch(self, *names: str) -> None:
+        self.watched = set(names)
+        self.on_turned()
+
+    def turn(self, commands: Iterable[Command]) -> None:
+        with self._lock:
+            for command in commands:
+                self.commands.append(command)
+                self._wanted[command.camera][command.knob] = command.value
+        self.on_turned()
+
+    def applied(self) -> dict[str, Knobs]:
+        with self._lock:
+            return {name: dict(knobs) if name in self.watched else {} for name, knobs in self._wanted.items()}
+
+    def sent(self) -> dict[str, tuple[int, int]]:
+        for name, knobs in self.applied().items():
+            self._sent[name] += FRAMES if knobs.get("sending") else 0
+        return {name: (frames, FRAME_BYTES * frames) for name, frames in self._sent.items()}
+
+    def faults(self) -> list[str]:
+        return []
+
+    def sources(self) -> dict[str, str]:
+        return {}
+
+    def give_control(self, operator: str) -> None:
+        self.controller = operator
+
+    def push(self, camera: str, frame: Any) -> bool:
+        return camera in self.watched
+
+    def stop(self) -> None:
+        self.watched = set()
+
+
+class RecordingOperator:
+    """Stands in for `runner.apply.OperatorSide`: cameras that should send deliver frames of a fixed size."""
+
+    def __init__(self, plans: Sequence[Plan], *_: Any, **__: Any) -> None:
+        self._received = {plan.camera.name: Received() for plan in plans}
+
+    def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
+        for name, received in self._received.items():
+            frames = received.frames + (FRAMES if sending.get(name) else 0)
+            size = (640, 480) if frames else (0, 0)
+            self._received[name] = Received(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
+        return dict(self._received)
+
+    def stop(self) -> None:
+        self._received = {}

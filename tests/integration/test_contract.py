@@ -1,0 +1,195 @@
+"""What loop and station ask of the sides that stream: the same under GStreamer and under stand-ins that record."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+
+import pytest
+
+from rig import Heard, Operator, free_port, process, until
+from runner import apply
+from runner.operator.frames import live_frames
+from runner.operator.live import live_operator
+from runner.vehicle.live import live_vehicle
+from stand_in import RecordingOperator, RecordingVehicle
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=10", "pqos=constant", "pqos.kbps=3000")
+CAMERAS = ("front", "rear", "mast")
+
+
+class Watched:
+    """A vehicle that streams, and who watches which of its cameras."""
+
+    def __init__(self, live, words, stack):
+        self.live, self._words, self._stack = live, words, stack
+
+    def watch(self, *names):
+        if isinstance(self.live.side, RecordingVehicle):
+            self.live.side.watch(*names)
+        else:
+            frames = self._stack.enter_context(live_frames(self._words, cameras=names))
+            seen = set()
+            until(lambda: seen.add(frames.next(15).camera) or seen == set(names))
+
+
+@pytest.fixture(params=["recording", "gstreamer"])
+def vehicle(request, broker, monkeypatch):
+    if request.param == "recording":
+        monkeypatch.setattr(apply, "VehicleSide", RecordingVehicle)
+    words = [*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"]
+    with ExitStack() as stack:
+        live = stack.enter_context(live_vehicle(words, say=lambda line: None))
+        live.start()
+        yield Watched(live, words, stack)
+
+
+@pytest.fixture
+def operator(broker, vehicle):
+    operator = Operator(broker)
+    ended = threading.Event()
+
+    def stay() -> None:
+        while not ended.wait(0.3):
+            operator.send("stay", event="operator_connected")
+
+    staying = threading.Thread(target=stay)
+    staying.start()
+    yield operator
+    ended.set()
+    staying.join()
+
+
+def applied(operator, name, **knobs):
+    """The applied knobs of a camera, once they are as given."""
+
+    def fits(state):
+        have = state["cameras"][name]["applied"]
+        return all(have.get(knob) == value for knob, value in knobs.items())
+
+    return operator.reach(fits)["cameras"][name]["applied"]
+
+
+def test_what_nobody_watches_is_kept_until_somebody_does(operator, vehicle):
+    operator.ask("1", event="mode_selected", mode="collective")
+    reply = operator.ask("2", event="total_set", kbps=1200)
+    assert reply["result"] == "applied"
+    assert reply["reason"] == "nobody watches front, rear, mast: kept until somebody does"
+    vehicle.watch("rear")
+    cameras = operator.reach(lambda state: fits(state["cameras"]["rear"]))["cameras"]
+    assert not cameras["front"]["applied"]
+
+
+def test_a_request_is_answered_once_it_is_read_back(operator, vehicle):
+    vehicle.watch(*CAMERAS)
+    operator.ask("1", event="mode_selected", mode="collective")
+    for number, kbps in enumerate((900, 4000, 500), 2):
+        reply = operator.ask(str(number), event="total_set", kbps=kbps)
+        assert (reply["result"], reply["reason"]) == ("applied", "")
+        state = operator.reach(lambda state, kbps=kbps: state["total_kbps"] == kbps and all_fit(state))
+        assert sum(camera["applied"]["bitrate"] for camera in state["cameras"].values()) <= kbps
+
+
+def fits(camera):
+    """Whether what is decided for a camera is applied."""
+    size = {"width": camera["width"], "height": camera["height"]}
+    return (camera["applied"].get("bitrate"), camera["applied"].get("size")) == (camera["kbps"], size)
+
+
+def all_fit(state):
+    return all(fits(camera) for camera in state["cameras"].values())
+
+
+def test_a_camera_that_is_switched_off_stops_and_resumes_as_it_was(operator, vehicle):
+    vehicle.watch("rear")
+    before = applied(operator, "rear", sending=True)
+    assert operator.ask("1", event="camera_switched", camera="rear", on=False)["result"] == "applied"
+    applied(operator, "rear", sending=False)
+    assert operator.ask("2", event="camera_switched", camera="rear", on=True)["result"] == "applied"
+    assert applied(operator, "rear", sending=True) == before
+
+
+def test_a_region_of_interest_is_applied_whole(operator, vehicle):
+    vehicle.watch("rear")
+    operator.ask("1", event="mode_selected", mode="single")
+    roi = {"x": 100, "y": 50, "width": 320, "height": 240}
+    assert operator.ask("2", event="roi_set", camera="rear", **roi)["result"] == "applied"
+    applied(operator, "rear", roi=roi)
+    rear = operator.reach(lambda state: fits(state["cameras"]["rear"]))["cameras"]["rear"]
+    assert rear["roi"] == rear["applied"]["roi"] == roi
+
+
+def test_telemetry_counts_what_is_sent_of_watched_cameras_only(operator, vehicle):
+    vehicle.watch("rear")
+    until(lambda: operator.telemetry and operator.telemetry[-1]["cameras"]["rear"]["frames"] > 10)
+    cameras = operator.telemetry[-1]["cameras"]
+    assert cameras["front"] == {"applied": {}, "frames": 0, "bytes": 0}
+    assert cameras["rear"]["bytes"] > cameras["rear"]["frames"]
+    assert cameras["rear"]["applied"]["sending"] is True
+
+
+# --- the operator's side ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["recording", "gstreamer"])
+def live(request, broker, monkeypatch):
+    """An operator's side that runs beside a real vehicle, and what its station has said."""
+    if request.param == "recording":
+        monkeypatch.setattr(apply, "OperatorSide", RecordingOperator)
+    words = [*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"]
+    with process("vehicle", *words) as vehicle, live_operator(words) as operator:
+        heard = Heard()
+        operator.station.listeners.append(heard)
+        operator.start()
+        until(lambda: operator.station.state)
+        yield operator, heard, vehicle
+
+
+def samples(heard):
+    return [record for kind, record in heard.said if kind == "sample"]
+
+
+def cameras(heard):
+    return samples(heard)[-1].cameras
+
+
+def test_every_camera_that_should_send_arrives(live):
+    operator, heard, _ = live
+    until(lambda: samples(heard) and all(camera.fps and camera.allocated_kbps for camera in cameras(heard).values()))
+    last = samples(heard)[-1]
+    assert set(last.cameras) == {row.name for row in operator.station.rows()} == set(CAMERAS)
+    assert all(camera.width and camera.frames and camera.bytes for camera in last.cameras.values())
+    assert not any(camera.rebuilt for camera in last.cameras.values())
+    assert last.allocated_kbps == sum(camera.allocated_kbps for camera in last.cameras.values())
+    assert "the vehicle is online, mode automatic" in heard.notes
+
+
+def test_requests_are_answered_and_change_the_state(live):
+    operator, _, _ = live
+    replies = []
+    operator.station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
+    operator.station.ask({"event": "total_set", "kbps": 1000}, replies.append)
+    operator.station.ask({"event": "total_set", "kbps": -1}, replies.append)
+    until(lambda: len(replies) == 3)
+    assert sorted(reply.result for reply in replies) == ["applied", "applied", "refused"]
+    until(lambda: operator.station.state.total_kbps == 1000)
+
+
+def test_a_camera_that_is_switched_off_is_no_fault(live):
+    operator, heard, _ = live
+    until(lambda: samples(heard) and samples(heard)[-1].cameras["rear"].fps > 0)
+    operator.station.ask({"event": "camera_switched", "camera": "rear", "on": False})
+    until(lambda: not operator.station.sending()["rear"])
+    until(lambda: samples(heard)[-1].cameras["rear"].fps == 0)
+    assert samples(heard)[-1].cameras["rear"].rebuilt == 0
+    assert operator.runs()
+
+
+def test_a_vehicle_that_is_killed_is_offline_and_all_rates_fall_to_zero(live):
+    operator, heard, vehicle = live
+    until(lambda: samples(heard) and samples(heard)[-1].cameras["rear"].fps > 0)
+    vehicle.kill()
+    until(lambda: operator.station.state is None)
+    until(lambda: all(camera.fps == 0 for camera in samples(heard)[-1].cameras.values()))
+    assert samples(heard)[-1].allocated_kbps == 0
+    assert operator.runs()

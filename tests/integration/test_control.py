@@ -1,0 +1,378 @@
+"""The control link under operators that stall, brokers that vanish, floods, garbage, and rules that fail."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+
+from rig import CHECKOUT, Heard, Operator, free_port, process, run, until
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint
+from runner.mqtt.broker import find_mosquitto, private_broker
+from runner.operator.station import Station
+from runner.vehicle.operators import SILENT_S
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000", "page.serve=false")
+
+
+@pytest.fixture
+def ports(broker):
+    return (f"control.port={broker.port}", f"media.port={free_port()}")
+
+
+@pytest.fixture
+def vehicle(ports, tmp_path):
+    with process("vehicle", *ROBOT, *ports, f"log={tmp_path / 'drive'}", stdout=subprocess.DEVNULL) as child:
+        yield child
+
+
+@pytest.fixture
+def stack():
+    with ExitStack() as stack:
+        yield stack
+
+
+class Present:
+    """An operator that gives its sign of life until it is left."""
+
+    def __init__(self, broker, stack, name=""):
+        self.operator = Operator(broker, name=name)
+        self._left = threading.Event()
+        thread = threading.Thread(target=self._breathe)
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(self._left.set)
+
+    def _breathe(self):
+        while not self._left.wait(SILENT_S / 4):
+            self.operator.send("sign of life", event="operator_connected")
+
+    def leave(self):
+        self._left.set()
+
+
+def logged(tmp_path):
+    file = tmp_path / "drive" / "drive.jsonl"
+    whole = file.read_text().rpartition("\n")[0] if file.exists() else ""
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def notes(tmp_path):
+    lines = logged(tmp_path)
+    return [line["text"] for line in lines if line.get("log") == "note"]
+
+
+def sending(state):
+    return state["online"] and all(camera["sending"] for camera in state["cameras"].values())
+
+
+def paused(state):
+    return state["online"] and not any(camera["sending"] for camera in state["cameras"].values())
+
+
+# --- presence ---------------------------------------------------------------------------------------------------------
+
+
+def test_other_operators_do_not_stop_the_video_of_one_who_is_present(broker, vehicle, tmp_path, stack):
+    first, second, stranger = (Present(broker, stack, name) for name in ("first", "second", "third"))
+    until(lambda: {f"operator {name} is present" for name in ("first", "second", "third")} <= set(notes(tmp_path)))
+    second.leave()
+    stranger.leave()
+    stranger.operator.send("bye", event="operator_disconnected")
+    until(lambda: {"operator second has been silent for 1 s", "operator third said goodbye"} <= set(notes(tmp_path)))
+    time.sleep(3 * SILENT_S)  # sending would have stopped by now
+    assert first.operator.ask("1", event="mode_selected", mode="collective")["result"] == "applied"
+    assert not [line for line in logged(tmp_path) if line.get("event") == "operator_disconnected"], notes(tmp_path)
+    first.leave()
+    first.operator.state(paused)
+
+
+@pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
+def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_s, tmp_path):
+    """Its connection may have been closed by the broker meanwhile, or not."""
+    onlooker = Operator(broker)
+    with process("operator", *ROBOT, *ports, stdout=subprocess.DEVNULL) as operator:
+        onlooker.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
+        until(lambda: any("is present" in note for note in notes(tmp_path)))
+        operator.send_signal(signal.SIGSTOP)
+        onlooker.state(paused)
+        time.sleep(stall_s - 2.1)  # gone after 1 s, paused after another one
+        operator.send_signal(signal.SIGCONT)
+        woken = time.monotonic()
+        onlooker.state(sending)
+        assert time.monotonic() - woken < 1.5
+
+
+# --- requests ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_request_that_comes_late_is_not_carried_out(broker, vehicle):
+    operator = Operator(broker)
+    operator.ask("1", event="mode_selected", mode="collective")
+    operator.ask("2", event="total_set", kbps=1000)
+    vehicle.send_signal(signal.SIGSTOP)
+    operator.send("3", event="total_set", kbps=9000)
+    time.sleep(2.5)
+    vehicle.send_signal(signal.SIGCONT)
+    late = until(lambda: operator.replies.get("3"))
+    assert late["result"] == "expired"
+    assert late["reason"].endswith(" s old, limit 1.00 s") or " s old, limit 1.0" in late["reason"]
+    assert operator.ask("4", event="total_set", kbps=1200)["result"] == "applied"
+    assert operator.state(lambda state: state["total_kbps"] not in (3000, 1000))["total_kbps"] == 1200
+
+
+def test_a_request_must_say_as_of_when_and_is_never_retained(broker, vehicle):
+    operator = Operator(broker)
+    as_of = operator.as_of()
+    rule = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
+    for identity, keys, reason in (
+        ("1", {}, rule),
+        ("2", {"as_of": "now"}, rule),
+        ("3", {"as_of": True}, rule),
+        ("4", {"as_of": None}, rule),
+    ):
+        operator.publish(json.dumps({"id": identity, "event": "total_set", "kbps": 1, **keys}).encode())
+        assert until(lambda i=identity: operator.replies.get(i))["reason"] == reason
+    strange = Operator(broker, name="anyone else")
+    strange.publish(json.dumps({"id": "1", "as_of": as_of, "event": "operator_connected"}).encode())
+    said = until(lambda: strange.replies.get(""))
+    assert said["reason"] == "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
+    ahead = operator.ask("5", event="total_set", kbps=1, as_of=as_of + 100)
+    assert ahead["result"] == "expired" and "is ahead of the vehicle's time" in ahead["reason"]
+    retained = json.dumps({"id": "6", "as_of": as_of, "event": "mode_selected", "mode": "single"}).encode()
+    with process("vehicle", *ROBOT, "name=late", f"control.port={broker.port}", f"media.port={free_port()}"):
+        late = Operator(broker, vehicle="late")
+        late.as_of()
+    late.publish(retained, retain=True)
+    with process("vehicle", *ROBOT, "name=late", f"control.port={broker.port}", f"media.port={free_port()}"):
+        said = until(lambda: late.replies.get("6"))
+        assert (said["result"], said["reason"]) == ("refused", "must not be retained: a request is for now")
+    late.publish(b"", retain=True)
+
+
+FLOOD = """
+import json, sys, time
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+client = Client(CallbackAPIVersion.VERSION2)
+client.connect("127.0.0.1", int(sys.argv[1]))
+client.loop_start()
+message = json.dumps({"id": "x", "as_of": 0, "event": "total_set", "kbps": 3000})
+began, sent = time.monotonic(), 0
+while (passed := time.monotonic() - began) < 4:
+    for _ in range(100):
+        client.publish("tod/delivery_robot/request/flood", message)
+        sent += 1
+    time.sleep(max(0, sent / 10_000 - passed))
+print(sent)
+"""
+
+
+def test_a_flood_of_one_operator_holds_up_no_other(broker, vehicle):
+    good = Operator(broker)
+    good.ask("0", event="mode_selected", mode="collective")
+    with subprocess.Popen([sys.executable, "-c", FLOOD, str(broker.port)], stdout=subprocess.PIPE, text=True) as flood:
+        waits = []
+        while flood.poll() is None:
+            began = time.monotonic()
+            said = good.ask(str(began), event="camera_switched", camera="rear", on=len(waits) % 2 == 0)
+            waits.append(time.monotonic() - began)
+            assert said["result"] == "applied", said
+            time.sleep(0.05)
+        assert int(flood.communicate()[0]) > 20_000
+    print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
+    assert max(waits) < 0.2
+    assert until(lambda: good.telemetry[-1]["refused"]) > 10_000
+
+
+# --- broker -----------------------------------------------------------------------------------------------------------
+
+
+def test_both_sides_wait_for_a_broker(stack):
+    broker = Endpoint("127.0.0.1", free_port())
+    ports = (f"control.port={broker.port}", f"media.port={free_port()}")
+    said = {}
+    for verb in ("vehicle", "operator"):
+        child = stack.enter_context(process(verb, *ROBOT, *ports))
+        said[verb] = []
+        reader = threading.Thread(target=lambda c=child, v=verb: said[v].extend(c.stdout), daemon=True)
+        reader.start()
+    wanted = f"no control link: MQTT broker at {broker}: connection refused; trying again"
+    until(lambda: any(wanted in line for line in said["vehicle"]))
+    time.sleep(2)
+    with private_broker(broker):
+        operator = Operator(broker)
+        operator.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
+        assert sum(wanted in line for line in said["vehicle"]) == 1
+        assert any(f"connected to the MQTT broker at {broker}" in line for line in said["vehicle"])
+
+
+def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
+    """A broker that hangs takes connections and answers nothing, as a link that is cut does."""
+    broker = Endpoint("127.0.0.1", free_port())
+    file = tmp_path / "mosquitto.conf"
+    file.write_text(f"listener {broker.port} {broker.host}\nallow_anonymous true\n")
+    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).vehicle(), {})
+    with subprocess.Popen([find_mosquitto(), "-c", file], stderr=subprocess.DEVNULL) as mosquitto:
+        try:
+            with process("vehicle", *ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"):
+                station.connect()
+                until(lambda: station.state)
+                mosquitto.send_signal(signal.SIGSTOP)
+                until(lambda: station.take({}) is None and not station.state, every_s=0.2)
+                time.sleep(4)
+                mosquitto.send_signal(signal.SIGCONT)
+                resumed = time.monotonic()
+                until(lambda: station.take({}) is None and station.state, every_s=0.2)
+                assert time.monotonic() - resumed < 5
+                retained = station._vehicle_time  # perhaps; a request as of a time that old would expire
+                until(lambda: station._vehicle_time != retained)
+                replies = []
+                station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
+                assert until(lambda: replies)[0].result == "applied"
+        finally:
+            station.close()
+            mosquitto.kill()
+
+
+def test_a_second_vehicle_of_the_same_name_is_refused(broker, vehicle):
+    operator = Operator(broker)
+    operator.as_of()
+    second = run("vehicle", *ROBOT, f"control.port={broker.port}", f"media.port={free_port()}")
+    assert second.returncode == 1
+    rule = "choose another `name`, or stop the other vehicle"
+    assert second.stderr.splitlines()[-1] == f"a vehicle named delivery_robot is at the broker already; {rule}"
+    assert operator.ask("1", event="mode_selected", mode="collective")["result"] == "applied"
+    assert operator.states.queue[-1]["online"]
+
+
+# --- what is received -------------------------------------------------------------------------------------------------
+
+GARBAGE = (
+    b"",
+    b"null",
+    b"[]",
+    b"{",
+    b"\xff\xfe",
+    b'{"online": true}',
+    b'{"online": 1}',
+    b'{"id": 1}',
+    b"1" * 400,
+    b"[" * 9999,
+)
+
+
+@pytest.fixture
+def station(broker):
+    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).vehicle(), {})
+    heard = Heard()
+    station.listeners.append(heard)
+    yield station, heard
+    station.close()
+
+
+def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
+    station, heard = station
+    station.connect()
+    until(lambda: station.state)
+    stranger = Operator(broker)
+    for name in ("state", "telemetry", "configuration", f"reply/{station.identity}"):
+        for payload in GARBAGE:
+            stranger.link._client.publish(f"tod/delivery_robot/{name}", payload, qos=1, retain=name == "state")
+    stranger.link._client.publish("tod/delivery_robot/state", b'{"online": "x"}', qos=1, retain=True)
+    until(lambda: station._link.dropped >= 4 * len(GARBAGE))
+    why = "not JSON: Expecting value: line 1 column 1 (char 0)"
+    assert f"a message on tod/delivery_robot/state was dropped: {why}" in heard.notes
+    until(lambda: station.take({}) is None and station.state, every_s=0.2)
+    replies = []
+    station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
+    assert until(lambda: replies)[0].result == "applied"
+
+
+def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(broker, vehicle):
+    Operator(broker).as_of()
+    station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).vehicle(), {})
+    heard = Heard()
+    station.listeners.append(heard)
+    station.connect()
+    try:
+        until(lambda: station.take({}) is None and heard.notes, every_s=0.2)
+        assert heard.notes == ["the broker knows no vehicle named delivery_robott, online are delivery_robot"]
+    finally:
+        station.close()
+
+
+def test_sides_of_different_configuration_name_the_difference(broker, vehicle, ports):
+    with process("operator", *ROBOT, *ports, "fps_max=10", "duration_s=4") as operator:
+        said, _ = operator.communicate(timeout=60)
+    assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(said.split())
+
+
+# --- rules of the user's own ------------------------------------------------------------------------------------------
+
+RULES = """
+import time
+from fractions import Fraction
+from runner.core.rules import rule
+
+@rule(needs=["total"], gives=["total"], reads=["prediction"])
+def mine(vehicle, state, draft, memory):
+    kbps = state.prediction.kbps if state.prediction else 0
+    if kbps == 666:
+        raise ZeroDivisionError("division by zero")
+    if kbps == 667:
+        return draft.but(total=Fraction(-1)), memory
+    if kbps == 668:
+        return draft.but(total=1.5), memory
+    if kbps == 669:
+        time.sleep(4)
+    return draft, memory
+"""
+
+
+def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_path):
+    package, conf = tmp_path / "package", tmp_path / "conf"
+    (package / "mine-1.dist-info").mkdir(parents=True)
+    (package / "mine-1.dist-info" / "entry_points.txt").write_text("[tod_runner.rules]\nmine = my_rules:mine\n")
+    (package / "mine-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1\n")
+    (package / "my_rules.py").write_text(RULES)
+    (conf / "modes").mkdir(parents=True)
+    safe = (CHECKOUT / "conf" / "modes" / "paper.yaml").read_text()
+    (conf / "modes" / "mine.yaml").write_text(safe.replace("start_kbps: 3000}", "start_kbps: 3000}\n  - mine: {}", 1))
+    words = (*ROBOT[:3], "modes=mine", "pqos=live", f"conf={conf}", f"log={tmp_path / 'drive'}")
+    path = {"PYTHONPATH": f"{CHECKOUT}:{package}"}
+    with process("vehicle", *words, *ports, env=path, stdout=subprocess.DEVNULL) as vehicle:
+        operator = Operator(broker)
+        operator.ask("0", event="bitrate_predicted", kbps=2000)
+        for kbps, why in (
+            (666, "rule mine failed: ZeroDivisionError: division by zero"),
+            (
+                667,
+                "rule mine failed: total Fraction(-1, 1): must be kbit/s from 0 as an exact number (int or Fraction)",
+            ),
+            (668, "rule mine failed: total 1.5: must be kbit/s from 0 as an exact number (int or Fraction)"),
+        ):
+            assert operator.ask(str(kbps), event="bitrate_predicted", kbps=kbps)["result"] == "applied"
+            state = operator.state(lambda state, why=why: state["online"] and state["fault"] == why)
+            assert state["total_kbps"] == 2000
+        operator.ask("1", event="bitrate_predicted", kbps=1000)
+        assert operator.state(lambda state: state["fault"] is None and state["total_kbps"] == 1000)
+        operator.send("669", event="bitrate_predicted", kbps=669)
+        assert until(lambda: operator.replies.get("669"))["result"] == "applied"
+        until(lambda: "the control loop runs again" in notes(tmp_path))
+        vehicle.send_signal(signal.SIGTERM)
+        assert vehicle.wait(15) == 0
+    told = notes(tmp_path)
+    assert "rule mine failed: ZeroDivisionError: division by zero; the decision before stays in force" in told
+    assert told.index("the control loop hangs in bitrate_predicted") < told.index("the control loop runs again")
+    replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
+    faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}
+    assert len(faults) == 4, replayed.stderr

@@ -1,0 +1,99 @@
+"""A link that is cut for 20 s and comes back, under RTSP and SRT at once."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from rig import free_port, process, until
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint
+from runner.errors import RunError
+from runner.link import limited_link
+from runner.link.limit import Limit
+from runner.link.netns import _check_allowed, _router
+from runner.mqtt.broker import private_broker
+from runner.plans import compile_plans
+
+CUT_S, BACK_S = 20, 5
+CONTROL_S = 1.0  # the control link takes so long to be back; until then nobody knows which cameras should send
+COMMON = ("source=test", "fps_max=15", "pqos=constant", "pqos.kbps=1000", "modes=paper", "page.serve=false")
+# Each vehicle with one camera.
+RTSP = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast")
+OTHERS = ("front_left", "front_right", "front_center", "top_front", "top_left", "top_right", "top_rear")
+SRT = ("vehicle=tum_q7", "graph=h264_srt", *(f"~cameras.{name}" for name in OTHERS))
+
+
+def _may_not():
+    try:
+        _check_allowed()
+    except RunError as error:
+        return str(error)
+    return "" if shutil.which("ip") else "iproute2 is not installed"
+
+
+needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
+
+
+@contextmanager
+def received(*words):
+    """One camera at the operator. Yields (frames so far, by whether it is known to send; what was reported)."""
+    from runner.apply import OperatorSide
+
+    plans = compile_plans(configuration([*COMMON, *words]).vehicle())
+    told = []
+    side = OperatorSide(plans, lambda cameras, what: told.append(f"{cameras}: {what}"))
+    name = plans[0].camera.name
+    try:
+        yield lambda known: side.sample({name: True} if known else {})[name].frames, told
+    finally:
+        side.stop()
+
+
+@needs_root
+def test_after_a_cut_of_20_s_everything_is_back_within_5_s():
+    media, srt = Endpoint("127.0.0.1", free_port()), free_port()
+    wide = Limit(lambda t: 20_000, queue_ms=200, delay_ms=0)
+    with (
+        limited_link("netns", wide, media, Endpoint("127.0.0.1", free_port()), lambda line: None) as link,
+        private_broker(link.broker),
+    ):
+        here = (f"media.host={link.broker.host}", f"graph.first_port={srt}")  # SRT dials the operator
+        control = tuple(word for word in link.vehicle_overrides if word.startswith("control."))
+        router = _router(link.vehicle_command[3])
+        with (
+            process("vehicle", *COMMON, *RTSP, *link.vehicle_overrides, before=link.vehicle_command),
+            process("vehicle", *COMMON, *SRT, *here, *control, before=link.vehicle_command),
+            received(*RTSP, *link.operator_overrides) as (rtsp_frames, _),
+            received(*SRT, *here) as (srt_frames, _),
+        ):
+            cameras = {"rtsp": rtsp_frames, "srt": srt_frames}
+
+            def frames(known):
+                return {transport: count(known) for transport, count in cameras.items()}
+
+            until(lambda: min(frames(True).values()) > 30, seconds=30)
+            _forward(router, 0)
+            cut = time.monotonic()
+            while time.monotonic() < cut + CUT_S:
+                stood = frames(False)
+                time.sleep(0.1)
+            _forward(router, 1)
+            began, back = time.monotonic(), {}
+            while len(back) < len(cameras) and time.monotonic() < began + 3 * BACK_S:
+                passed = time.monotonic() - began
+                now = frames(passed > CONTROL_S)
+                back |= {name: passed for name in cameras if now[name] > stood[name] + 5 and name not in back}
+                time.sleep(0.05)
+            assert set(back) == {"rtsp", "srt"}
+            assert max(back.values()) < BACK_S
+
+
+def _forward(router, on):
+    """Let the router pass packets on, or drop them all without a word."""
+    command = ["ip", "netns", "exec", router, "sh", "-c", f"echo {on} > /proc/sys/net/ipv4/ip_forward"]
+    subprocess.run(command, check=True)

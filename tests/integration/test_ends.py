@@ -1,0 +1,115 @@
+"""How the verbs end: by signals at any moment, when a part of a demo dies, and when the demo itself is killed."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from contextlib import contextmanager, suppress
+
+import pytest
+from soak.signals import LIMIT_S, MARK, ROBOT, marked, soak
+
+from rig import CHECKOUT, free_port, until
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+pytestmark = pytest.mark.gst
+
+PARTS = {  # by what a person calls it, how its command line is known
+    "the vehicle's side": r"-m runner vehicle ",
+    "the operator's side": r"-m runner operator ",
+    "the MQTT broker": r"/mosquitto -c ",
+    "relay": r"-m runner\.link\.relay ",
+}
+
+
+def test_signals_at_random_moments_end_every_verb_and_all_that_it_started():
+    assert soak(seed=11, count=8) == []
+
+
+@contextmanager
+def demo(tmp_path, *words):
+    """A running demo over a relay. Yields its process and the process ids of all that it started, by part."""
+    mark = uuid.uuid4().hex
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    command = (sys.executable, "-m", "runner", "demo", *ROBOT, *ports, "link=relay", f"log={tmp_path / 'drive'}")
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark}
+    with (
+        (tmp_path / "said").open("w+") as said,
+        subprocess.Popen(
+            [*command, "duration_s=60", *words], stdout=said, stderr=said, env=environment, cwd=CHECKOUT
+        ) as child,
+    ):
+        try:
+            until(lambda: (tmp_path / "drive" / "link.jsonl").exists() and "front" in (tmp_path / "said").read_text())
+            yield child, _parts(mark), (tmp_path / "said").read_text
+        finally:
+            for pid in marked(mark):
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+
+def _parts(mark):
+    found = {}
+    for name, pattern in PARTS.items():
+        (found[name],) = (pid for pid, words in marked(mark).items() if re.search(pattern, words + " "))
+    return found
+
+
+def _alive(pids):
+    """Which of some processes still run; zombies do not."""
+    alive = []
+    for pid in pids:
+        with suppress(OSError), open(f"/proc/{pid}/stat") as stat:
+            alive += [] if stat.read().rpartition(")")[2].split()[0] == "Z" else [pid]
+    return alive
+
+
+def test_a_demo_that_is_killed_leaves_nobody_behind(tmp_path):
+    with demo(tmp_path) as (child, parts, _):
+        child.kill()
+        until(lambda: not _alive(parts.values()), seconds=LIMIT_S)
+    lines = (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()
+    assert '"ended"' in lines[-1]  # the vehicle's side had its orderly end
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_of_a_demo_that_dies_is_named_and_ends_it(tmp_path, part):
+    with demo(tmp_path) as (child, parts, said):
+        os.kill(parts[part], signal.SIGKILL)
+        assert child.wait(20) == 1
+        assert re.search(f"^{part}.* ended.*killed by SIGKILL", said(), re.MULTILINE), said()
+        assert "Traceback" not in said()
+        assert not _alive(parts.values())
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_of_a_demo_that_hangs_does_not_hold_up_its_end(tmp_path, part):
+    with demo(tmp_path) as (child, parts, said):
+        os.kill(parts[part], signal.SIGSTOP)
+        child.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        until(lambda: child.poll() is not None and not _alive(parts.values()), seconds=20)
+        assert time.monotonic() - began < LIMIT_S
+        assert child.returncode == 130
+        assert "Traceback" not in said()
+
+
+def test_the_broker_serves_any_number_of_connections():
+    """Each would be a line on a pipe that holds 64 KB."""
+    endpoint = Endpoint("127.0.0.1", free_port())
+    with private_broker(endpoint) as broker:
+        for number in range(1200):
+            with socket.create_connection((endpoint.host, endpoint.port), timeout=5) as client:
+                client.settimeout(5)
+                name = f"client-{number:04}".encode()
+                client.sendall(b"\x10" + bytes([12 + len(name)]) + b"\0\4MQTT\4\2\0\x3c\0" + bytes([len(name)]) + name)
+                assert client.recv(4) == b"\x20\2\0\0", f"no answer to connection {number}"
+                client.sendall(b"not MQTT")
+        broker.check()

@@ -1,0 +1,155 @@
+"""An IP camera that freezes, disappears or is switched off, in front of viewers who stay."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+
+from rig import free_port, ip_camera, streaming, until, watching
+from runner.core.commands import Command
+
+FROZEN_S = 15
+WORDS = ("vehicle=delivery_robot", "source=rtsp", "fps_max=15")
+
+
+def knobs(side, **values):
+    side.turn([Command("rear", knob, value) for knob, value in values.items()])
+
+
+@contextmanager
+def driving(*words):
+    """A robot whose rear camera is an IP camera. Yields (camera's process, side, vehicle, plan, reported)."""
+    with (
+        ip_camera(free_port()) as (address, camera),
+        streaming(*WORDS, f'source.address="{address}"', *words, cameras=("rear",)) as (side, vehicle, plans, reported),
+    ):
+        knobs(side, sending=True, size=(424, 240), bitrate=500)
+        yield camera, side, vehicle, plans[0], reported
+
+
+@contextmanager
+def ffmpeg(vehicle, transport):
+    """A foreign viewer. Yields how many frames it has decoded, as a function."""
+    url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"
+    command = ["ffmpeg", "-v", "error", "-progress", "-", "-rtsp_transport", transport, "-i", url, "-f", "null", "-"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        seen = [0]
+
+        def read():
+            for line in child.stdout:
+                if line.startswith("frame="):
+                    seen[0] = int(line.removeprefix("frame="))
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        try:
+            yield lambda: seen[0] if child.poll() is None else -1
+        finally:
+            child.kill()
+            reader.join(5)
+
+
+def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session():
+    with (
+        driving() as (camera, side, vehicle, plan, reported),
+        watching(plan) as client,
+        ffmpeg(vehicle, "tcp") as over_tcp,
+        ffmpeg(vehicle, "udp") as over_udp,
+    ):
+
+        def counts():
+            return len(client.sizes), over_tcp(), over_udp()
+
+        until(lambda: min(counts()) > 10)
+        assert side.sources() == {}
+        camera.send_signal(signal.SIGSTOP)
+        until(side.sources)
+        assert side.sources() == {"rear": "source: no frame for 1 s"}
+        time.sleep(FROZEN_S - 1)
+        stood = counts()
+        camera.send_signal(signal.SIGCONT)
+        until(lambda: not side.sources(), seconds=12)  # 10 s between two attempts, at most
+        until(lambda: all(now > then + 10 for now, then in zip(counts(), stood, strict=True)))
+        assert client.errors == []
+        told = [line.removeprefix("rear: ") for line in reported]
+    assert told[:2] == ["pipeline built", "source: no frame for 1 s"]
+    assert told[-1].startswith("works again after 1")
+    assert len(set(told)) == len(told) <= 5  # each reason once, however many attempts
+
+
+def test_a_camera_that_is_off_is_watched_all_the_same():
+    with driving() as (camera, side, _, plan, reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        knobs(side, sending=False)
+        until(lambda: side.applied()["rear"]["sending"] is False)
+        time.sleep(2)  # twice what a frozen source is allowed
+        assert side.sources() == {}
+        camera.kill()
+        until(side.sources)
+        assert reported[:1] == ["rear: pipeline built"]
+        assert reported[1].startswith("rear: source: ")
+
+
+def test_frames_that_are_held_up_behind_the_source_are_no_fault_of_it():
+    from runner.gst import Gst
+
+    with driving() as (_, side, _, plan, reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        below = side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src")
+        held = below.add_probe(Gst.PadProbeType.BLOCK_DOWNSTREAM, lambda *_: Gst.PadProbeReturn.OK)
+        time.sleep(2)  # twice what a frozen source is allowed
+        assert side.sources() == {}
+        before = len(client.sizes)
+        below.remove_probe(held)
+        until(lambda: len(client.sizes) > before + 10)
+        assert reported == ["rear: pipeline built"]
+
+
+def test_a_camera_that_restarts_is_connected_again():
+    port = free_port()
+    with ExitStack() as stack:
+        address, camera = stack.enter_context(ip_camera(port))
+        words = (*WORDS, f'source.address="{address}"')
+        side, _, (plan,), reported = stack.enter_context(streaming(*words, cameras=("rear",)))
+        knobs(side, sending=True, size=(424, 240), bitrate=500)
+        client = stack.enter_context(watching(plan))
+        until(lambda: len(client.sizes) > 10)
+        camera.kill()
+        until(side.sources)
+        before = len(client.sizes)
+        stack.enter_context(ip_camera(port))
+        until(lambda: len(client.sizes) > before + 10)
+        assert client.errors == []
+        assert side.sources() == {}
+        assert reported.count("rear: pipeline built") == 1
+
+
+def test_a_viewer_of_a_camera_that_is_not_there_is_refused_and_served_when_it_is_back():
+    with driving() as (camera, side, _, plan, reported):
+        camera.send_signal(signal.SIGSTOP)
+        with watching(plan) as client:
+            until(lambda: client.errors, seconds=30)
+        camera.send_signal(signal.SIGCONT)
+        until(lambda: "rear: pipeline gone" in reported)
+        with watching(plan) as client:
+            until(lambda: len(client.sizes) > 10)
+        assert side.sources() == {}
+
+
+def test_a_paused_pipeline_is_neither_a_fault_nor_a_recovery():
+    """The server pauses a pipeline with its last viewer."""
+    from runner.gst import Gst
+
+    with driving() as (camera, side, _, plan, reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        camera.send_signal(signal.SIGSTOP)
+        until(side.sources)
+        client.pipeline.set_state(Gst.State.PAUSED)
+        time.sleep(1)
+        client.pipeline.set_state(Gst.State.PLAYING)
+        time.sleep(1)
+        assert side.sources() == {"rear": "source: no frame for 1 s"}
+        assert not any("works" in what for what in reported)

@@ -1,0 +1,180 @@
+"""The operator's receivers: a vehicle that starts late or goes away, strangers, a link that is cut."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from rig import free_port, until
+from runner.core.commands import Command
+from runner.errors import RunError
+
+CAMERAS = ("front", "rear")
+SENDING = dict.fromkeys(CAMERAS, True)
+WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15")
+
+
+def compiled(*words):
+    from runner.apply import check_plan
+    from runner.configuration.config import configuration
+    from runner.plans import compile_plans
+
+    vehicle = configuration([*WORDS, f"media.port={free_port()}", *words], check=check_plan).vehicle()
+    return vehicle, [plan for plan in compile_plans(vehicle) if plan.camera.name in CAMERAS]
+
+
+@contextmanager
+def sending(vehicle, plans):
+    from runner.apply import VehicleSide
+
+    side = VehicleSide(plans, vehicle.media, lambda camera, what: None)
+    knobs = {"sending": True, "size": (320, 180), "bitrate": 300}
+    side.turn([Command(camera, knob, value) for camera in CAMERAS for knob, value in knobs.items()])
+    try:
+        yield side
+    finally:
+        side.stop()
+
+
+@contextmanager
+def receiving(plans):
+    """Yields (side, what was reported, a function: whether every camera has brought n more frames)."""
+    from runner.apply import OperatorSide
+
+    told = []
+    side = OperatorSide(plans, lambda cameras, what: told.append(f"{cameras}: {what}"))
+
+    def frames():
+        return {name: received.frames for name, received in side.sample(SENDING).items()}
+
+    def more(n=10):
+        before = frames()
+        until(lambda: all(now - before[name] >= n for name, now in frames().items()), every_s=0.1)
+
+    try:
+        yield side, told, more
+    finally:
+        side.stop()
+
+
+def test_a_vehicle_that_starts_later_is_waited_for_in_silence():
+    vehicle, plans = compiled()
+    with receiving(plans) as (side, told, more):
+        end = time.monotonic() + 3
+        while time.monotonic() < end:
+            side.sample({})
+            time.sleep(0.1)
+        with sending(vehicle, plans):
+            more()
+            assert {received.rebuilt for received in side.sample(SENDING).values()} == {0}
+            assert told == []
+
+
+def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
+    vehicle, plans = compiled()
+    with receiving(plans) as (side, told, more):
+        with sending(vehicle, plans):
+            more()
+        end = time.monotonic() + 8
+        while time.monotonic() < end:
+            side.sample(SENDING)
+            time.sleep(0.1)
+        away = list(told)
+        with sending(vehicle, plans):
+            more()
+            until(lambda: any("works again" in what for what in told))
+            assert {received.rebuilt for received in side.sample(SENDING).values()} == {1}
+            back = told[len(away) :]
+    assert 1 <= len(away) <= 4  # each reason once; cameras that say the same are named together
+    assert len(set(away)) == len(away)
+    assert all(" works again after " in what for what in back)
+
+
+def test_packets_of_strangers_are_dropped_and_counted():
+    vehicle, plans = compiled()
+    with sending(vehicle, plans), receiving(plans) as (side, told, more):
+        more()
+        sockets = [taken for r in side._receivers.values() for taken in r._filter._sockets.values()]
+        assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
+        ports = [taken.getsockname()[1] for taken in sockets]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.bind(("127.0.0.2", 0))
+            for number in range(500):
+                packet = struct.pack(">BBHII", 0x80, 0x80 | 96, number, 3000 * number, 0xBAD) + b"\x41" * 100
+                for port in ports:
+                    stranger.sendto(packet, ("127.0.0.1", port))
+        more(20)
+        samples = side.sample(SENDING)
+        assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
+        assert {(received.lost, received.rebuilt) for received in samples.values()} == {(0, 0)}
+        until(lambda: told)
+    assert told == ["front, rear: packets that do not come from the vehicle are dropped"]
+
+
+def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
+    """Accepts connections and says nothing, as a vehicle does that stands still."""
+    vehicle, plans = compiled()
+    with socket.create_server((vehicle.media.host, vehicle.media.port)) as server:
+        server.settimeout(30)
+        with receiving(plans[:1]) as (_, told, _more), ExitStack() as connections:
+            came = []
+            for _ in range(4):
+                connections.enter_context(server.accept()[0])
+                came.append(time.monotonic())
+            assert told == []
+    assert came[-1] - came[0] < 3 * 2.0
+
+
+def test_a_receiver_that_locks_up_holds_up_nobody(monkeypatch):
+    """As rtspsrc can on network faults, on its way to NULL."""
+    from runner.gst import Gst, aside, receiver
+
+    monkeypatch.setattr(aside, "HUNG_S", 1.0)
+    freed = threading.Event()
+
+    class Stuck(Gst.Bin):
+        def do_change_state(self, transition):
+            if transition == Gst.StateChange.READY_TO_NULL:
+                freed.wait(30)
+            return Gst.Bin.do_change_state(self, transition)
+
+    class Locking(receiver.Receiver):
+        def _on_built(self, pipeline):
+            if self._name == "front":
+                pipeline.add(Stuck())
+            return super()._on_built(pipeline)
+
+    monkeypatch.setattr("runner.apply.Receiver", Locking)
+    vehicle, plans = compiled()
+    with sending(vehicle, plans):
+        try:
+            with receiving(plans) as (side, told, more):
+                more()
+                side._glib.call("a fault", lambda: side._receivers["front"]._supervised.restart("locked up"))
+                more(30)  # both: another receiver takes the place of the stuck one
+                until(lambda: any("has not stopped" in what for what in told))
+                began = time.monotonic()
+            assert time.monotonic() - began < 3
+        finally:
+            freed.set()
+    assert told[0] == "front: locked up"
+    assert f"front: {aside.HUNG}" in told
+
+
+def test_work_that_hangs_in_gstreamer_s_thread_is_named(monkeypatch):
+    from runner import apply
+
+    monkeypatch.setattr(apply, "CALL_S", 0.2)
+    glib, freed = apply._Glib(), threading.Event()
+    try:
+        with pytest.raises(RunError) as raised:
+            glib.call("reading the counters", lambda: freed.wait(30))
+        assert str(raised.value) == "GStreamer hangs: reading the counters takes more than 0.2 s"
+    finally:
+        freed.set()
+        glib.end(lambda: None)

@@ -1,0 +1,433 @@
+"""The RTSP server under clients of every kind: what one does, others do not notice."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from rig import streaming, until
+from rtsp_client import RtspClient
+from runner.core.commands import Command
+from runner.gst.viewers import user_agent
+
+CAMERA, OTHER = "front_left", "front_right"
+FRAME_S = 1 / 40
+SMALL = ("vehicle=delivery_robot", "fps_max=10")  # where time is measured, on a machine that may be busy
+SMALL_CAMERA, UNTOUCHED, SMALL_FRAME_S = "rear", "front", 1 / 10
+OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only asked for the way there
+
+
+class Vehicle:
+    """Some cameras that stream, and what the tests ask of them."""
+
+    def __init__(self, side, vehicle, reported):
+        self.side, self.reported = side, reported
+        self.port = vehicle.media.port
+
+    def url(self, camera=CAMERA):
+        return f"rtsp://127.0.0.1:{self.port}/{camera}"
+
+    def turn(self, camera=CAMERA, **knobs):
+        self.side.turn([Command(camera, knob, value) for knob, value in knobs.items()])
+        if self.side.applied()[camera]:
+            until(lambda: self.side.applied()[camera].items() >= knobs.items())
+
+    def frames(self, camera=CAMERA):
+        return self.side.sent()[camera][0]
+
+    def pipelines(self, camera=CAMERA):
+        return self.reported.count(f"{camera}: pipeline built")
+
+
+@contextmanager
+def serving(*overrides, cameras=(CAMERA,)):
+    with streaming(*overrides, cameras=cameras) as (side, vehicle, _, reported):
+        served = Vehicle(side, vehicle, reported)
+        for camera in cameras:
+            served.turn(camera, size=(240, 130), bitrate=500)
+        yield served
+
+
+@contextmanager
+def watched(vehicle, camera=CAMERA, *, udp=True):
+    """A camera that somebody watches, who must not lose a packet."""
+    with RtspClient(vehicle.url(camera)) as viewer:
+        assert viewer.open(udp=udp) == [200, 200, 200]
+        viewer.read()
+        until(lambda: viewer.frames > 5)
+        yield viewer
+        seen = viewer.frames
+        until(lambda: viewer.frames > seen + 5)
+        assert viewer.lost == 0
+
+
+@contextmanager
+def asking_options(vehicle, camera):
+    """Ask for OPTIONS again and again, each on a connection of its own; yields how long the answers took, s."""
+    took, done = [], threading.Event()
+
+    def ask():
+        while not done.is_set():
+            began = time.monotonic()
+            with RtspClient(vehicle.url(camera)) as client:
+                assert client.ask("OPTIONS") == 200
+            took.append(time.monotonic() - began)
+            time.sleep(0.02)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield took
+    finally:
+        done.set()
+        thread.join()
+
+
+# --- opening ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line", [b"rtsp://h/\x8f", b"rtsp://h/front_left?\xff", b"rtsp://h/front_left/\xc9", b"rtsp://h\xab/front_left?x"]
+)
+def test_a_url_that_is_no_text_is_refused_without_a_traceback(line, capfd):
+    with serving() as vehicle, watched(vehicle):
+        for method in (b"OPTIONS", b"DESCRIBE", b"SETUP", b"PLAY", b"TEARDOWN"):
+            with socket.create_connection(("127.0.0.1", vehicle.port), 5) as connection:
+                connection.sendall(method + b" " + line + b" RTSP/1.0\r\nCSeq: 1\r\nUser-Agent: \xff\r\n\r\n")
+                assert connection.recv(9) == b"RTSP/1.0 "
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_pause_loses_no_packet_of_what_follows():
+    """Over UDP and TCP at once: queues stand between the stream and its sinks. Each frame has several packets."""
+    with serving() as vehicle, watched(vehicle) as over_udp, watched(vehicle, udp=False) as over_tcp:
+        vehicle.turn(bitrate=4000)
+        for _ in range(8):
+            vehicle.turn(sending=False)
+            time.sleep(1.2)
+            seen = over_udp.frames, over_tcp.frames
+            vehicle.turn(sending=True)
+            until(lambda s=seen: over_udp.frames > s[0] + 3 and over_tcp.frames > s[1] + 3)
+        assert (over_udp.lost, over_tcp.lost) == (0, 0)
+
+
+@pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
+@pytest.mark.parametrize("state", ["sending", "off before the first viewer", "off", "off with a viewer over UDP"])
+def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving(cameras=(CAMERA, OTHER)))
+        stack.enter_context(watched(vehicle, OTHER))
+        if state == "off before the first viewer":
+            vehicle.turn(sending=False)
+        elif state != "sending":
+            before = stack.enter_context(RtspClient(vehicle.url()))
+            assert before.open(udp="UDP" in state) == [200, 200, 200]
+            before.read()
+            until(lambda: before.frames > 5)
+            vehicle.turn(sending=False)
+            time.sleep(3 * FRAME_S)  # what is on its way
+        frames = vehicle.frames()
+        with asking_options(vehicle, OTHER) as took, RtspClient(vehicle.url()) as client:
+            began = time.monotonic()
+            assert client.open(udp=udp, Range="npt=0.000-") == [200, 200, 200]
+            assert time.monotonic() - began < 1
+            until(lambda: len(took) > 5)
+        assert max(took) < 0.2
+        if state != "sending":
+            assert vehicle.frames() - frames <= 10
+        with RtspClient(vehicle.url()) as viewer:  # and the picture comes back
+            assert viewer.open(udp=udp) == [200, 200, 200]
+            viewer.read()
+            vehicle.turn(sending=True)
+            until(lambda: viewer.frames > 5)
+
+
+def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delivers():
+    with serving("source=appsrc") as vehicle, asking_options(vehicle, CAMERA) as took:
+        with RtspClient(vehicle.url()) as client:
+            began = time.monotonic()
+            assert client.open() == [503]
+            assert time.monotonic() - began < 1
+        assert max(took) < 0.2
+        frame = bytes(1920 * 1040 * 3 // 2)
+        until(lambda: vehicle.side.push(CAMERA, frame))
+        with RtspClient(vehicle.url()) as client:
+            assert client.open() == [200, 200, 200]
+        assert vehicle.pipelines() == 1  # the one that the first client asked for
+
+
+def test_a_camera_opened_again_at_once_is_there():
+    """Clients that each may be the last one to leave, while another opens it."""
+    answers = []
+
+    def open_often(vehicle):
+        for _ in range(10):
+            with RtspClient(vehicle.url()) as client:
+                answers.append(client.open())
+
+    with serving() as vehicle:
+        threads = [threading.Thread(target=open_often, args=(vehicle,)) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert answers == 30 * [[200, 200, 200]]
+
+
+@pytest.mark.parametrize("source", ["source=test", "source=synthetic"])
+@pytest.mark.parametrize("header", [{"Range": "npt=5.000-"}, {"Scale": "2.0"}, {"Speed": "4.0"}], ids=str)
+def test_nobody_seeks_what_others_watch(source, header):
+    with serving(source) as vehicle, watched(vehicle) as viewer:
+        first = vehicle.frames() - viewer.frames
+        with RtspClient(vehicle.url()) as client:
+            assert client.open(**header) == [200, 200, 200]
+        seen = viewer.frames
+        until(lambda: viewer.frames > seen + 10)
+        assert vehicle.frames() - viewer.frames <= first + 1
+
+
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+def test_a_player_that_opens_a_paused_camera_takes_nobodys_picture(transport):
+    with serving(cameras=(CAMERA, OTHER)) as vehicle, watched(vehicle, OTHER):
+        vehicle.turn(sending=False)
+        words = ["ffmpeg", "-v", "error", "-rtsp_transport", transport, "-i", vehicle.url(), "-f", "null", "-"]
+        with subprocess.Popen(words, stderr=subprocess.DEVNULL) as player:
+            until(lambda: vehicle.side.applied()[CAMERA])
+            with RtspClient(vehicle.url()) as viewer:
+                assert viewer.open() == [200, 200, 200]
+                viewer.read()
+                vehicle.turn(sending=True)
+                until(lambda: viewer.frames > 5)
+            player.kill()
+
+
+# --- one pipeline per camera ------------------------------------------------------------------------------------------
+
+
+def test_every_url_of_a_camera_leads_to_its_one_pipeline():
+    with serving() as vehicle, watched(vehicle):
+        base = f"rtsp://127.0.0.1:{vehicle.port}"
+        others = (
+            f"{base}/{CAMERA}/",
+            f"{base}//{CAMERA}",
+            f"rtsp://127.0.0.1:1/{CAMERA}",
+            f"rtsp://forwarded:554/{CAMERA}",
+        )
+        for url in others:
+            with RtspClient(url, at=("127.0.0.1", vehicle.port)) as client:
+                assert client.open() == [200, 200, 200], url
+        for url in (f"{base}/{CAMERA}?x=1", f"{base}/{CAMERA}/?x=1"):
+            with RtspClient(url) as client:
+                assert client.open() == [301]
+                assert f"Location: {base}/{CAMERA}\r" in client.head
+        assert vehicle.pipelines() == 1
+        vehicle.turn(bitrate=75)  # read back from the watched pipeline's encoder
+        vehicle.turn(sending=False)
+        vehicle.turn(sending=True)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["ffmpeg", "-v", "error", "-rtsp_transport", "tcp", "-i", "{url}", "-frames:v", "5", "-f", "null", "-"],
+        ["ffmpeg", "-v", "error", "-rtsp_transport", "udp", "-i", "{url}", "-frames:v", "5", "-f", "null", "-"],
+        [
+            "gst-launch-1.0",
+            "-q",
+            "rtspsrc",
+            "location={url}",
+            "!",
+            "rtph264depay",
+            "!",
+            "identity",
+            "eos-after=5",
+            "!",
+            "fakesink",
+        ],
+    ],
+    ids=["ffmpeg over TCP", "ffmpeg over UDP", "rtspsrc"],
+)
+def test_players_follow_to_the_url_that_is_right(words):
+    with serving() as vehicle, watched(vehicle):
+        words = [word.format(url=f"{vehicle.url()}?x=1") for word in words]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        assert vehicle.pipelines() == 1
+
+
+@pytest.fixture
+def outside():
+    """An address of this machine that is not loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((OFF_LOOPBACK, 9))
+        except OSError:
+            pytest.skip("this machine has no address but loopback")
+        return probe.getsockname()[0]
+
+
+def test_a_second_viewer_over_the_uplink_is_refused(outside):
+    with serving() as vehicle, RtspClient(vehicle.url(), source=outside) as first:
+        assert first.open() == [200, 200, 200]
+        first.read()
+        with RtspClient(vehicle.url(), source=outside) as second:
+            assert second.open() == [200, 453]
+        with RtspClient(vehicle.url()) as local:  # costs no uplink
+            assert local.open() == [200, 200, 200]
+        seen = first.frames
+        until(lambda: first.frames > seen + 5)
+        assert first.lost == 0
+        first.close()
+        with RtspClient(vehicle.url(), source=outside) as third:
+            until(lambda: third.session or third.open() == [200, 200, 200])
+
+
+def test_more_viewers_are_let_in_where_the_configuration_says_so(outside):
+    with serving("media.max_viewers=2") as vehicle, ExitStack() as stack:
+        viewers = [stack.enter_context(RtspClient(vehicle.url(), source=outside)) for _ in range(3)]
+        assert [viewer.open() for viewer in viewers] == [[200, 200, 200], [200, 200, 200], [200, 453]]
+
+
+def test_the_controller_is_let_in_and_the_other_viewer_closed(outside):
+    with serving() as vehicle, RtspClient(vehicle.url(), source=outside) as stranger:
+        vehicle.side.give_control("anna")
+        assert stranger.open() == [200, 200, 200]
+        with RtspClient(vehicle.url(), source=outside, agent=user_agent("bert")) as bert:
+            assert bert.open() == [200, 453]
+        with RtspClient(vehicle.url(), source=outside, agent=user_agent("anna")) as anna:
+            assert anna.open() == [200, 200, 200]
+            assert stranger.ended()
+            anna.read()
+            until(lambda: anna.frames > 5)
+        closed = f"{CAMERA}: closed the viewer at {outside}: the operator in control watches from {outside}"
+        assert closed in vehicle.reported
+
+
+def longest_allowed(untouched):
+    """Two frame intervals; one more than a camera lost that nobody disturbs, where the machine itself stood still."""
+    return max(2 * SMALL_FRAME_S, untouched.longest_gap() + SMALL_FRAME_S)
+
+
+# --- readers that stop or lag -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("small", [True, False], ids=["small buffers", "large buffers"])
+@pytest.mark.parametrize("neighbour", ["udp", "tcp", "both"])
+def test_a_reader_that_stops_is_closed_and_holds_up_nobody(neighbour, small):
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving(*SMALL, cameras=(SMALL_CAMERA, UNTOUCHED)))
+        vehicle.turn(SMALL_CAMERA, size=(640, 480), bitrate=6000)
+        untouched = stack.enter_context(watched(vehicle, UNTOUCHED))
+        kinds = [True, False] if neighbour == "both" else [neighbour == "udp"]
+        viewers = [stack.enter_context(watched(vehicle, SMALL_CAMERA, udp=udp)) for udp in kinds]
+        stopped = stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA), small=small))
+        assert stopped.open() == [200, 200, 200]
+        until(lambda: any("it lags by more than 1 s" in line for line in vehicle.reported))
+        seen = viewers[0].frames
+        until(lambda: viewers[0].frames > seen + 20)
+        assert max(viewer.longest_gap() for viewer in viewers) <= longest_allowed(untouched)
+        latecomer = stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA)))
+        assert latecomer.open() == [200, 200, 200]
+        latecomer.read()
+        until(lambda: latecomer.frames > 5)
+
+
+@pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
+def test_a_viewer_that_joins_while_the_only_other_has_stopped_gets_the_picture(udp):
+    with serving() as vehicle:
+        vehicle.turn(size=(960, 520), bitrate=6000)
+        with RtspClient(vehicle.url(), small=True) as stopped:
+            assert stopped.open() == [200, 200, 200]
+            time.sleep(0.5)
+            with RtspClient(vehicle.url()) as viewer:
+                assert viewer.open(udp=udp) == [200, 200, 200]
+                viewer.read()
+                until(lambda: viewer.frames > 80)
+
+
+def test_a_reader_that_is_slow_is_closed():
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving(*SMALL, cameras=(SMALL_CAMERA, UNTOUCHED)))
+        vehicle.turn(SMALL_CAMERA, size=(640, 480), bitrate=2000)
+        untouched = stack.enter_context(watched(vehicle, UNTOUCHED))
+        viewers = [stack.enter_context(watched(vehicle, SMALL_CAMERA, udp=udp)) for udp in (True, False)]
+        began, sent = time.monotonic(), vehicle.side.sent()[SMALL_CAMERA][1]
+        slow = stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA), small=True))
+        assert slow.open() == [200, 200, 200]
+        taken, closed = 0, False
+        while not closed:
+            half = (vehicle.side.sent()[SMALL_CAMERA][1] - sent) / 2
+            time.sleep(0.01)
+            try:
+                data = slow.tcp.recv(2048) if taken < half else b"nothing yet"
+            except ConnectionError:
+                data = b""
+            taken, closed = taken + len(data) * (data != b"nothing yet"), not data
+            assert time.monotonic() < began + 60
+        assert any("it lags by more than 1 s" in line for line in vehicle.reported)
+        assert max(viewer.longest_gap() for viewer in viewers) <= longest_allowed(untouched)
+
+
+# --- silence ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_silent_viewer_over_udp_is_sent_nothing_after_its_session_ends():
+    with serving("media.session_timeout_s=1") as vehicle, RtspClient(vehicle.url()) as silent:
+        assert silent.open(udp=True) == [200, 200, 200]
+        assert "timeout=1" in silent.head
+        silent.read()
+        began = time.monotonic()
+        until(lambda: not vehicle.side.applied()[CAMERA])
+        assert time.monotonic() - began < 1 + 6
+        seen = len(silent.packets)
+        time.sleep(1)
+        assert len(silent.packets) == seen
+
+
+def test_viewers_that_say_something_stay_on_a_paused_camera():
+    """A player's RTCP and keep-alive requests, a raw client's GET_PARAMETER."""
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving("media.session_timeout_s=1"))
+        words = ["ffmpeg", "-v", "error", "-rtsp_transport", "udp", "-i", vehicle.url(), "-f", "null", "-"]
+        player = stack.enter_context(subprocess.Popen(words, stderr=subprocess.DEVNULL))
+        stack.callback(player.kill)
+        client = stack.enter_context(RtspClient(vehicle.url()))
+        assert client.open(udp=True) == [200, 200, 200]
+        until(lambda: vehicle.frames() > 40)
+        vehicle.turn(sending=False)
+        end = time.monotonic() + 1 + 6 + 1
+        while time.monotonic() < end:
+            assert client.ask("GET_PARAMETER") == 200
+            time.sleep(0.5)
+        client.read()
+        vehicle.turn(sending=True)
+        until(lambda: client.frames > 5)
+        assert player.poll() is None
+        assert vehicle.pipelines() == 1
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [b"", b"DESCRIBE rtsp://127.0.0.1/front_left RTSP/1.0\r\nCSeq: 1\r\n", b"GET /front_left HTTP/1.1\r\nHost: x\r\n"],
+    ids=["nothing", "half of an RTSP request", "half of an HTTP request"],
+)
+def test_a_request_that_is_never_finished_times_out(begun):
+    with serving("media.session_timeout_s=1") as vehicle, RtspClient(vehicle.url()) as client:
+        client.tcp.sendall(begun)
+        assert client.ended()
+
+
+# --- sockets ----------------------------------------------------------------------------------------------------------
+
+
+def test_rtp_and_rtcp_sockets_listen_on_the_servers_address_only():
+    with serving("media.rtp_ports=[21000,21999]") as vehicle, watched(vehicle) as viewer:
+        assert 21000 <= viewer.server_port <= 21998
+        lines = subprocess.run(["ss", "-Hlun"], capture_output=True, text=True, check=True).stdout.splitlines()
+        for port in (viewer.server_port, viewer.server_port + 1):
+            assert [line.split()[3] for line in lines if f":{port} " in line] == [f"127.0.0.1:{port}"]

@@ -1,0 +1,51 @@
+/** What a tile says of its stream, from times alone. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { judge, words } from "../../runner/page/static/status.js";
+
+const NOW = 100_000;
+const LIMITS = { frozen_ms: 120 };
+const LIVE = {
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true,
+  arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
+};
+const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
+
+test("a stream whose pictures come is live", () => assert.equal(judged({}), "live"));
+
+const CASES = [
+  ["off", { on: false }],
+  ["off", { on: false, sending: false, arrived: NOW - 5000 }], // silence is what was asked for
+  ["paused", { sending: false }],
+  ["lost", { connected: false }],
+  ["lost", { online: false }],
+  ["lost", { connected: false, on: false }], // nothing is known of a camera that cannot be heard
+  ["lost", { arrived: NOW - 1001 }],
+  ["frozen", { arrived: NOW - 1000 }],
+  ["unsupported", { refused: "no decoder" }],
+  ["lost", { refused: "no decoder", arrived: NOW - 1001 }],
+  ["synchronising", { drawn: false }],
+  ["frozen", { arrived: NOW - 121 }],
+  ["live", { arrived: NOW - 120 }],
+  ["frozen", { decoded: NOW - 121 }], // units come, and no picture of them
+  ["late", { late_until: NOW + 1 }],
+  ["live", { late_until: NOW }],
+  ["frozen", { late_until: NOW + 1, arrived: NOW - 500 }],
+];
+for (const [status, more] of CASES) test(`${status}: ${JSON.stringify(more)}`, () => assert.equal(judged(more), status));
+
+test("a slow camera freezes after 1.3 frame intervals, not after the limit of fast ones", () => {
+  assert.equal(judged({ fps: 5, arrived: NOW - 260 }), "live");
+  assert.equal(judged({ fps: 5, arrived: NOW - 261 }), "frozen");
+});
+
+test("alarms say for how long and how late", () => {
+  assert.equal(words("frozen", 450, NaN), "FROZEN 0.4 s");
+  assert.equal(words("late", 0, 313), "LATE 310 ms");
+  assert.equal(words("lost", 3999, NaN), "LOST 3 s");
+  assert.equal(words("lost", 1e9, NaN), "LOST");
+  assert.equal(words("unsupported", 0, NaN), "NO PICTURE");
+  assert.equal(words("synchronising", 0, NaN), "SYNCHRONISING");
+});

@@ -1,0 +1,58 @@
+"""Long repeats of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers, garbage.
+
+    make soak                           everything, at most 45 minutes on two cores
+    SOAK=0.1 make soak                  a tenth of it
+    SOAK_SEED=7 make soak               the same random choices again; the seed is printed
+    make soak PARTS="stalls hostile"    some parts only
+
+Every part prints what it did, with its figures; the exit status is 1 if anything failed.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import time
+from collections.abc import Callable
+
+import hostile
+import ip_camera
+import kills
+import openings
+import readers
+import signals
+import stalls
+
+Part = Callable[[int, float], list[str]]  # seed, scale -> what failed
+PARTS: dict[str, Part] = {
+    "signals": lambda seed, scale: [str(run) for run in signals.soak(seed, max(8, round(80 * scale)))],
+    "stalls": stalls.soak,
+    "openings": openings.soak,
+    "kills": kills.soak,
+    "ip_camera": ip_camera.soak,
+    "readers": readers.soak,
+    "hostile": hostile.soak,
+}
+
+
+def main(chosen: list[str]) -> int:
+    scale = float(os.environ.get("SOAK", "1"))
+    seed = int(os.environ.get("SOAK_SEED", random.randrange(10**6)))
+    if unknown := set(chosen) - PARTS.keys():
+        print(f"unknown part {', '.join(sorted(unknown))}; expected one of {', '.join(PARTS)}", file=sys.stderr)
+        return 2
+    print(f"seed {seed}, scale {scale:g}", flush=True)
+    failed: list[str] = []
+    for name in chosen or PARTS:
+        began = time.monotonic()
+        print(f"--- {name}", flush=True)
+        problems = PARTS[name](seed, scale)
+        print(f"--- {name}: {len(problems)} problems, {time.monotonic() - began:.0f} s", flush=True)
+        failed += [f"{name}: {problem}" for problem in problems]
+    print("\n".join(failed) or "no problems")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

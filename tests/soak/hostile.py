@@ -1,0 +1,266 @@
+"""Garbage for RTSP, MQTT in both directions, WebSocket and HTTP of running sides.
+
+No process ends, no thread dies, nothing prints a traceback, watched cameras lose no frame; memory, threads and
+descriptors come back to where they were.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import aiohttp
+from system import CAMERAS, System, Watched, running
+
+COUNT = 10_000  # of each kind
+GROWTH_MB = 60.0
+SETTLE_S = 40.0  # sessions and half-finished requests expire
+
+
+class Size(NamedTuple):
+    """What a process holds."""
+
+    memory_mb: float
+    threads: int
+    descriptors: int
+
+
+def soak(seed: int, scale: float) -> list[str]:
+    dice, count = random.Random(seed), max(200, round(COUNT * scale))
+    problems: list[str] = []
+    kinds: dict[str, Callable[[System, random.Random, int], None]] = {
+        "RTSP": rtsp,
+        "HTTP": http,
+        "WebSocket": websocket,
+        "MQTT to the vehicle": to_vehicle,
+        "MQTT to the operator": to_operator,
+    }
+    with running() as (system, operator):
+        for kind in kinds.values():  # what is loaded and cached at the first use counts as there before
+            kind(system, dice, 100)
+        time.sleep(SETTLE_S / 2)
+        before = _sizes(system)
+        for name, kind in kinds.items():
+            watched = [Watched(system, operator, camera) for camera in CAMERAS]
+            began = time.monotonic()
+            kind(system, dice, count)
+            print(f"  {name}: {count} inputs in {time.monotonic() - began:.0f} s", flush=True)
+            problems += [f"{name}: {problem}" for watch in watched for problem in watch.problems()]
+            problems += [f"{name}: {n} ended" for n, child in system.processes.items() if child.poll() is not None]
+        time.sleep(SETTLE_S)
+        for name, now in _sizes(system).items():
+            was = before[name]
+            print(f"  {name}: before {was}, after {now}", flush=True)
+            if now.memory_mb > was.memory_mb + GROWTH_MB:
+                problems.append(f"{name}: memory rose from {was.memory_mb:.0f} to {now.memory_mb:.0f} MB")
+            # A thread or two may have come from a pool that had not been used up; each client's or camera's is gone.
+            if abs(now.threads - was.threads) > 4:
+                problems.append(f"{name}: {was.threads} threads before, {now.threads} after")
+            if abs(now.descriptors - was.descriptors) > 8:
+                problems.append(f"{name}: {was.descriptors} descriptors before, {now.descriptors} after")
+        problems += system.tracebacks()
+    return problems
+
+
+def _sizes(system: System) -> dict[str, Size]:
+    return {name: _size(child.pid) for name, child in system.processes.items() if name != "broker"}
+
+
+def _size(pid: int) -> Size:
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    memory_kb = float(status["VmRSS"].split()[0])
+    return Size(round(memory_kb / 1024, 1), int(status["Threads"]), len(list(Path(f"/proc/{pid}/fd").iterdir())))
+
+
+# --- what is sent -----------------------------------------------------------------------------------------------------
+
+METHODS = (
+    "OPTIONS",
+    "DESCRIBE",
+    "SETUP",
+    "PLAY",
+    "PAUSE",
+    "TEARDOWN",
+    "GET_PARAMETER",
+    "ANNOUNCE",
+    "RECORD",
+    "GET",
+    "X",
+)
+TRANSPORTS = (
+    "RTP/AVP;unicast;client_port=5000-5001",
+    "RTP/AVP/TCP;unicast;interleaved=0-1",
+    "RTP/AVP;multicast",
+    "RTP/AVP;unicast;client_port=99999-0",
+    "",
+    "\x00",
+)
+EVENTS = (
+    "mode_selected",
+    "total_set",
+    "camera_switched",
+    "roi_set",
+    "camera_configured",
+    "weights_set",
+    "x",
+    "",
+    None,
+    7,
+)
+
+
+def bytes_of(dice: random.Random, most: int = 200) -> bytes:
+    return bytes(dice.randrange(256) for _ in range(dice.randrange(most)))
+
+
+def broken(dice: random.Random, data: bytes) -> bytes:
+    """A message with something cut out, put in or changed; sometimes as it is."""
+    at, way = dice.randrange(len(data) + 1), dice.randrange(5)
+    if way == 0:
+        return data[:at]
+    if way == 1:
+        return data[:at] + bytes_of(dice, 20) + data[at:]
+    if way == 2:
+        return data[:at] + bytes([dice.randrange(256)]) + data[at + 1 :]
+    return data if way == 3 else bytes_of(dice)
+
+
+def rtsp(system: System, dice: random.Random, count: int) -> None:
+    """Whole and broken requests, several on a connection; some connections are left without a word."""
+    sent = 0
+    while sent < count:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", system.media), 1) as sock:
+            sock.settimeout(0.05)
+            for number in range(dice.randrange(1, 8)):
+                camera = dice.choice((*CAMERAS, "none", "", "front/../rear", "front?x=1", "front/stream=9", "%00"))
+                head = [f"{dice.choice(METHODS)} rtsp://127.0.0.1:{system.media}/{camera} RTSP/1.0", f"CSeq: {number}"]
+                head += [f"Transport: {dice.choice(TRANSPORTS)}"] * dice.randrange(2)
+                head += [f"Session: {dice.randrange(10**8)}"] * dice.randrange(2)
+                head += [f"Range: npt={dice.choice(('0.000-', 'now-', '-1-', 'x', '9' * 40))}"] * dice.randrange(2)
+                head += [f"Content-Length: {dice.choice((0, 5, -1, 10**12, 'x'))}"] * (dice.random() < 0.1)
+                sock.sendall(broken(dice, "\r\n".join([*head, "", ""]).encode()))
+                sent += 1
+                with suppress(OSError):
+                    sock.recv(4096)
+
+
+def http(system: System, dice: random.Random, count: int) -> None:
+    sent = 0
+    while sent < count:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", system.page), 1) as sock:
+            sock.settimeout(0.05)
+            path = dice.choice(("/", "/live", "/live?viewer=a", "/static/../x", "/plotly.js", "/%ff", "x" * 9000, "*"))
+            host = dice.choice((f"127.0.0.1:{system.page}", "evil.example", "[::1", "a:b:c", "", "\xff", "x" * 500))
+            head = [f"{dice.choice(('GET', 'POST', 'HEAD', 'PUT', 'CONNECT', 'x'))} {path} HTTP/1.1", f"Host: {host}"]
+            if dice.random() < 0.3:
+                head += [
+                    "Connection: Upgrade",
+                    "Upgrade: websocket",
+                    "Sec-WebSocket-Version: 13",
+                    "Sec-WebSocket-Key: x",
+                ]
+            head += [f"Origin: {dice.choice(('http://evil.example', 'null', 'x'))}"] * dice.randrange(2)
+            head += [f"Content-Length: {dice.choice((0, 3, -1, 10**12, 'x'))}"] * (dice.random() < 0.2)
+            sock.sendall(broken(dice, "\r\n".join([*head, "", ""]).encode("latin-1")))
+            sent += 1
+            with suppress(OSError):
+                sock.recv(4096)
+
+
+def document(dice: random.Random) -> object:
+    """A request, or something like one."""
+    values = (0, -1, 1e308, 10**400, "x", None, True, [], {}, [[]], "\ud800", float("nan"), "front", "../", 0.5, 300)
+    keys = (
+        "kbps",
+        "camera",
+        "on",
+        "mode",
+        "x",
+        "y",
+        "width",
+        "height",
+        "scaling",
+        "weights",
+        "t",
+        "id",
+        "as_of",
+        "clock",
+    )
+    chosen: dict[str, object] = {key: dice.choice(values) for key in dice.sample(keys, dice.randrange(5))}
+    return dice.choice(({"id": "h", "event": dice.choice(EVENTS), **chosen}, chosen, list(chosen), dice.choice(values)))
+
+
+def message(dice: random.Random) -> bytes:
+    if dice.random() < 0.01:
+        return dice.choice((b"[" * 20_000, b'{"a":' * 5000, b"x" * 200_000, b"1" * 5000, b""))
+    return broken(dice, json.dumps(document(dice)).encode())
+
+
+def websocket(system: System, dice: random.Random, count: int) -> None:
+    asyncio.run(_websocket(system, dice, count))
+
+
+async def _websocket(system: System, dice: random.Random, count: int) -> None:
+    sent = 0
+    live = f"http://127.0.0.1:{system.page}/live?viewer="
+    async with aiohttp.ClientSession() as session, session.ws_connect(f"{live}driver", max_msg_size=0) as driver:
+        # The driver's page holds control. What others ask is refused, so that watched cameras stay as they are.
+        reading = asyncio.create_task(_read(driver))
+        while sent < count:
+            async with session.ws_connect(f"{live}hostile{dice.randrange(5)}", max_msg_size=0) as ws:
+                with suppress(ConnectionError):
+                    for _ in range(dice.randrange(1, 200)):
+                        data = message(dice)
+                        if b"take_control" in data:
+                            continue
+                        await (
+                            ws.send_bytes(data) if dice.random() < 0.5 else ws.send_str(data.decode("utf-8", "replace"))
+                        )
+                        sent += 1
+                        while dice.random() < 0.2 and not ws.closed:
+                            with suppress(TimeoutError):
+                                await ws.receive(0.01)
+        assert not driver.closed
+        reading.cancel()
+
+
+async def _read(ws: aiohttp.ClientWebSocketResponse) -> None:
+    async for _ in ws:
+        pass
+
+
+def _publish(system: System, dice: random.Random, count: int, topics: tuple[str, ...]) -> None:
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.connect(system.broker.host, system.broker.port)
+    client.loop_start()
+    for number in range(count):
+        info = client.publish(f"tod/delivery_robot/{dice.choice(topics)}", message(dice), qos=dice.randrange(2))
+        if number % 50 == 49:
+            info.wait_for_publish(5)
+    client.disconnect()
+    client.loop_stop()
+
+
+def to_vehicle(system: System, dice: random.Random, count: int) -> None:
+    _publish(system, dice, count, ("request/hostile", "request/other", "request/\ud7ff", "configuration"))
+
+
+def to_operator(system: System, dice: random.Random, count: int) -> None:
+    """Not retained: what is broken is dropped; a true state would be the vehicle's."""
+    _publish(system, dice, count, ("state", "telemetry", "configuration", "reply/x", f"reply/{_operator(system)}"))
+
+
+def _operator(system: System) -> str:
+    """The operator's id, as the vehicle has reported it."""
+    words = [line.split() for line in system.output("vehicle").read_text().splitlines() if "is present" in line]
+    return words[-1][words[-1].index("operator") + 1]

@@ -1,0 +1,50 @@
+"""An IP camera that stands still for 1 to 30 s: viewers keep their sessions, and the picture comes back."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import time
+
+from system import flowing, running
+
+import rig
+from rig import free_port, until
+
+RETRY_S = 10.0  # longest time between two attempts at a source
+BACK_S = RETRY_S + 3.0
+
+
+def soak(seed: int, scale: float) -> list[str]:
+    dice, problems = random.Random(seed), []
+    with rig.ip_camera(free_port()) as (address, camera):
+        words = ("page.serve=false", "+source@cameras.rear.source=rtsp", f'cameras.rear.source.address="{address}"')
+        with running(*words) as (system, operator):
+            command = ["ffmpeg", "-v", "error", "-rtsp_transport", "tcp", "-i", system.url("rear"), "-f", "null", "-"]
+            with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as player:
+                for number in range(max(2, round(10 * scale))):
+                    stopped_s = dice.uniform(1, 30)
+                    rebuilt = system.samples()["rear"]["rebuilt"]
+                    camera.send_signal(signal.SIGSTOP)
+                    time.sleep(stopped_s)
+                    before = system.samples()["rear"]["frames"]
+                    camera.send_signal(signal.SIGCONT)
+                    woken = time.monotonic()
+                    try:
+                        until(lambda b=before: system.samples()["rear"]["frames"] > b + 15, seconds=30, every_s=0.1)
+                    except AssertionError:
+                        problems.append(f"stood for {stopped_s:.1f} s: no picture within 30 s")
+                        continue
+                    back_s = time.monotonic() - woken
+                    print(f"{number:3} stood {stopped_s:.1f} s, back in {back_s:.1f} s", flush=True)
+                    if back_s > BACK_S:
+                        problems.append(f"stood for {stopped_s:.1f} s: back after {back_s:.1f} s, limit {BACK_S:g} s")
+                    if system.samples()["rear"]["rebuilt"] != rebuilt:
+                        problems.append(f"stood for {stopped_s:.1f} s: the operator's session was rebuilt")
+                    if player.poll() is not None:
+                        problems.append(f"stood for {stopped_s:.1f} s: ffmpeg's session ended")
+                player.kill()
+            until(lambda: flowing(operator), seconds=15)
+            problems += system.tracebacks()
+    return problems

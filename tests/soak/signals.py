@@ -1,0 +1,185 @@
+"""Signals to the verbs that run long, at random moments, single and double: each run ends in time, with all it started.
+
+    PYTHONPATH=tests/integration .venv/bin/python tests/soak/signals.py SEED COUNT [VERB ...]
+
+The signal goes to the whole process group, as Ctrl-C in a terminal sends it. A run fails if it or any process it
+started is alive after `LIMIT_S`, if a traceback is printed, or if the exit status is not one that a signal gives.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from rig import CHECKOUT, free_port
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+LIMIT_S = 3.0  # from the first signal to the end of the last process
+MARK = "TOD_SOAK_RUN"  # environment variable that tells the processes of one run from all others
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=5", "page.serve=false", "pqos=constant", "pqos.kbps=2000")
+STATUSES = {0, 130, 143}
+BY_VERB = {  # what else is right
+    "record": {1},  # a camera had no frame yet
+    # By the system's own hand, when the work is done and Python ends: there are no half files.
+    **{verb: {-signal.SIGINT, -signal.SIGTERM} for verb in ("report", "export", "replay")},
+}
+
+
+class Verb(NamedTuple):
+    """words: the command line, told a free directory; span_s: signals come from 0 to this after the start, s."""
+
+    words: Callable[[Path], Sequence[str]]
+    span_s: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run and what came of it. ended_s: None if it did not end in time; left: command lines of who was left."""
+
+    number: int
+    verb: str
+    signals: tuple[str, ...]
+    at_s: float
+    gap_s: float
+    ended_s: float | None
+    status: int | None
+    left: tuple[str, ...]
+    said: str
+
+    @property
+    def problem(self) -> str:
+        if self.ended_s is None:
+            return f"not ended within {LIMIT_S:g} s: {'; '.join(self.left)}"
+        if "Traceback" in self.said:
+            return f"traceback: {self.said.strip()[-2000:]}"
+        # Before Python has started, a signal ends the process by the system's own hand.
+        killed = self.status is not None and self.status < 0 and self.at_s < 0.5
+        right = self.status in STATUSES | BY_VERB.get(self.verb, set())
+        return "" if right or killed else f"status {self.status}: {self.said.strip()[-200:]}"
+
+    def __str__(self) -> str:
+        ended = "-" if self.ended_s is None else f"{self.ended_s:.2f} s"
+        sent = f"{'+'.join(self.signals)} at {self.at_s:.2f} s" + (f" +{self.gap_s:.2f}" if self.gap_s else "")
+        return f"{self.number:3} {self.verb:11} {sent:32} ended {ended:7} status {self.status}  {self.problem or 'ok'}"
+
+
+def _demo(directory: Path, *more: str) -> Sequence[str]:
+    return ("demo", *ROBOT, f"media.port={free_port()}", f"control.port={free_port()}", "duration_s=60", *more)
+
+
+def _side(verb: str, broker: Endpoint, *more: str) -> Sequence[str]:
+    return (verb, *ROBOT, f"media.port={free_port()}", f"control.port={broker.port}", *more)
+
+
+@contextmanager
+def verbs() -> Iterator[dict[str, Verb]]:
+    """Every verb that runs long, with what it works on."""
+    with tempfile.TemporaryDirectory() as name:
+        directory, broker = Path(name), Endpoint("127.0.0.1", free_port())
+        drive = directory / "drive"
+        subprocess.run(_command(*_demo(directory), "duration_s=4", f"log={drive}"), check=True, capture_output=True)
+        with private_broker(broker):
+            yield {
+                "demo": Verb(_demo, 5.0),
+                "demo relay": Verb(lambda free: _demo(free, "link=relay", f"log={free / 'drive'}"), 5.0),
+                "vehicle": Verb(lambda free: _side("vehicle", broker, f"log={free / 'drive'}"), 3.0),
+                "operator": Verb(lambda free: _side("operator", broker, f"log={free / 'drive'}"), 3.0),
+                "record": Verb(lambda free: ("record", *ROBOT[:3], f"output={free / 'rec'}"), 3.0),
+                "report": Verb(lambda free: ("report", str(drive), f"output={free / 'report'}"), 4.0),
+                "export": Verb(lambda free: ("export", str(drive), f"output={free / 'drive.mcap'}"), 0.6),
+                "replay": Verb(lambda free: ("replay", *ROBOT), 1.0),
+            }
+
+
+def _print(run: Run) -> None:
+    print(run, flush=True)
+
+
+def soak(seed: int, count: int, chosen: Sequence[str] = (), tell: Callable[[Run], None] = _print) -> list[Run]:
+    """Run verbs in turn and interrupt each.
+
+    returns  the runs that failed
+    """
+    dice, failed = random.Random(seed), []
+    with verbs() as known:
+        names = list(chosen or known)
+        for number in range(count):
+            run = _run(number, names[number % len(names)], known[names[number % len(names)]], dice)
+            tell(run)
+            failed += [run] if run.problem else []
+    return failed
+
+
+def _run(number: int, name: str, verb: Verb, dice: random.Random) -> Run:
+    kinds = [dice.choice((signal.SIGINT, signal.SIGTERM)) for _ in range(dice.choice((1, 2)))]
+    at_s, gap_s = dice.uniform(0.05, verb.span_s), dice.choice((0.0, 0.001, 0.02, 0.2, 0.6))
+    mark = uuid.uuid4().hex
+    with tempfile.TemporaryDirectory() as free, tempfile.TemporaryFile("w+") as said:
+        child = subprocess.Popen(
+            _command(*verb.words(Path(free))),
+            stdin=subprocess.PIPE,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            cwd=CHECKOUT,
+            env={**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark},
+        )
+        time.sleep(at_s)
+        began = time.monotonic()
+        for kind in kinds:
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, kind)
+            time.sleep(gap_s if len(kinds) > 1 else 0)
+        left = _wait(child, mark, began + LIMIT_S)
+        ended_s = None if left else time.monotonic() - began
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        assert child.stdin
+        child.stdin.close()
+        status = child.wait(10)
+        said.seek(0)
+        sent = tuple(kind.name for kind in kinds)
+        return Run(number, name, sent, at_s, gap_s, ended_s, status, tuple(left.values()), said.read())
+
+
+def _wait(child: subprocess.Popen[bytes], mark: str, until: float) -> dict[int, str]:
+    """Wait until every process of a run has ended; those that have not in time, by process id."""
+    while True:
+        child.poll()  # else it would stay as a zombie
+        left = marked(mark)
+        if not left or time.monotonic() > until:
+            return left
+        time.sleep(0.02)
+
+
+def marked(mark: str) -> dict[int, str]:
+    """Command lines of the processes that run with a mark in their environment, by process id."""
+    wanted, found = f"{MARK}={mark}".encode(), {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended meanwhile, or is another user's
+            if wanted in (process / "environ").read_bytes():
+                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                found[int(process.name)] = " ".join(words)[:120]
+    return found
+
+
+def _command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "runner", *words]
+
+
+if __name__ == "__main__":
+    problems = soak(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:])
+    sys.exit(f"{len(problems)} of {sys.argv[2]} runs failed" if problems else 0)

@@ -1,0 +1,168 @@
+"""A running broker, vehicle and operator's side, as three processes that a test may stop, kill and start again."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rig import CHECKOUT, Operator, free_port, until
+from runner.core.model import Endpoint
+from runner.mqtt.broker import find_mosquitto
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
+CAMERAS = ("front", "rear", "mast")
+
+
+class System:
+    """Three processes: broker, vehicle, operator.
+
+    words  overrides of both sides
+    url    where a camera is to be had: `url("front")`
+    page   port of the operator's page
+    """
+
+    def __init__(self, directory: Path, words: Sequence[str]) -> None:
+        self.directory = directory
+        self.broker = Endpoint("127.0.0.1", free_port())
+        self.media, self.page = free_port(), free_port()
+        self.words = (*ROBOT, *words, f"control.port={self.broker.port}", f"media.port={self.media}")
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._started = 0
+        (directory / "mosquitto.conf").write_text(
+            f"listener {self.broker.port} {self.broker.host}\nallow_anonymous true\nset_tcp_nodelay true\n"
+        )
+
+    def url(self, camera: str) -> str:
+        return f"rtsp://127.0.0.1:{self.media}/{camera}"
+
+    def start(self, name: str) -> None:
+        self._started += 1
+        self.log = self.directory / f"{name}{self._started}"
+        if name == "broker":
+            command = [find_mosquitto(), "-c", str(self.directory / "mosquitto.conf")]
+        else:
+            page = [f"page.port={self.page}"] if name == "operator" else ["page.serve=false"]
+            command = [sys.executable, "-m", "runner", name, *self.words, *page, f"log={self.log}"]
+        if name == "operator":
+            self.operator_log = self.log / "operator.jsonl"
+        with self.output(name).open("ab") as output:
+            self.processes[name] = subprocess.Popen(
+                command,
+                stdout=output,
+                stderr=output,
+                cwd=CHECKOUT,
+                env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+            )
+
+    def output(self, name: str) -> Path:
+        return self.directory / f"{name}.txt"
+
+    def stop(self) -> None:
+        for child in self.processes.values():
+            child.kill()
+            child.wait()
+
+    def samples(self) -> dict[str, Any]:
+        """The newest counters of what the operator has received, by camera."""
+        with self.operator_log.open("rb") as file:
+            file.seek(max(0, self.operator_log.stat().st_size - 200_000))
+            lines = file.read().split(b"\n")[1:-1]
+        newest = next(line for line in reversed(lines) if b'"log": "sample"' in line)
+        cameras: dict[str, Any] = json.loads(newest)["cameras"]
+        return cameras
+
+    def tracebacks(self) -> list[str]:
+        """Tracebacks in what the processes have printed, the first of each."""
+        found = []
+        for name in self.processes:
+            text = self.output(name).read_text(errors="replace")
+            at = text.find("Traceback")
+            if at >= 0:
+                found.append(f"{name} printed a traceback:\n{text[max(0, at - 300) : at + 3000]}")
+        return found
+
+
+@contextmanager
+def running(*words: str) -> Iterator[tuple[System, Operator]]:
+    """A system that streams, and a program's end of the control link."""
+    with tempfile.TemporaryDirectory(prefix="tod-soak-") as directory:
+        system = System(Path(directory), words)
+        try:
+            for name in ("broker", "vehicle", "operator"):
+                system.start(name)
+            operator = Operator(system.broker)
+            until(lambda: flowing(operator), seconds=30, every_s=0.1)
+            yield system, operator
+        finally:
+            system.stop()
+
+
+def newest(operator: Operator) -> Any:
+    """The vehicle's newest state."""
+    state = None
+    while not operator.states.empty():
+        state = operator.states.get()
+    operator.newest = state or getattr(operator, "newest", {"online": False})  # type: ignore[attr-defined]
+    return operator.newest  # type: ignore[attr-defined]
+
+
+def flowing(operator: Operator, cameras: Sequence[str] = CAMERAS) -> bool:
+    """Whether all cameras are decided to be sent and are watched."""
+    state = newest(operator)
+    return state["online"] and all(
+        state["cameras"][name]["sending"] and state["cameras"][name]["applied"] for name in cameras
+    )
+
+
+class Watched:
+    """A camera that the operator watches: every frame that its encoder puts out must come."""
+
+    def __init__(self, system: System, operator: Operator, camera: str = "front") -> None:
+        self._system, self._operator, self._camera = system, operator, camera
+        self._before = self._settled()
+
+    def problems(self) -> list[str]:
+        """What was lost since the last call."""
+        before, self._before = self._before, self._settled()
+        sent, received, lost, rebuilt = (self._before[key] - before[key] for key in before)
+        print(f"    watched {self._camera}: {sent} frames sent, {received} received, {lost} packets lost", flush=True)
+        found = []
+        if sent <= 0 or sent != received:
+            found.append(f"{sent} frames sent, {received} received")
+        if lost:
+            found.append(f"{lost} packets lost")
+        if rebuilt:
+            found.append(f"its pipeline was rebuilt {rebuilt} times")
+        return [f"watched {self._camera}: {problem}" for problem in found]
+
+    def _settled(self) -> Mapping[str, int]:
+        """Counters at rest: nothing is on its way while the camera is switched off."""
+        self._switch(False)
+        seen: list[Mapping[str, int]] = []
+        while len(seen) < 5 or seen[-1] != seen[-5]:
+            time.sleep(0.3)
+            sample = self._system.samples()[self._camera]
+            sent = self._operator.telemetry[-1]["cameras"][self._camera]["frames"]
+            seen.append(
+                {"sent": sent, "received": sample["frames"], "lost": sample["lost"], "rebuilt": sample["rebuilt"]}
+            )
+        self._switch(True)
+        return seen[-1]
+
+    def _switch(self, on: bool) -> None:
+        said = self._operator.ask(str(time.monotonic()), event="camera_switched", camera=self._camera, on=on)
+        assert said["result"] == "applied", said
+
+
+def ended(child: subprocess.Popen[bytes], seconds: float) -> bool:
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(seconds)
+    return child.poll() is not None

@@ -1,0 +1,23 @@
+"""What the configurations of both sides differ in."""
+
+from __future__ import annotations
+
+from runner.configuration.agreement import differences, settings
+from runner.configuration.config import configuration
+
+
+def of(*overrides: str) -> dict[str, object]:
+    return dict(settings(configuration(["vehicle=delivery_robot", *overrides]).document))
+
+
+def test_what_belongs_to_one_side_need_not_agree() -> None:
+    own = of("source=v4l2", "cameras.front.device=/dev/video7", "media.host=192.0.2.1", "page.port=1", "pqos=constant")
+    assert differences(of("source=test"), own) == ""
+
+
+def test_differences_are_named() -> None:
+    assert differences(of("fps_max=10"), of()) == "fps_max: 10 here, null on the vehicle"
+    assert differences(of(), of("cameras.rear.weight=2", "graph.mtu_bytes=900")) == (
+        "graph.mtu_bytes: 1200 here, 900 on the vehicle; cameras.rear.weight: null here, 2 on the vehicle"
+    )
+    assert differences(of(), of("graph=openh264_rtsp")).endswith(" more")

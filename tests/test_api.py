@@ -1,0 +1,74 @@
+"""The public API: a package of rules, installed as a wheel, runs unchanged and is well typed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+PACKAGE = CHECKOUT / "tests" / "rule_package"
+MODES = """
+defaults: [paper, _self_]
+automatic:
+  - total_from_prediction: {start_kbps: 3000}
+  - night_cap: {cap_kbps: 1234}
+  - demand_from_roi: {}
+  - share_by_demand: {}
+  - scaling_from_rate_quality: {}
+"""
+
+
+def run(*command: str, **variables: str) -> str:
+    environment = {**os.environ, **variables}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory that the package's wheel is installed into."""
+    made, site = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("site")
+    copy = made / "source"
+    copy.mkdir()
+    for path in PACKAGE.rglob("*"):
+        if path.is_file() and path.suffix in (".py", ".toml", ".typed") and "build" not in path.parts:
+            target = copy / path.relative_to(PACKAGE)
+            target.parent.mkdir(exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+    run(*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(made), str(copy))
+    (wheel,) = made.glob("*.whl")
+    run(*pip, "install", "--no-deps", "--no-index", "--target", str(site), str(wheel))
+    return site
+
+
+def test_a_rule_of_an_installed_package_decides(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "modes").mkdir()
+    (tmp_path / "modes" / "night.yaml").write_text(MODES)
+    words = ("print", f"conf={tmp_path}", "modes=night", "source=test", "total_kbps=5000")
+    printed = run(sys.executable, "-m", "runner", *words, PYTHONPATH=f"{installed}{os.pathsep}{CHECKOUT}")
+    assert "total 1234 kbit/s" in printed.splitlines()[0]
+    assert "total 5000 -> 1234: night" in printed
+
+
+def test_the_package_is_well_typed(tmp_path: Path) -> None:
+    words = ("--strict", "--cache-dir", str(tmp_path), "-p", "night_rules")
+    run(sys.executable, "-m", "mypy", *words, MYPYPATH=f"{PACKAGE}{os.pathsep}{CHECKOUT}")
+
+
+def test_the_documented_names_are_there() -> None:
+    from runner.frames import Frame, live_frames
+    from runner.live import LiveVehicle, live_vehicle
+    from runner.model import Camera, Kbps, Mode, RateQualityModel, Roi, Vehicle
+    from runner.rules import Draft, Memory, Step, rule
+    from runner.state import State
+
+    named = (CHECKOUT / "docs" / "api.md").read_text()
+    for name in (Frame, live_frames, LiveVehicle, live_vehicle, Camera, Mode, RateQualityModel, Roi, Vehicle, Draft):
+        assert name.__name__ in named
+    assert all((rule, State, Kbps, Memory, Step))

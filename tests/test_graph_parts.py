@@ -1,0 +1,120 @@
+"""Graphs that build on each other: one part replaced, the rest taken over, problems reported where they are written."""
+
+from __future__ import annotations
+
+import pytest
+from helpers import CONF, Command, UserConf
+
+from runner.configuration.compose import compose
+from runner.configuration.config import configuration
+from runner.core.model import Graph
+
+BASED = sorted(path.stem for path in (CONF / "graph").glob("*.yaml") if path.stem != "h264_rtsp")
+OPEN = "defaults: [h264_rtsp, _self_]\nencoder:\n"
+ENCODER = "  - {name: encoder, element: openh264enc, properties: {complexity: low}}\n"
+WHOLE = "[{name: gate, element: valve}, {name: crop, element: videocrop}, {name: size, element: capsfilter}, "
+UNUSED = "encoder: is not used, the list vehicle must refer to it as ${..encoder}"
+
+
+def graph(conf: UserConf, *words: str, camera: str = "front_left") -> Graph:
+    return configuration(["source=test", *words], conf.path, runnable=False).vehicle().cameras[camera].graph
+
+
+def names(graph: Graph) -> str:
+    return " ".join(element.name for element in graph.vehicle)
+
+
+def test_packaged_graphs_state_only_what_differs() -> None:
+    for name in BASED:
+        lines = (CONF / f"graph/{name}.yaml").read_text().splitlines()
+        assert len(lines) <= 21, name
+        assert "defaults: [h264_rtsp, _self_]" in lines
+
+
+def test_an_encoder_is_replaced_alone(conf: UserConf) -> None:
+    conf.write("graph/mine.yaml", OPEN + ENCODER + "  - {name: parse, element: h264parse}\n")
+    mine = graph(conf, "graph=mine")
+    assert names(mine) == "gate crop scaler size encoder parse sent pay0"
+    assert mine.vehicle[4].properties == {"complexity": "low"}  # and nothing of x264enc's
+
+
+@pytest.mark.parametrize("camera, factory", [("front_left", "openh264enc"), ("front_right", "x264enc")])
+def test_a_mounted_graph_builds_on_another_too(conf: UserConf, camera: str, factory: str) -> None:
+    mine = graph(conf, "+graph@cameras.front_left.graph=openh264_rtsp", camera=camera)
+    assert mine.vehicle[4].factory == factory
+
+
+def test_a_mount_may_refer_to_the_graph_of_all(conf: UserConf) -> None:
+    mine = graph(conf, "graph=openh264_rtsp", "cameras.front_left.graph=${graph}")
+    assert mine.vehicle[4].factory == "openh264enc"
+
+
+def test_the_command_line_changes_a_part(conf: UserConf) -> None:
+    assert graph(conf, "graph.encoder.0.properties.quantizer=20").vehicle[4].properties["quantizer"] == 20
+
+
+def test_a_whole_list_replaces_the_list_with_its_parts(conf: UserConf) -> None:
+    text = f"defaults: [openh264_rtsp, _self_]\nvehicle: {WHOLE}"
+    conf.write("graph/mine.yaml", text + "{name: encoder, element: x264enc}, {name: pay0, element: rtph264pay}]\n")
+    assert [element.factory for element in graph(conf, "graph=mine").vehicle][3:] == ["x264enc", "rtph264pay"]
+
+
+def test_the_composed_graph_is_whole_lists() -> None:
+    document = compose(["graph=h264_srt", "+graph@cameras.front_left.graph=openh264_rtsp"]).document
+    for composed in (document["graph"], document["cameras"]["front_left"]["graph"]):
+        assert not {"encoder", "sender", "receiver"} & set(composed)
+        assert all(isinstance(entry, dict) for side in ("vehicle", "operator") for entry in composed[side])
+
+
+@pytest.mark.parametrize(
+    "text, problem",
+    [
+        (
+            OPEN + "  - {name: encoder, elemnt: openh264enc}\n",
+            "encoder[0].elemnt: unknown key, did you mean element?",
+        ),
+        (
+            OPEN + ENCODER.replace("low", '"{lowest}"'),
+            "encoder[0].properties.complexity: '{lowest}': ",
+        ),
+        (OPEN + ENCODER + ENCODER, "encoder[1].name: 'encoder': is already the name of another element"),
+        (OPEN.replace("encoder", "encodr") + ENCODER, "encodr: unknown key, did you mean encoder?"),
+        (
+            OPEN + ENCODER + "vehicle: [encoder]\n",
+            "vehicle[0]: 'encoder': must be a mapping",
+        ),
+        (
+            "defaults: [h264_rtsp, _self_]\nsender:\n  - {name: sent, element: identity}\n",
+            "vehicle: 'sent': the last element must be named pay0, as the RTSP server asks",
+        ),
+    ],
+)
+@pytest.mark.parametrize("word", ["graph=mine", "+graph@cameras.front_left.graph=mine"])
+def test_a_problem_names_the_part_and_its_file(
+    conf: UserConf, tod: Command, text: str, problem: str, word: str
+) -> None:
+    conf.write("graph/mine.yaml", text)
+    found = [line.partition("/graph/mine.yaml: ")[2] for line in tod("print", "source=test", word, conf.word).problems]
+    assert any(line.startswith(problem) for line in found), found
+
+
+@pytest.mark.parametrize(
+    "old, new, path",
+    [
+        ("name: depay", "name: client", "operator[1].name"),
+        ('"{mtu_bytes}"', '"{mtu}"', "sender[1].properties.mtu"),
+        ("threads: 1", "threads: '{many}'", "encoder[0].properties.threads"),
+    ],
+)
+def test_a_path_is_the_one_in_the_file(conf: UserConf, tod: Command, old: str, new: str, path: str) -> None:
+    conf.change("graph/h264_rtsp.yaml", {old: new})
+    found = {tuple(line.split(": ")[:2]) for line in tod("print", "source=test", conf.word).problems}
+    assert found == {(f"{conf.path}/graph/h264_rtsp.yaml", path)}
+
+
+def test_a_part_that_no_list_takes_in_is_refused(conf: UserConf, tod: Command) -> None:
+    conf.change("graph/h264_rtsp.yaml", {"  - ${..encoder}\n": ENCODER})
+    # The packaged graph gives an encoder, and the user's list does without: nobody would notice.
+    assert tod("print", "source=test", "graph=openh264_rtsp", conf.word).problems == [
+        f"conf/graph/openh264_rtsp.yaml: {UNUSED}"
+    ]

@@ -1,0 +1,80 @@
+"""What the operator reads of a decision: one phrase, whatever it changes."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from runner.core.events import EVENTS
+from runner.mqtt.messages import read_state
+from runner.operator.notes import CAUSES, decision_note
+from runner.records import VehicleState
+
+FULL = {"x": 0, "y": 0, "width": 1280, "height": 720}
+PART = {"x": 8, "y": 4, "width": 640, "height": 360}
+WHY = "500 of 4000 kbit/s, range [400, ...) -> 0.5"
+
+
+def camera(scaling: float | None = 0.5, **more: Any) -> dict[str, Any]:
+    on = scaling is not None
+    decided = {"on": on, "sending": on, "demand_kbps": 4000, "kbps": 500, "scaling": scaling, "width": 64, "height": 36}
+    return decided | {"roi": FULL, "reason": WHY, "weight": 1, "applied": {}} | more
+
+
+def state(cause: str = "start", mode: str = "automatic", total: int = 3000, **cameras: Any) -> VehicleState:
+    known = {name: camera() for name in ("front", "rear", "mast")}
+    document = {"online": True, "t": 1.0, "cause": cause, "mode": mode, "total_kbps": total, "cameras": known | cameras}
+    read = read_state(json.dumps(document).encode())
+    assert read
+    return read
+
+
+PREDICTED = "bitrate_predicted kbps 900"
+LOW = "300 of 4000 kbit/s, range [0, 400) -> 0.25"
+STALE = "no prediction for 2 s"
+
+
+@pytest.mark.parametrize(
+    "after, text",
+    [
+        (state(PREDICTED), None),
+        (state(PREDICTED, rear=camera(reason="another")), None),
+        (state(PREDICTED, rear=camera(0.25, reason=LOW)), f"Prediction 900 kbit/s: rear 0.5 -> 0.25 ({LOW})"),
+        (
+            state(PREDICTED, total=900, rear=camera(0.25), front=camera(0.25), mast=camera(0.125)),
+            "Prediction 900 kbit/s: front, rear 0.5 -> 0.25; mast 0.5 -> 0.125 (3 of 3 cameras, total 900 kbit/s)",
+        ),
+        (
+            state(
+                "clock_advanced",
+                total=400,
+                **{name: camera(0.25, reason=f"{name}; {STALE}") for name in ("front", "rear")},
+            ),
+            f"Time elapsed: front, rear 0.5 -> 0.25 (2 of 3 cameras, total 400 kbit/s; {STALE})",
+        ),
+        (state(PREDICTED, rear=camera(0.125, sending=False)), f"Prediction 900 kbit/s: rear 0.5 -> paused ({WHY})"),
+        (
+            state("camera_switched camera rear on False", rear=camera(None, reason="switched off")),
+            "rear switched: rear 0.5 -> off (switched off)",
+        ),
+        (
+            state("roi_set camera rear x 8 y 4 width 640 height 360", rear=camera(roi=PART)),
+            f"ROI of rear set: rear ROI 640x360 at 8, 4 ({WHY})",
+        ),
+        (state("mode_selected mode single", mode="single"), "Mode single: total 3000 kbit/s"),
+        (
+            state("mode_selected mode single", mode="single", rear=camera(0.25)),
+            f"Mode single: rear 0.5 -> 0.25 ({WHY})",
+        ),
+        (state(PREDICTED, mode="single"), "Mode single; Prediction 900 kbit/s: total 3000 kbit/s"),
+        (state("tide_turned high 3", rear=camera(0.25)), f"tide_turned high 3: rear 0.5 -> 0.25 ({WHY})"),
+    ],
+)
+def test_a_decision_is_one_phrase(after: VehicleState, text: str | None) -> None:
+    assert decision_note(state(), after) == text
+
+
+def test_every_event_has_a_phrase() -> None:
+    assert CAUSES.keys() == EVENTS.keys()

@@ -1,0 +1,81 @@
+"""Presence of operators, and which requests are too old."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.mqtt.messages import MAX_ROUND_TRIP_S
+from runner.vehicle.operators import DELAYS, MOST, SILENT_S, Operators
+
+
+def test_an_operator_leaves_by_its_own_silence_or_goodbye_only() -> None:
+    operators = Operators(1.0)
+    assert operators.connected("a", 0.0)
+    assert operators.connected("b", 0.0)
+    assert not operators.disconnected("stranger")
+    assert operators.disconnected("b")
+    assert operators.present == {"a"}
+    assert operators.silent(SILENT_S) == []
+    assert operators.silent(SILENT_S + 0.1) == ["a"]
+    assert operators.silent(100) == []  # gone already
+    assert operators.present == frozenset()
+
+
+def test_any_message_of_its_own_brings_an_operator_back() -> None:
+    operators = Operators(1.0)
+    operators.connected("a", 0.0)
+    operators.silent(5.0)
+    assert not operators.heard("b", 6.0)
+    assert operators.present == frozenset()
+    assert operators.heard("a", 6.0)
+    assert not operators.heard("a", 6.1)
+    assert operators.present == {"a"}
+
+
+def test_who_never_announced_itself_is_no_operator() -> None:
+    operators = Operators(1.0)
+    assert not operators.heard("predictor", 0.0)
+    assert operators.present == frozenset()
+
+
+def test_the_operator_who_has_been_present_longest_is_in_control() -> None:
+    operators = Operators(1.0)
+    assert operators.in_control == ""
+    operators.connected("b", 0.0)
+    operators.connected("a", 0.5)
+    operators.heard("b", 1.2)
+    assert operators.in_control == "b"
+    operators.silent(2.0)  # a
+    operators.heard("a", 2.1)
+    operators.disconnected("b")
+    operators.heard("b", 2.2)
+    assert operators.in_control == "a"
+
+
+def test_the_longest_absent_is_forgotten_first() -> None:
+    operators = Operators(1.0)
+    operators.connected("driver", 0.0)
+    for number in range(10 * MOST):
+        operators.heard(f"stranger{number}", float(number))
+    assert operators.present == {"driver"}
+
+
+@pytest.mark.parametrize(
+    "delays, delay, expired",
+    [
+        ([], 0.99, ""),
+        ([], 1.01, "1.01 s old, limit 1.00 s"),
+        ([0.2, 0.3], 1.19, ""),  # beyond the round trip, the least delay there was
+        ([0.2, 0.3], 1.21, "1.21 s old, limit 1.20 s"),
+        ([6.0, 6.0], 6.0, f"6.00 s old, limit {1 + MAX_ROUND_TRIP_S:.2f} s"),
+        ([0.01] + [0.4] * DELAYS, 1.39, ""),  # the path has become longer
+        ([], -0.05, ""),
+        ([], -0.2, "as_of 100.2 is ahead of the vehicle's time, 100"),
+    ],
+)
+def test_a_request_expires(delays: list[float], delay: float, expired: str) -> None:
+    operators = Operators(1.0)
+    for earlier in delays:
+        operators.expired("a", 50.0, 50.0 - earlier)
+        operators.expired("b", 50.0, 50.0)  # another operator's path does not matter
+    assert operators.expired("a", 100.0, 100.0 - delay) == expired

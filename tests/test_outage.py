@@ -1,0 +1,38 @@
+"""What is said of a camera that fails again and again."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.gst.outage import Outage
+
+pytestmark = pytest.mark.gst  # the package runner.gst loads it
+
+
+def test_each_reason_is_told_once_and_the_end_with_its_length():
+    told = []
+    outage = Outage(told.append)
+    assert outage.reason == ""
+    outage.failed("no frame for 1 s", 10.0)
+    for second in range(12, 30):
+        outage.failed("refused" if second % 2 else "no frame for 1 s", float(second))
+    assert outage.reason == "no frame for 1 s"
+    assert told == ["no frame for 1 s", "refused"]
+    outage.over(30.2)
+    assert told[2:] == ["works again after 20 s"]
+    assert outage.reason == ""
+
+
+def test_what_fails_again_is_told_again():
+    told = []
+    outage = Outage(told.append)
+    for began in (0.0, 10.0):
+        outage.failed("refused", began)
+        outage.over(began + 1)
+    assert told == ["refused", "works again after 1 s"] * 2
+
+
+def test_nothing_is_told_where_nothing_failed():
+    told = []
+    Outage(told.append).over(1.0)
+    assert told == []

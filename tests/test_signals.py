@@ -1,0 +1,158 @@
+"""What SIGINT and SIGTERM do to a process, whatever its main thread is busy with."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from textwrap import dedent, indent
+
+import pytest
+
+from runner.system.signals import END_S, LIFELINE
+
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: for ever
+
+
+def started(body: str, **options: object) -> subprocess.Popen[str]:
+    """A process that runs `body` as a verb would run, and has said "ready"."""
+    program = dedent(
+        """\
+        import ctypes, sys, threading, time
+        from pathlib import Path
+        from runner.system import signals
+        from runner.system.files import unfinished
+        def ready():
+            print("ready", flush=True)
+        with signals.handled():
+            try:
+                with signals.interruptible():
+        """
+    )
+    program += indent(dedent(body), 12 * " ")
+    program += "\n    except KeyboardInterrupt:\n        sys.exit(128 + signals.received())\n"
+    words = [sys.executable, "-c", program]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload]
+    assert child.stdout
+    assert child.stdout.readline() == "ready\n", child.communicate(timeout=10)
+    return child  # type: ignore[no-any-return]
+
+
+def ended(child: subprocess.Popen[str]) -> tuple[int, str, float]:
+    """Exit status, standard error, seconds until then."""
+    began = time.monotonic()
+    _, said = child.communicate(timeout=20)
+    return child.returncode, said, time.monotonic() - began
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_interrupts_the_main_thread(number: signal.Signals) -> None:
+    child = started("ready(); time.sleep(60)")
+    child.send_signal(number)
+    assert ended(child)[:2] == (128 + number, "")
+
+
+def test_a_library_that_makes_another_error_of_it_changes_nothing() -> None:
+    child = started(
+        """\
+        ready()
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            raise ValueError("Invalid affine transformation matrix")
+        """
+    )
+    child.send_signal(signal.SIGTERM)
+    assert ended(child)[:2] == (143, "")
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_verb_that_looks_is_not_interrupted(number: signal.Signals) -> None:
+    child = started(
+        """\
+        with signals.stopping() as stop:
+            ready()
+            while not stop.wait(60):
+                pass
+        time.sleep(0.2)  # its orderly end
+        sys.exit(stop.status)
+        """
+    )
+    child.send_signal(number)
+    assert ended(child)[:2] == (130 if number == signal.SIGINT else 0, "")
+
+
+@pytest.mark.parametrize("mode", ["", "with signals.stopping(): "])
+def test_a_main_thread_in_a_c_library_is_ended_by_force(mode: str) -> None:
+    child = started(f"{mode}threading.Timer(0.3, ready).start(); {LOCK}; {LOCK.partition('; ')[2]}")
+    child.send_signal(signal.SIGTERM)
+    status, said, seconds = ended(child)
+    assert (status, said) == (143, "no orderly end in time: ending at once\n")
+    assert seconds > END_S / 2
+
+
+def test_a_second_signal_ends_at_once_and_leaves_no_half_file(tmp_path: Path) -> None:
+    child = started(
+        f"""\
+        with signals.stopping(limit_s=None) as stop, unfinished(Path({str(tmp_path / "file")!r})) as part:
+            part.write_text("half")
+            ready()
+            stop.wait(60)
+            print("stopping", flush=True)
+            time.sleep(60)
+        """
+    )
+    assert len(list(tmp_path.iterdir())) == 1
+    child.send_signal(signal.SIGINT)
+    assert child.stdout and child.stdout.readline() == "stopping\n"
+    child.send_signal(signal.SIGTERM)
+    assert ended(child)[:2] == (130, "a second signal: ending at once\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cleaning_up_that_hangs_delays_nothing_for_long() -> None:
+    child = started("with signals.urgent(lambda: time.sleep(60)):\n    ready(); time.sleep(0.1); time.sleep(60)")
+    child.send_signal(signal.SIGSTOP)  # both signals are there when it looks
+    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.SIGTERM)
+    child.send_signal(signal.SIGCONT)
+    status, said, seconds = ended(child)
+    assert status in (130, 143)
+    assert said == "a second signal: ending at once\n"
+    assert seconds < 10
+
+
+def test_nobody_who_reads_standard_error_is_waited_for() -> None:
+    child = started("ready()\nwhile True:\n    sys.stderr.write('x' * 4096)")
+    time.sleep(0.2)  # the pipe is full now
+    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.SIGTERM)
+    assert child.wait(10) in (130, 143)
+
+
+def test_a_verb_whose_parent_ends_its_lifeline_ends_as_by_sigterm() -> None:
+    read, write = os.pipe()
+    child = started(
+        "with signals.stopping() as stop:\n    ready(); stop.wait(60)\nsys.exit(stop.status)",
+        pass_fds=[read],
+        env={**os.environ, LIFELINE: str(read)},
+    )
+    os.close(read)
+    os.close(write)
+    assert ended(child)[:2] == (0, "")
+
+
+def test_a_parent_that_ended_before_the_verb_looked_is_noticed() -> None:
+    read, write = os.pipe()
+    os.close(write)
+    words = [sys.executable, "-m", "runner", "replay", "modes=paper", "source=test"]
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[read], env={**os.environ, LIFELINE: str(read)}
+    ) as child:
+        os.close(read)
+        assert child.wait(20) == 143
+        assert child.stderr and child.stderr.read() == b""

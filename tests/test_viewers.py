@@ -1,0 +1,62 @@
+"""Who may watch a camera over the uplink."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.gst.viewers import Viewer, admit, operator_of, over_uplink, user_agent
+
+LOCAL, ANNA, BERT, ANYONE = (
+    Viewer("127.0.0.1"),
+    Viewer("192.0.2.7", "anna"),
+    Viewer("192.0.2.8", "bert"),
+    Viewer("192.0.2.9"),
+)
+
+
+@pytest.mark.parametrize(
+    ("address", "leaves"),
+    [
+        ("127.0.0.1", False),
+        ("127.8.8.8", False),
+        ("::1", False),
+        ("::ffff:127.0.0.1", False),
+        ("192.0.2.7", True),
+        ("::ffff:192.0.2.7", True),
+        ("fe80::1%eth0", True),
+    ],
+)
+def test_only_loopback_costs_no_uplink(address, leaves):
+    assert over_uplink(address) is leaves
+
+
+@pytest.mark.parametrize(
+    ("viewers", "newcomer", "limit", "controller", "leaving"),
+    [
+        ([], ANYONE, 1, "", []),
+        ([ANYONE], LOCAL, 1, "", []),
+        ([LOCAL, LOCAL], ANYONE, 1, "", []),
+        ([ANYONE], BERT, 1, "", None),
+        ([ANYONE], ANYONE, 2, "", []),
+        ([ANYONE, BERT], ANYONE, 2, "", None),
+        ([ANYONE], BERT, 1, "anna", None),
+        ([BERT], ANNA, 1, "anna", [BERT]),
+        ([ANYONE, BERT], ANNA, 2, "anna", [BERT]),  # the newest
+        ([ANNA], BERT, 1, "anna", None),
+        ([ANNA, BERT], ANNA, 2, "anna", [BERT]),
+        ([ANNA], ANNA, 1, "anna", [ANNA]),  # whose address changed
+        ([ANYONE], Viewer("192.0.2.9"), 1, "", None),  # no operator is not the controller where there is none
+        ([LOCAL, ANYONE], ANNA, 1, "anna", [ANYONE]),
+        ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, "anna", [ANYONE._replace(since=1)]),
+    ],
+)
+def test_who_is_let_in_and_who_leaves(viewers, newcomer, limit, controller, leaving):
+    assert admit(viewers, newcomer, limit, controller) == leaving
+
+
+@pytest.mark.parametrize(
+    ("agent", "operator"),
+    [(user_agent("anna"), "anna"), ("ffmpeg/5.1", ""), (None, ""), ("", ""), (user_agent(""), "")],
+)
+def test_an_operator_is_known_by_its_user_agent(agent, operator):
+    assert operator_of(agent) == operator
