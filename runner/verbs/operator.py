@@ -45,7 +45,9 @@ def run(arguments: Arguments) -> int:
             operator.start(page.show if page else None, duration)
             gc.freeze()  # what is loaded by now stays: collecting it again and again would hold up frames
             with stopping(action=operator.end) as stop:
-                while operator.runs(SHOW_S):
+                runs = True
+                while runs:  # once more after the end: the last notes are shown too
+                    runs = operator.runs(SHOW_S)
                     table.show(station.rows(), station.headline())
     show_summary(station.meters, station.samples)
     return stop.status
