@@ -118,3 +118,10 @@ def test_a_part_that_no_list_takes_in_is_refused(conf: UserConf, tod: Command) -
     assert tod("print", "source=test", "graph=openh264_rtsp", conf.word).problems == [
         f"conf/graph/openh264_rtsp.yaml: {UNUSED}"
     ]
+
+
+def test_an_override_of_a_part_by_its_number_names_the_command_line(tod: Command) -> None:
+    assert tod("print", "graph.vehicle.4.properties.threads=2").problems == [
+        "command line: graph.vehicle[4].name: missing: must be given",
+        "command line: graph.vehicle[4].element: missing: must be given",
+    ]

@@ -388,3 +388,17 @@ def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest
     lists = {**TUM.modes, Mode.AUTOMATIC: (TUM.modes[Mode.AUTOMATIC][0], call, *TUM.modes[Mode.AUTOMATIC][1:])}
     assert check_order(Mode.AUTOMATIC, lists[Mode.AUTOMATIC]) == []
     assert decide(replace(TUM, modes=lists), START, {})[0].total == 1000
+
+
+def test_a_rule_that_reads_an_unknown_field_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(_: EntryPoint) -> None:
+        rules.rule(reads=["prediction", "predicton"])(lambda vehicle, state, draft, memory: (draft, memory))
+
+    entry = EntryPoint("deaf", "my.rules:deaf", "tod_runner.rules")
+    monkeypatch.setattr(EntryPoint, "load", load)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group, name: [entry])
+    with pytest.raises(ModelError) as refused:
+        call_rule("deaf", {})
+    assert str(refused.value).startswith(
+        ": 'deaf': my.rules:deaf cannot be imported: ValueError: reads: predicton: unknown; expected fields of State: "
+    )

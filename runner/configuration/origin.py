@@ -80,8 +80,10 @@ class Composed:
             makers = [part for part in inside if len(part.package) == length]
             above = (part for part in inside if len(part.package) < length)
             holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
-            # For a missing key ask who made its surroundings, the most local file first.
-            asked = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
+            if length < len(path):  # the key is missing: the part that wrote its surroundings, the most local first
+                writers = [part for part in holders if isinstance(_held(part, path[:length]), dict | list)]
+                holders = sorted(writers or holders, key=_locality)
+            asked = [*holders, *makers] if length == len(path) else [*makers, *holders]
             if asked:
                 return asked[0]
         vehicle = (part for part in self.parts if part.path and part.path.parent.name == "vehicle")

@@ -23,7 +23,11 @@ def find_rule(name: str) -> Rule:
         from importlib.metadata import entry_points
 
         for entry in entry_points(group="tod_runner.rules", name=name):
-            entry.load()
+            try:
+                entry.load()
+            except Exception as error:  # whatever the user's package raises when it is imported
+                rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
+                raise ModelError("", repr(name), rule) from None
     if name not in rules.RULES:
         raise ModelError("", repr(name), f"unknown rule, {suggest(name, rules.RULES)}")
     return rules.RULES[name]

@@ -83,12 +83,16 @@ def rule(
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Make a function known as a rule under its own name.
 
-    reads  saves decisions that would come out the same: without it any change of the state makes the mode decide again
+    reads   saves decisions that would come out the same: without it any change of the state makes the mode decide again
+    raises  ValueError where `reads` names no field of the state: the rule would miss its changes
     """
+    read = frozenset(reads)
+    if unknown := sorted(read - EVERYTHING):
+        raise ValueError(f"reads: {', '.join(unknown)}: unknown; expected fields of State: {', '.join(sorted(EVERYTHING))}")
 
     def register(function: Callable[..., Step]) -> Callable[..., Step]:
         name = function.__name__
-        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), frozenset(reads))
+        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), read)
         return function
 
     return register

@@ -252,10 +252,11 @@ class Station:
 
     def _on_telemetry(self, message: Message) -> None:
         telemetry = read_telemetry(message.payload)
+        if message.retained:  # published before: not a sign of life, and not the vehicle's time now
+            return
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
-        if self._published:  # else it is the retained telemetry of a vehicle that is gone
-            self._hear()
+        self._hear()
 
     def _on_configuration(self, message: Message) -> None:
         """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""

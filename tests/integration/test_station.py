@@ -58,6 +58,10 @@ class Vehicle:
         parts = (kind, self.operator) if kind == "reply" else (kind,)
         self.link.publish(topic("delivery_robot", *parts), message)
 
+    def live_until(self, done):
+        """Publish telemetry again and again, as a vehicle does."""
+        until(lambda: [self.publish("telemetry", TELEMETRY), done()][-1], every_s=0.1)
+
     def request(self, event):
         return until(lambda: next((asked for asked in self.requests if asked["event"] == event), None))
 
@@ -72,8 +76,7 @@ def both():
         vehicle = Vehicle(broker)
         station.connect()
         vehicle.publish("state", STATE)
-        vehicle.publish("telemetry", TELEMETRY)
-        until(lambda: station.state)
+        vehicle.live_until(lambda: station.state)
         yield station, vehicle, heard
         station.close()
         vehicle.link.close((topic("delivery_robot", "state"), OFFLINE))
@@ -98,6 +101,22 @@ def test_who_comes_says_hello_and_is_answered(both):
     until(lambda: replies)
     assert results(replies) == [("refused", "no")]
     assert heard.notes == ["the vehicle is online, mode automatic"]
+
+
+def test_retained_telemetry_is_no_sign_of_life(both):
+    station, vehicle, _ = both
+    late = Station(station._vehicle, {})
+    notes = Heard()
+    late.listeners.append(notes)
+    late.connect()
+    try:
+        until(lambda: late._published)  # retained, and so was the telemetry
+        with pytest.raises(AssertionError):
+            until(lambda: late.state, seconds=0.5)
+        vehicle.live_until(lambda: late.state)
+        assert notes.notes == ["the vehicle is online, mode automatic"]
+    finally:
+        late.close()
 
 
 def test_a_request_that_nobody_answers_has_timed_out(both):
