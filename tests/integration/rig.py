@@ -56,6 +56,14 @@ def until(done: Callable[[], Any], seconds: float = 15, every_s: float = 0.01) -
     return seen
 
 
+def passes(done: Callable[[], Any], seconds: float) -> bool:
+    """Whether something comes to pass in time."""
+    try:
+        return bool(until(done, seconds))
+    except AssertionError:
+        return False
+
+
 class Heard(Listener):
     """Keeps what a station says, as ("state" | "sample" | "note", record)."""
 

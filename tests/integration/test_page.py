@@ -60,6 +60,7 @@ def demo():
         f"control.port={free_port()}",
         "duration_s=1200",
         "fps_max=5",
+        "pqos.position.speed_mps=16",  # the loop in half a minute
     )
     # 5 Hz: two cores that also run the tests have time to spare, so that counts say something
     with process("demo", *words, stdout=subprocess.DEVNULL) as child:
@@ -105,11 +106,16 @@ def apart(coroutine):
 
 
 def take_control(page):
-    other = page.evaluate("tod.control") == "another"
-    page.locator("#take-control").click()
-    if other:  # asked once more
-        page.locator("#confirm-yes").click()
-    until(lambda: page.evaluate("tod.control === 'you'"))
+    def taken():
+        """A person would click again where the page was just connecting."""
+        if (holder := page.evaluate("tod.control")) == "you":
+            return True
+        page.locator("#take-control").click()
+        if holder == "another":  # asked once more
+            page.locator("#confirm-yes").click()
+        return rig.passes(lambda: page.evaluate("tod.control === 'you'"), seconds=2)
+
+    until(taken)
 
 
 def measure(page):
@@ -623,21 +629,23 @@ def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
             assert frames.next(5)
 
 
-def test_a_new_size_every_second_for_a_minute_breaks_no_decoder(chromium):
+def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
+    """`make soak` does it for longer."""
+    turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
     graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
     with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
-        began = time.monotonic()
-        for turn in range(60):
+        counted, began = measure(page), time.monotonic()
+        for turn in range(turns):
             for camera in ("front", "rear", "mast"):
                 reply = send(page, event="camera_configured", camera=camera, scaling=(0.25, 0.5, 1.0)[turn % 3])
                 assert reply["result"] == "applied", reply
-            time.sleep(max(0.5, began + turn + 1 - time.monotonic()))
+            time.sleep(0.5)
             for camera in ("front", "rear", "mast"):
                 assert luma(page, camera)[0].mean() > 40, f"{camera} is black in turn {turn}"
-        measured = measure(page)
+        measured, sent = measure(page), 15 * (time.monotonic() - began)
         assert {name: camera["errors"] for name, camera in measured.items()} == {"front": 0, "rear": 0, "mast": 0}
-        assert all(camera["drawn"] > 0.9 * 60 * 15 for camera in measured.values())
+        assert all(camera["drawn"] - counted[name]["drawn"] > 0.9 * sent for name, camera in measured.items())
 
 
 SHIFTED = """\

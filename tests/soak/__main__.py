@@ -1,4 +1,5 @@
-"""Long repeats of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers, garbage.
+"""Long repeats of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
+new sizes, garbage.
 
     make soak                           everything, at most 45 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
@@ -22,6 +23,7 @@ import kills
 import openings
 import readers
 import signals
+import sizes
 import stalls
 
 Part = Callable[[int, float], list[str]]  # seed, scale -> what failed
@@ -32,6 +34,7 @@ PARTS: dict[str, Part] = {
     "kills": kills.soak,
     "ip_camera": ip_camera.soak,
     "readers": readers.soak,
+    "sizes": sizes.soak,
     "hostile": hostile.soak,
 }
 
