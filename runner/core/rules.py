@@ -88,7 +88,9 @@ def rule(
     """
     read = frozenset(reads)
     if unknown := sorted(read - EVERYTHING):
-        raise ValueError(f"reads: {', '.join(unknown)}: unknown; expected fields of State: {', '.join(sorted(EVERYTHING))}")
+        raise ValueError(
+            f"reads: {', '.join(unknown)}: unknown; expected fields of State: {', '.join(sorted(EVERYTHING))}"
+        )
 
     def register(function: Callable[..., Step]) -> Callable[..., Step]:
         name = function.__name__

@@ -1,7 +1,7 @@
-"""What runs here needs GStreamer, and most of it the machine for itself.
+"""Everything here needs GStreamer, and most of it lives by the clock.
 
-`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs what is marked `alone` by itself, and the rest
-on all cores.
+`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs three tests at a time of what is marked `timed`,
+then one by one those marked `alone`, whose limits are tight; beside them everything else, at the lowest priority.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from rig import free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
-BESIDE_OTHERS = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
+UNTIMED = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -21,8 +21,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         path = Path(item.fspath)
         if path.parent.name == "integration":
             item.add_marker("gst")
-            if path.stem not in BESIDE_OTHERS:
-                item.add_marker("alone")
+            if path.stem not in UNTIMED and not item.get_closest_marker("alone"):
+                item.add_marker("timed")
 
 
 @pytest.fixture

@@ -176,6 +176,7 @@ print(sent)
 """
 
 
+@pytest.mark.alone
 def test_a_flood_of_one_operator_holds_up_no_other(broker, vehicle):
     good = Operator(broker)
     good.ask("0", event="mode_selected", mode="collective")

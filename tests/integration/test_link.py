@@ -128,6 +128,7 @@ def test_a_wide_link_passes_everything(kind):
     assert [line.t for line in drive.lines] == sorted(line.t for line in drive.lines)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
     def kbps_at(t):
@@ -152,6 +153,7 @@ def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
             assert line.kbps == kbps_at(line.t)
 
 
+@pytest.mark.alone
 def test_rtsp_over_tcp_waits_where_udp_is_dropped():
     with driving("relay", lambda t: 5000 if t < 1 else 1000, sent_kbps=2000, tcp=True) as drive:
         until(lambda: drive.lines[-1].t > 1)

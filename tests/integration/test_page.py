@@ -524,6 +524,7 @@ def sides(*overrides, log="log.video=false"):
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
 
 
+@pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
@@ -547,6 +548,7 @@ def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
             assert page.locator("#banner").is_hidden()
 
 
+@pytest.mark.alone
 def test_a_station_that_stands_still_is_left_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)

@@ -116,6 +116,7 @@ def test_a_pause_loses_no_packet_of_what_follows():
         assert (over_udp.lost, over_tcp.lost) == (0, 0)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
 @pytest.mark.parametrize("state", ["sending", "off before the first viewer", "off", "off with a viewer over UDP"])
 def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
@@ -147,6 +148,7 @@ def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
             until(lambda: viewer.frames > 5)
 
 
+@pytest.mark.alone
 def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delivers():
     with serving("source=appsrc") as vehicle, asking_options(vehicle, CAMERA) as took:
         with RtspClient(vehicle.url()) as client:
@@ -316,6 +318,7 @@ def longest_allowed(untouched):
 # --- readers that stop or lag -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("small", [True, False], ids=["small buffers", "large buffers"])
 @pytest.mark.parametrize("neighbour", ["udp", "tcp", "both"])
 def test_a_reader_that_stops_is_closed_and_holds_up_nobody(neighbour, small):
@@ -350,6 +353,7 @@ def test_a_viewer_that_joins_while_the_only_other_has_stopped_gets_the_picture(u
                 until(lambda: viewer.frames > 80)
 
 
+@pytest.mark.alone
 def test_a_reader_that_is_slow_is_closed():
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving(*SMALL, cameras=(SMALL_CAMERA, UNTOUCHED)))
