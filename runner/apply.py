@@ -18,10 +18,10 @@ from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.aside import settle
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
+from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
-from runner.gst.server import CameraServer
+from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
 from runner.gst.video_files import VideoFile, VideoFiles, born
 from runner.gst.watched import WatchedSource
@@ -39,7 +39,7 @@ __all__ = [
     "TYPELIBS",
     "OnUnit",
     "OperatorSide",
-    "Received",
+    "Reception",
     "Recorded",
     "RecordingSide",
     "Stage",
@@ -58,7 +58,6 @@ __all__ = [
     "write_clip",
 ]
 
-Report = Callable[[str, str], None]  # camera, what happened to it
 CALL_S = 10.0  # what GLib's thread is asked to do takes milliseconds; after so long it hangs
 STOP_S = 2.0  # how long the end waits for pipelines to stop
 
@@ -165,7 +164,7 @@ class VehicleSide:
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, report: Report, video: VideoFiles | None = None) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, report: OnReport, video: VideoFiles | None = None) -> None:
         self._report, self._video = report, video
         plans = _kept(plans, video)
         self._lock = threading.Lock()
@@ -280,7 +279,7 @@ class OperatorSide:
     def __init__(
         self,
         plans: Sequence[Plan],
-        report: Report,
+        report: OnReport,
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
@@ -300,14 +299,14 @@ class OperatorSide:
 
         self._glib.call("starting the receivers", start)
 
-    def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
+    def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
         """What has come of each camera; to be called a few times a second.
 
         sending  which cameras should send; one that should and is silent is built anew. Those of which nobody knows are
                  left out
         raises   RunError where GStreamer hangs
         """
-        samples: dict[str, Received] = {}
+        samples: dict[str, Reception] = {}
 
         def sample() -> None:
             for name, receiver in self._receivers.items():

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from runner.core.commands import Command, Knobs
+from runner.core.commands import Command, KnobValues
 from runner.core.decision import Decision, Setting
 from runner.core.events import PositionReported
 from runner.core.model import Mode, Roi, plain
@@ -359,7 +359,7 @@ def line_from_json(document: Mapping[str, Any]) -> Record:
 _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if kind is not Offline}
 
 
-def applied_to_json(camera: str, knobs: Knobs) -> Applied:
+def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
     """Where a camera's knobs are, by name."""
     return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
 

@@ -16,7 +16,7 @@ from helpers import CONF, Command, process
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
-from runner.drive.checks import Check
+from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.figures import Figure, figures
 from runner.drive.read import read_drive
@@ -185,7 +185,11 @@ def test_claims_are_held_against_the_drive(
     from runner.drive import claims as module
     from runner.verbs.report import report
 
-    claims = [Check("the total varies", "3000 to 7310 kbit/s", True), Check("<b>", "&", False), Check("c", "d", None)]
+    claims = [
+        ClaimCheck("the total varies", "3000 to 7310 kbit/s", True),
+        ClaimCheck("<b>", "&", False),
+        ClaimCheck("c", "d", None),
+    ]
     monkeypatch.setattr(module, "claims", lambda series: claims)
     report([drive], tmp_path / "out")
     (one,) = document(tmp_path / "out")["drives"]

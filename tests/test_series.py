@@ -14,15 +14,15 @@ from helpers import vehicle
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
 from runner.drive.read import read_drive
-from runner.drive.series import Line, counted, held, mean_held, panels, rate, sending_spans, series, spans
+from runner.drive.series import TimeSeries, counted, held, mean_held, panels, rate, sending_spans, series, spans
 from runner.errors import UserError
 
 NAN = float("nan")
 
 
-def line(*points: tuple[float, float]) -> Line:
+def line(*points: tuple[float, float]) -> TimeSeries:
     t, y = np.array(points, dtype=float).reshape(-1, 2).T
-    return Line(t, y)
+    return TimeSeries(t, y)
 
 
 def test_what_holds_until_the_next() -> None:
@@ -83,7 +83,7 @@ def test_sides_are_joined_by_the_time_they_began(tmp_path: Path) -> None:
     assert np.isnan(received.kbps[received.t < OPERATOR_LATER_S + 1.9]).all()
     assert np.isfinite(received.kbps[received.t > OPERATOR_LATER_S + 2.5]).all()
     decided = drive.cameras["front_left"].decided
-    at_5 = held(Line(decided.t, decided.kbps), np.array([5.0]))
+    at_5 = held(TimeSeries(decided.t, decided.kbps), np.array([5.0]))
     assert np.interp(5.0, *drive.cameras["front_left"].actual) == pytest.approx(at_5[0], rel=0.2)
 
 

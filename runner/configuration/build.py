@@ -19,17 +19,17 @@ from runner.core.model import (
     Element,
     Endpoint,
     Graph,
+    KnobTarget,
     Media,
     Mode,
     ModelError,
-    Page,
+    PageSettings,
     Place,
     Pose,
     RateQualityModel,
     Recording,
     Roi,
     Source,
-    Turn,
     Value,
     Vehicle,
     exact,
@@ -47,7 +47,7 @@ GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "
 
 T = TypeVar("T")
 
-Check = Callable[[Plan], Iterable[ModelError]]
+PlanCheck = Callable[[Plan], Iterable[ModelError]]
 
 
 @dataclass
@@ -59,7 +59,7 @@ class Builder:
 
     composed: Composed
     runnable: bool
-    check: Check | None
+    check: PlanCheck | None
     fits: Collection[str] = ()  # sections that the schemas accept, as is known already
     problems: list[Problem] = field(default_factory=list)
     bad: set[schema.Path] = field(default_factory=set)
@@ -69,7 +69,7 @@ class Builder:
     others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
 
     @classmethod
-    def of(cls, composed: Composed, runnable: bool, check: Check | None, fits: Collection[str]) -> Builder:
+    def of(cls, composed: Composed, runnable: bool, check: PlanCheck | None, fits: Collection[str]) -> Builder:
         """The builder of a configuration, with its vehicle built."""
         builder = cls(composed, runnable, check, fits)
         builder.vehicle = builder._vehicle()
@@ -95,7 +95,7 @@ class Builder:
         built = {name: camera for name, camera in cameras.items() if camera}
         self.built = set(built)
         recording = self.part(("recording",), _recording)
-        page = Page(**document["page"])
+        page = PageSettings(**document["page"])
         listening = {"page.port": page.port} if page.serve else {}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
@@ -333,7 +333,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         operator=_elements(data["operator"]),
         wire_vehicle=_elements(wire.get("vehicle")),
         wire_operator=_elements(wire.get("operator")),
-        knobs={knob: tuple(Turn(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
+        knobs={knob: tuple(KnobTarget(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
         settings=settings,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **_given(data, ("verified",)),

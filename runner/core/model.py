@@ -53,7 +53,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
 
 
-class RuleCall(Protocol):
+class ModeRule(Protocol):
     """A rule with its parameters, as a mode lists it, see `runner.core.rules`.
 
     reads  fields of the state whose change makes the mode decide again
@@ -139,7 +139,7 @@ class Element:
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class KnobTarget:
     """One property that a knob sets, and with what: kbps, bps, left, right, top, bottom, on, off or a caps template."""
 
     element: str
@@ -164,7 +164,7 @@ class Graph:
     operator: tuple[Element, ...]
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
-    knobs: Mapping[str, tuple[Turn, ...]]
+    knobs: Mapping[str, tuple[KnobTarget, ...]]
     settings: Mapping[str, Value]
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
@@ -333,7 +333,7 @@ class Media(Endpoint):
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class PageSettings:
     """The operator's page, on 127.0.0.1.
 
     late_ms  age of a picture when it is drawn, above which it is marked as late
@@ -362,10 +362,10 @@ class Vehicle:
     name: str
     cameras: Mapping[str, Camera]
     mode: Mode
-    modes: Mapping[Mode, tuple[RuleCall, ...]]
+    modes: Mapping[Mode, tuple[ModeRule, ...]]
     media: Media
     control: Endpoint
-    page: Page
+    page: PageSettings
     pqos: Mapping[str, Any]
     recording: Recording
     expires_s: float

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from runner.core import rules
-from runner.core.commands import Command, Knobs, after, difference
+from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
 from runner.core.events import Event
 from runner.core.model import Mode, Vehicle
 from runner.core.rules import Memory
 from runner.core.state import Refused, State, advance, keep
 
-NOTHING: Mapping[str, Knobs] = MappingProxyType({})
+NOTHING: Mapping[str, KnobValues] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Run:
     state: State
     memory: Memory
     decision: Decision
-    commanded: Mapping[str, Knobs] = field(default_factory=lambda: NOTHING)
+    commanded: Mapping[str, KnobValues] = field(default_factory=lambda: NOTHING)
     commands: tuple[Command, ...] = ()
     refused: str = ""
     fault: str = ""

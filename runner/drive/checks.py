@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Check(NamedTuple):
+class ClaimCheck(NamedTuple):
     """One claim. holds: None where the drive does not tell."""
 
     claim: str

@@ -17,10 +17,10 @@ from runner.drive.series import (
     RATE_WINDOW_S,
     CameraSeries,
     Flags,
-    Line,
-    Received,
+    FloatSeries,
+    ReceivedSeries,
     Series,
-    Values,
+    TimeSeries,
     held,
     mean_held,
     sending_spans,
@@ -54,16 +54,16 @@ class Latency(NamedTuple):
 class PerSecond(NamedTuple):
     """Latency of the frames of all cameras in each second: where it begins, s; median and 95th percentile, ms."""
 
-    t: Values
-    median: Values
-    p95: Values
+    t: FloatSeries
+    median: FloatSeries
+    p95: FloatSeries
 
 
 class RateCurve(NamedTuple):
     """Quality of one factor as measured: kbit/s that came out of the encoder, rising, and the quality."""
 
-    kbps: Values
-    quality: Values
+    kbps: FloatSeries
+    quality: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Estimate:
     """
 
     metric: str
-    line: Line
+    line: TimeSeries
     moving: float
     clamped: float
     unknown: tuple[float, ...]
@@ -133,7 +133,7 @@ class CameraStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Statistics:
+class DriveStatistics:
     """A drive: its cameras, and all of them together."""
 
     series: Series
@@ -156,7 +156,7 @@ class Statistics:
     notes: tuple[str, ...]
 
 
-def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Statistics:
+def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> DriveStatistics:
     """All figures of a drive.
 
     models  by camera, where there is one
@@ -171,7 +171,7 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Stat
     frozen = [freeze for camera in each for freeze in camera.freezes or ()]
     watched = any(camera.freezes is not None for camera in each)
     kbps, allocated = (sum_known(getattr(camera, key) for camera in each) for key in ("kbps", "allocated"))
-    return Statistics(
+    return DriveStatistics(
         series=drive,
         cameras=cameras,
         kbps=kbps,
@@ -200,7 +200,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
     sending_s = sum(max(0.0, b - a) for a, b in sending)
     frames = float(source.frames[-1] - source.frames[0]) if source else NAN
     kbps = ratio(float(source.bytes[-1] - source.bytes[0]) * 8 / 1000, until - begin) if source else NAN
-    allocated = mean_held(Line(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
+    allocated = mean_held(TimeSeries(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
     stood = tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None
     return CameraStatistics(
         name=camera.name,
@@ -222,7 +222,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
     )
 
 
-def _arrivals_logged(got: Received) -> bool:
+def _arrivals_logged(got: ReceivedSeries) -> bool:
     """An operator who logged frames but no arrivals kept none of them."""
     return bool(got.arrival_t.size) or not got.frames[-1]
 
@@ -256,13 +256,13 @@ def _part(share: float) -> str:
 # --- latency and freezes ----------------------------------------------------------------------------------------------
 
 
-def latency(values: Values) -> Latency:
+def latency(values: FloatSeries) -> Latency:
     """Median, 95th and 99th percentile by linear interpolation; nan of none."""
     known = values[np.isfinite(values)]
     return Latency(*map(float, np.percentile(known, (50, 95, 99)))) if known.size else Latency()
 
 
-def freezes(arrivals: Values, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
+def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
     """Where the picture stood still.
 
         gap >= max(3 * mean, mean + 150 ms)      mean: of the last 30 gaps before it    (W3C webrtc-stats, freezeCount)
@@ -302,7 +302,7 @@ def per_second(drive: Series) -> PerSecond:
     return PerSecond(edges[:-1], np.array([f.median for f in found]), np.array([f.p95 for f in found]))
 
 
-def latencies(drive: Series, camera: str | None = None) -> tuple[Values, Values]:
+def latencies(drive: Series, camera: str | None = None) -> tuple[FloatSeries, FloatSeries]:
     """When and how late, s and ms, for each frame of one or of all cameras that a latency is known of."""
     chosen = [drive.cameras[camera]] if camera else list(drive.cameras.values())
     received = [c.received for c in chosen if c.received]
@@ -321,7 +321,7 @@ def to_arrival(drive: Series) -> bool:
     return any(got is not None and bool(np.isfinite(got.arrival_ms).any()) for got in received)
 
 
-def together(values: Iterable[Values]) -> Values:
+def together(values: Iterable[FloatSeries]) -> FloatSeries:
     return np.concatenate([np.empty(0), *values])
 
 
@@ -343,7 +343,7 @@ def size_shares(camera: CameraSeries, begin: float, end: float) -> dict[tuple[in
     return {size: share for size, share in shares.items() if size[0]}
 
 
-def _shares(keys: Sequence[Any], weights: Values) -> dict[Any, float]:
+def _shares(keys: Sequence[Any], weights: FloatSeries) -> dict[Any, float]:
     total = float(weights.sum())
     found: dict[Any, float] = {}
     for key, weight in zip(keys, weights, strict=True):
@@ -375,8 +375,8 @@ def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -
     """
     t, kbps = camera.actual
     decided = camera.decided
-    factors = np.round(held(Line(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
-    full = kbps / held(Line(decided.t, decided.roi_share), t)
+    factors = np.round(held(TimeSeries(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
+    full = kbps / held(TimeSeries(decided.t, decided.roi_share), t)
     quality, outside, unknown = np.full(t.shape, np.nan), np.zeros(t.shape, dtype=bool), []
     for factor in np.unique(factors[np.isfinite(factors)]):
         at = (factors == factor) & (full > 0)
@@ -391,10 +391,10 @@ def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -
         _hold(quality, moving, t, freeze)
     known = np.isfinite(quality) & moving
     clamped = ratio(int((outside & known).sum()), int(known.sum()))
-    return Estimate(model.metric, Line(t, quality), mean(quality[moving]), clamped, tuple(unknown))
+    return Estimate(model.metric, TimeSeries(t, quality), mean(quality[moving]), clamped, tuple(unknown))
 
 
-def _hold(quality: Values, moving: Flags, t: Values, freeze: Freeze) -> None:
+def _hold(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:
     """Let a picture that stands still keep the quality it had; where there was none before, there is none.
 
     Rates are those of a second, which for as long after a freeze holds some of it, or what had piled up meanwhile.
@@ -410,7 +410,7 @@ def _hold(quality: Values, moving: Flags, t: Values, freeze: Freeze) -> None:
 # --- small things -----------------------------------------------------------------------------------------------------
 
 
-def mean(values: Values) -> float:
+def mean(values: FloatSeries) -> float:
     """Mean of what is known; nan of nothing."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else NAN

@@ -13,7 +13,7 @@ from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
 
 
-class Knobs:
+class KnobPanel:
     """The knobs of one camera's pipeline, built anew with the pipeline.
 
     Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe in front of the first

@@ -20,12 +20,12 @@ from runner.errors import RunError
 from runner.gst.pipeline import counted
 from runner.lanes import FRAMES, LaneSet
 
-Luma = NDArray[np.uint8]  # height x width
+LumaPlane = NDArray[np.uint8]  # height x width
 POLL_NS = 200 * 1_000_000
 STALLED_S = 60  # no frame for so long: something waits for something else
 
-OnFrame = Callable[[int, Luma], None]  # number of the frame from 0, its luma
-OnDecoded = Callable[[int, int, Luma], None]  # lane, number of the frame, its luma as decoded
+OnFrame = Callable[[int, LumaPlane], None]  # number of the frame from 0, its luma
+OnDecoded = Callable[[int, int, LumaPlane], None]  # lane, number of the frame, its luma as decoded
 
 
 @dataclass(slots=True)
@@ -176,7 +176,7 @@ def _guarded(run: _Run, work: Callable[[], None]) -> None:
         run.failed = error
 
 
-def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> Luma:
+def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
     """A copy of the first plane of a picture with one byte per sample."""
     picture = caps.get_structure(0)
     width, height = picture.get_int("width")[1], picture.get_int("height")[1]

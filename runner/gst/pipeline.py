@@ -9,7 +9,7 @@ from gi.repository import Gst, GstRtp
 
 from runner.core.commands import KnobValue
 from runner.graph import Plan
-from runner.gst.knobs import Knobs
+from runner.gst.knobs import KnobPanel
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
@@ -35,7 +35,7 @@ class CameraPipeline:
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted = wanted
-        self.knobs = Knobs(pipeline, plan.camera, turned)
+        self.knobs = KnobPanel(pipeline, plan.camera, turned)
         if plan.loops:
             loop_clip(pipeline, plan)
         self._started = False

@@ -17,13 +17,13 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
-from runner.gst.connections import Connection
+from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit
 from runner.system.ports import check_port_free
 
-Report = Callable[[str, str], None]  # camera, what happened
+OnReport = Callable[[str, str], None]  # camera, what happened to it
 
 OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for who asks again
 HELD_S = 5.0  # how long one that is open waits for who asks again
@@ -94,13 +94,13 @@ class CameraServer:
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, report: Report) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, report: OnReport) -> None:
         check_port_free(media)
         self._media, self._build, self._report = media, build, report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
         self._changed = threading.Condition()  # a camera's stage; also guards all that clients' threads share
-        self._connections: dict[GstRtspServer.RTSPClient, Connection] = {}
+        self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
         self._left: set[str] = set()  # cameras that a viewer has left lately
         self._stopped = threading.Event()
@@ -252,7 +252,7 @@ class CameraServer:
 
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
         try:
-            connection = Connection(client, self._media.session_timeout_s)
+            connection = RtspConnection(client, self._media.session_timeout_s)
         except OSError:  # it has gone already, or there are no descriptors left: it may not watch
             return
         with self._changed:
@@ -357,15 +357,15 @@ class CameraServer:
             connection.cameras.pop(_camera_name(context), None)
             self._left.add(_camera_name(context))
 
-    def _connection(self, client: GstRtspServer.RTSPClient) -> Connection | None:
+    def _connection(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
         with self._changed:
             return self._connections.get(client)
 
-    def _watching(self, camera: str) -> list[Connection]:
+    def _watching(self, camera: str) -> list[RtspConnection]:
         with self._changed:
             return [connection for connection in self._connections.values() if camera in connection.cameras]
 
-    def _close(self, connection: Connection, why: str) -> None:
+    def _close(self, connection: RtspConnection, why: str) -> None:
         for camera in sorted(connection.cameras):
             self._report(camera, f"closed the viewer at {connection}: {why}")
         connection.close()
@@ -385,7 +385,7 @@ class CameraServer:
                 connection.close()
         return True
 
-    def _lag(self, connection: Connection) -> float:
+    def _lag(self, connection: RtspConnection) -> float:
         there = (other for other in self._connections.values() if other is not connection)
         shared = any(other.cameras.keys() & connection.cameras.keys() for other in there)
         pipelines = [pipeline for name in connection.cameras if (pipeline := self.pipelines.get(name))]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 _PRODUCT = "tod-runner/"
 
 
-class Viewer(NamedTuple):
+class StreamViewer(NamedTuple):
     """One viewer of one camera.
 
     address   IP address that its requests come from
@@ -45,7 +45,9 @@ def over_uplink(address: str) -> bool:
     return not (mapped or ip).is_loopback
 
 
-def admit(viewers: Sequence[Viewer], newcomer: Viewer, limit: int, controller: str) -> list[Viewer] | None:
+def admit(
+    viewers: Sequence[StreamViewer], newcomer: StreamViewer, limit: int, controller: str
+) -> list[StreamViewer] | None:
     """Which viewers of a camera have to leave for a newcomer, or None where the newcomer is refused.
 
     viewers     of this camera, in the order in which they came

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from runner.core.model import Endpoint, suggest
 from runner.errors import RunError
 from runner.link.ends import Ends
-from runner.link.limit import Counters, Limit
+from runner.link.limit import Limit, LinkCounters
 from runner.link.netns import namespaced
 from runner.link.relayed import relayed
 from runner.records import LinkSample
@@ -31,7 +31,7 @@ LOG_S = 0.1  # between two lines of the log
 LOOK_S = 0.02  # how late a change of the rate may be
 STOP_S = 0.5  # how long the last line of the log may take
 
-Record = Callable[[LinkSample], None]
+OnLinkSample = Callable[[LinkSample], None]
 
 
 class LimitedLink:
@@ -42,7 +42,7 @@ class LimitedLink:
     `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
     """
 
-    def __init__(self, limit: Limit, ends: Ends, record: Record) -> None:
+    def __init__(self, limit: Limit, ends: Ends, record: OnLinkSample) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
         self._limit, self._shaper, self._record = limit, ends.shaper, record
@@ -94,7 +94,7 @@ class LimitedLink:
                 self._record(_sample(t, kbps, counters))
 
 
-def _sample(t: float, kbps: float, counters: Counters) -> LinkSample:
+def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
     return LinkSample(
         t=round(t, 3),
         kbps=round(kbps, 3),
@@ -106,7 +106,9 @@ def _sample(t: float, kbps: float, counters: Counters) -> LinkSample:
 
 
 @contextmanager
-def limited_link(kind: str, limit: Limit, media: Endpoint, control: Endpoint, record: Record) -> Iterator[LimitedLink]:
+def limited_link(
+    kind: str, limit: Limit, media: Endpoint, control: Endpoint, record: OnLinkSample
+) -> Iterator[LimitedLink]:
     """The link while it is needed; everything that belongs to it is gone at the end.
 
     kind            netns or relay

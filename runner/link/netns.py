@@ -28,7 +28,7 @@ from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link.child import Child
 from runner.link.ends import Ends, overrides
-from runner.link.limit import Counters, Limit, burst_bytes, queue_bytes
+from runner.link.limit import Limit, LinkCounters, burst_bytes, queue_bytes
 from runner.system.signals import urgent
 
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
@@ -78,7 +78,7 @@ class _Tbf:
             self.end()
             raise RunError(f"link=netns: {error}; use a kernel that has tbf (module sch_tbf), {OTHERWISE}") from None
 
-    def limit(self, kbps: float) -> Counters:
+    def limit(self, kbps: float) -> LinkCounters:
         return self._set("change", kbps)
 
     def check(self) -> None:
@@ -87,7 +87,7 @@ class _Tbf:
     def end(self) -> None:
         self._tc.end()
 
-    def _set(self, verb: str, kbps: float) -> Counters:
+    def _set(self, verb: str, kbps: float) -> LinkCounters:
         lines = [f"qdisc show dev {OUT}"]
         if kbps != self._kbps:
             size, most = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
@@ -95,7 +95,7 @@ class _Tbf:
             lines.insert(0, f"qdisc {verb} dev {OUT} {self._parent} handle 2: {tbf}")
             self._kbps = kbps
         said = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
-        return Counters(8 * said["backlog"] / kbps, said["bytes"], said["packets"], said["drops"])
+        return LinkCounters(8 * said["backlog"] / kbps, said["bytes"], said["packets"], said["drops"])
 
 
 def _delay(tc: str, name: str, delay_ms: float) -> None:

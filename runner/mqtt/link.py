@@ -16,7 +16,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.core.model import Endpoint
 from runner.errors import RunError
-from runner.mqtt.messages import Document, Message
+from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
@@ -48,7 +48,7 @@ class _Client(Client):
                     self.reconnect()
 
 
-class Link:
+class ControlLink:
     """One side's connection to the broker, kept for as long as it is open. Callbacks come from the link's own thread.
 
     will          topic and message that the broker publishes when this side is lost
@@ -62,8 +62,8 @@ class Link:
     def __init__(
         self,
         broker: Endpoint,
-        will: tuple[str, Document],
-        listen: Mapping[str, Callable[[Message], None]],
+        will: tuple[str, JsonObject],
+        listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         report: Callable[[str], None],
     ) -> None:
@@ -84,7 +84,7 @@ class Link:
         """Whether messages for this side will reach it, by then."""
         return self._listening.wait(seconds)
 
-    def publish(self, topic: str, message: Document) -> None:
+    def publish(self, topic: str, message: JsonObject) -> None:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
         Without a connection nothing is sent and nothing queued: after a reconnection the present counts, not the past.
@@ -92,7 +92,7 @@ class Link:
         if self._listening.is_set():
             self._send(topic, message)
 
-    def close(self, *goodbye: tuple[str, Document]) -> None:
+    def close(self, *goodbye: tuple[str, JsonObject]) -> None:
         """Disconnect; with messages to send before, as the will would have said it."""
         self._closing.set()
         for topic, message in goodbye if self._listening.is_set() else ():
@@ -119,10 +119,10 @@ class Link:
             client.message_callback_add(wanted, self._guarded(function))
         return client
 
-    def _guarded(self, function: Callable[[Message], None]) -> Callable[[Client, object, MQTTMessage], None]:
+    def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
             try:
-                function(Message(message.topic, bytes(message.payload), message.retain))
+                function(MqttMessage(message.topic, bytes(message.payload), message.retain))
             except ValueError as error:  # of the reader of a message: it is not what it should be
                 self._drop(message, str(error))
             except Exception as error:
@@ -137,7 +137,7 @@ class Link:
             self._faults.add(fault)
             self._report(fault)
 
-    def _send(self, topic: str, message: Document) -> MQTTMessageInfo:
+    def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if topic.endswith("/telemetry") else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
 

@@ -31,7 +31,7 @@ MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
 MAX_ROUND_TRIP_S = 0.5  # a longer round trip is no excuse for an old request: nobody can drive by it
 
-Document = Mapping[str, Any]
+JsonObject = Mapping[str, Any]
 
 
 def topic(vehicle: str, *parts: str) -> str:
@@ -39,7 +39,7 @@ def topic(vehicle: str, *parts: str) -> str:
     return "/".join(("tod", vehicle, *parts))
 
 
-class Message(NamedTuple):
+class MqttMessage(NamedTuple):
     """A message as it came.
 
     retained  whether the broker had kept it
@@ -112,7 +112,7 @@ class Asked(NamedTuple):
     problem: str = ""
 
 
-def read_request(message: Message) -> Asked:
+def read_request(message: MqttMessage) -> Asked:
     """A request as it came. The event itself is checked when its time is known."""
     try:
         document = read_message(message.payload)

@@ -10,20 +10,20 @@ from typing import NamedTuple
 
 from runner.configuration import agreement
 from runner.core.model import Vehicle
-from runner.mqtt.link import Link
+from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import (
     APPLY_S,
     MAX_ROUND_TRIP_S,
     OPERATOR_GONE,
-    Document,
-    Message,
+    JsonObject,
+    MqttMessage,
     read_reply,
     read_settings,
     read_state,
     read_telemetry,
     topic,
 )
-from runner.operator.meter import Counters, Meter, Rates
+from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
 from runner.records import CameraSample, CameraState, Note, Outcome, Sample, Telemetry, VehicleState
 from runner.system.clocks import Clocks
@@ -54,8 +54,8 @@ class CameraRow(NamedTuple):
     """One camera: its rates and counters, and what the vehicle says of it, if anything."""
 
     name: str
-    rates: Rates
-    received: Counters
+    rates: MeasuredRates
+    received: StreamCounters
     state: CameraState | None
 
 
@@ -74,7 +74,7 @@ class Station:
     Requests go out by `ask`; samples of the cameras' counters come in by `take`.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: agreement.Settings) -> None:
+    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath) -> None:
         self._vehicle, self._settings = vehicle, settings
         self.identity = uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
@@ -89,10 +89,10 @@ class Station:
         self._differences = ""
         self._asked: dict[str, _Asked] = {}
         self._lock = threading.Lock()
-        self.meters = {name: Meter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
+        self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
         self.clocks = Clocks()
-        self.samples: Mapping[str, Counters] = {}
-        self._rates: dict[str, Rates] = {}
+        self.samples: Mapping[str, StreamCounters] = {}
+        self._rates: dict[str, MeasuredRates] = {}
         self._reported = 0.0
         listen = {
             topic("+", "state"): self._on_any_state,
@@ -101,7 +101,9 @@ class Station:
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         self._requests = topic(vehicle.name, "request", self.identity)
-        self._link = Link(vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note)
+        self._link = ControlLink(
+            vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note
+        )
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns at once."""
@@ -111,7 +113,7 @@ class Station:
         self.state = None  # a goodbye is no loss
         self._link.close((self._requests, OPERATOR_GONE))
 
-    def ask(self, event: Document, on_reply: OnReply | None = None) -> None:
+    def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.
 
         on_reply  called with what became of it: applied (read back from the elements), refused, expired or timed out
@@ -147,7 +149,7 @@ class Station:
         cameras = self.state.cameras if self.state else {}
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
-    def take(self, samples: Mapping[str, Counters]) -> None:
+    def take(self, samples: Mapping[str, StreamCounters]) -> None:
         """A sample of every camera's counters; to be called a few times a second, since time is judged here too."""
         now = time.monotonic()
         if self.state and now - self._heard > SILENT_S:
@@ -180,7 +182,7 @@ class Station:
         clock = "" if ahead is None else f"; its clock is ahead by at least {ahead:.0f} ms: latencies are unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_kbps} kbit/s{clock}"
 
-    def _with_known_ages(self, now: float, samples: Mapping[str, Counters]) -> Mapping[str, Counters]:
+    def _with_known_ages(self, now: float, samples: Mapping[str, StreamCounters]) -> Mapping[str, StreamCounters]:
         before = self.clocks.ahead_ms
         samples = self.clocks.checked(now, samples)
         after = self.clocks.ahead_ms
@@ -210,7 +212,7 @@ class Station:
     def _camera(self, name: str) -> CameraState | None:
         return self.state.cameras.get(name) if self.state else None
 
-    def _on_any_state(self, message: Message) -> None:
+    def _on_any_state(self, message: MqttMessage) -> None:
         """The state of any vehicle at the broker: of another one only its name is of use."""
         name, state = message.topic.split("/")[1], read_state(message.payload)
         if len(self._vehicles) < MOST_VEHICLES or name in self._vehicles:
@@ -250,14 +252,14 @@ class Station:
         if text := decision_note(before, state):
             self.note(text)
 
-    def _on_telemetry(self, message: Message) -> None:
+    def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         if self._published:  # else it is the retained telemetry of a vehicle that is gone
             self._hear()
 
-    def _on_configuration(self, message: Message) -> None:
+    def _on_configuration(self, message: MqttMessage) -> None:
         """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""
         differences = agreement.differences(self._settings, read_settings(message.payload).settings)
         if differences and differences != self._differences:
@@ -274,7 +276,7 @@ class Station:
             known = f"online are {', '.join(online)}" if online else "no vehicle is online"
             self.note(f"the broker knows no vehicle named {self._vehicle.name}, {known}")
 
-    def _on_reply(self, message: Message) -> None:
+    def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)
         with self._lock:
             asked = self._asked.pop(reply.id, None)

@@ -25,7 +25,7 @@ from runner.mqtt.messages import read_message
 from runner.operator.station import Listener, Station
 from runner.page.control import Control
 from runner.page.history import History
-from runner.page.viewer import Viewer
+from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
@@ -48,7 +48,7 @@ POLICY = (
 )
 
 
-class Page(Listener):
+class PageServer(Listener):
     """The page and everybody who looks at it.
 
     A listener of the station; it and `show` may be called from any thread, everything else happens in the page's own.
@@ -65,7 +65,7 @@ class Page(Listener):
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
-        self._viewers: set[Viewer] = set()
+        self._viewers: set[PageViewer] = set()
         self._control = Control()
         self._silent: set[RequestHandler] = set()  # new connections without a complete request
         self._loop = asyncio.new_event_loop()
@@ -170,7 +170,7 @@ class Page(Listener):
             line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, autoping=False)
         await ws.prepare(request)
-        viewer = Viewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
+        viewer = PageViewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
         self._greet(viewer)
         self._viewers.add(viewer)
         self._control.opened(token, time.monotonic())
@@ -190,7 +190,7 @@ class Page(Listener):
             self._tell_control()
         return ws
 
-    async def _listen(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
+    async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer) -> None:
         """What a viewer says, until it leaves.
 
         raises  TimeoutError for one that makes no progress: pings go the way of the video, and answers come back
@@ -201,7 +201,7 @@ class Page(Listener):
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._on_message(viewer, message.data)
 
-    def _greet(self, viewer: Viewer) -> None:
+    def _greet(self, viewer: PageViewer) -> None:
         viewer.tell("hello", _introduction(self._vehicle))
         viewer.tell("state", state_to_json(self._station.state))
         viewer.tell("history", self._history.columns())
@@ -212,7 +212,7 @@ class Page(Listener):
         for viewer in self._viewers:
             viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
 
-    def _on_message(self, viewer: Viewer, text: str | bytes) -> None:
+    def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
         """One message of a page; whatever it holds, it is answered and nothing else suffers."""
         try:
             document = read_message(text.encode() if isinstance(text, str) else text)
@@ -233,7 +233,7 @@ class Page(Listener):
             case _:
                 self._on_request(viewer, document)
 
-    def _on_request(self, viewer: Viewer, document: dict[str, Any]) -> None:
+    def _on_request(self, viewer: PageViewer, document: dict[str, Any]) -> None:
         identity = document.pop("id", None)
 
         def answer(result: str, reason: str) -> None:
@@ -279,7 +279,7 @@ class _Complaints(logging.Handler):
             self._note(text)
 
 
-async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
+async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
     """Send what waits, as fast as the viewer takes it."""
     try:
         while True:

@@ -14,7 +14,7 @@ from runner.lanes import Lane, LaneSet
 from runner.rate_quality.curves import Point
 
 if TYPE_CHECKING:
-    from runner.rate_quality.metrics import Luma, Mask, Meter, Metric
+    from runner.rate_quality.metrics import Luma, Mask, Metric, QualityMeter
 
 OVERHEAD = 0.1  # of an encoding at full size: what a lane costs whatever its size, decoding and looking at pictures
 
@@ -127,7 +127,7 @@ class _Scoring:
     def __init__(self, task: Task, number: int) -> None:
         size = (task.roi.width, task.roi.height)
         self._task, self._size, self._lane = task, size, task.lanes[number]
-        self._meters: dict[str, Meter] = {
+        self._meters: dict[str, QualityMeter] = {
             metric.name: metric.meter(size, task.compiled.fps, task.stride, task.mask) for metric in task.metrics
         }
         self._every = {metric.name: metric.every_frame for metric in task.metrics}

@@ -23,12 +23,12 @@ from runner.core.model import Progress, Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
-from runner.mqtt.link import Link
-from runner.mqtt.messages import OFFLINE, Message, read_request, read_settings, read_state, read_telemetry, topic
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import OFFLINE, MqttMessage, read_request, read_settings, read_state, read_telemetry, topic
 from runner.plans import compile_plans, render_missing
 from runner.records import Outcome, Settings, Telemetry, VehicleState, to_json
 from runner.vehicle.inbox import Request
-from runner.vehicle.loop import Loop
+from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
     from runner.apply import VehicleSide
@@ -49,7 +49,7 @@ class LiveVehicle:
     failure  why the vehicle had to end; None: it runs, or was stopped
     """
 
-    def __init__(self, side: VehicleSide, loop: Loop) -> None:
+    def __init__(self, side: VehicleSide, loop: ControlLoop) -> None:
         self.side, self.loop = side, loop
         self.failure: RunError | None = None
         self._thread: threading.Thread | None = None
@@ -152,7 +152,7 @@ class _ControlEnd:
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        self._link = Link(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
+        self._link = ControlLink(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -185,7 +185,7 @@ class _ControlEnd:
         self.publish(self._settings)
         self._live.loop.publish_again()  # the broker may have published the last will, or forgotten everything
 
-    def _on_request(self, message: Message) -> None:
+    def _on_request(self, message: MqttMessage) -> None:
         if self._live.loop.overrun(message.sender):
             return
         asked = read_request(message)
@@ -200,18 +200,18 @@ class _ControlEnd:
         else:
             self._live.loop.take(request)
 
-    def _on_telemetry(self, message: Message) -> None:
+    def _on_telemetry(self, message: MqttMessage) -> None:
         """Before anything was published, telemetry that comes now is another vehicle's."""
         if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
             rule = "choose another `name`, or stop the other vehicle"
             self._live.fail(RunError(f"a vehicle named {self._name} is at the broker already; {rule}"))
 
-    def _on_state(self, message: Message) -> None:
+    def _on_state(self, message: MqttMessage) -> None:
         """A last will that the broker publishes late, when the vehicle is back already."""
         if self._alone.is_set() and read_state(message.payload) is None:
             self._live.loop.publish_again()
 
-    def _on_configuration(self, message: Message) -> None:
+    def _on_configuration(self, message: MqttMessage) -> None:
         run = read_settings(message.payload).run
         own = run == self._settings.run
         if self._alone.is_set() and not message.retained and not own and run not in self._others:
@@ -253,7 +253,7 @@ def live_vehicle(
     video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
     control = _ControlEnd(vehicle, document, report)
-    loop = Loop(vehicle, side, pqos, track, drive, control.publish, report)
+    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report)
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:

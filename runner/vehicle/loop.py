@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
-from runner.core.commands import Command, Knobs
+from runner.core.commands import Command, KnobValues
 from runner.core.events import (
     ClockAdvanced,
     Event,
@@ -46,7 +46,7 @@ class Applier(Protocol):
     """What the loop asks of the side that streams."""
 
     def turn(self, commands: Iterable[Command]) -> None: ...
-    def applied(self) -> Mapping[str, Knobs]: ...
+    def applied(self) -> Mapping[str, KnobValues]: ...
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
@@ -62,7 +62,7 @@ class _Asked(NamedTuple):
 
 
 @dataclass
-class Loop:
+class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` what they have.
 
     publish  called with the state (decided and applied) whenever it changed, and telemetry a few times a second
@@ -308,7 +308,7 @@ class Loop:
             self.publish(state)
         self._asked = [asked for asked in self._asked if not self._answered(asked, applied)]
 
-    def _state(self, applied: Mapping[str, Knobs]) -> VehicleState:
+    def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights, faults = self._run.decision, self._run.state.weights, self.applier.sources()
         cameras = {
             name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name))
@@ -317,7 +317,7 @@ class Loop:
         fault = self._run.fault or None
         return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
 
-    def _answered(self, asked: _Asked, applied: Mapping[str, Knobs]) -> bool:
+    def _answered(self, asked: _Asked, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request, if all that it made of knobs is applied, or time is up."""
         now, commanded = self._now(), self._run.commanded
         watched = [(name, knob) for name, knob in asked.knobs if applied[name]]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner.drive.capacity import Cell, Sample, cannot_tell, cells, limited_samples
+from runner.drive.capacity import CapacitySample, Cell, cannot_tell, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.errors import RunError, UserError
@@ -27,7 +27,7 @@ PERCENTILE, CELL_M = 10.0, 10.0
 
 def run(arguments: Arguments) -> int:
     output, percentile, cell_m = _wanted(arguments)
-    samples: list[Sample] = []
+    samples: list[CapacitySample] = []
     seen, without = 0, list[str]()
     for word in arguments.words:
         drive = series(read_drive(Path(word)))

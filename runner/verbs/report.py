@@ -26,7 +26,7 @@ from runner.verbs.screen import progress_bar
 
 if TYPE_CHECKING:
     from runner.drive.read import Drive
-    from runner.drive.statistics import Statistics
+    from runner.drive.statistics import DriveStatistics
 
 DOCUMENT = "report.json"
 
@@ -115,7 +115,7 @@ def _need_libraries() -> None:
 
 def _measured(
     paths: Sequence[Path], models: Path | None, bases: Sequence[Path], progress: Callable[[float], None]
-) -> list[Statistics]:
+) -> list[DriveStatistics]:
     from dataclasses import replace
 
     from runner.drive.models import find_models

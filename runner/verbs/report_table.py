@@ -10,12 +10,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from runner.drive.checks import Check
-from runner.drive.statistics import Statistics
+from runner.drive.checks import ClaimCheck
+from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import VERDICTS, camera_rows, drive_rows
 
 
-def show(drives: Sequence[Statistics], checks: Mapping[str, Sequence[Check]], left_out: Sequence[str]) -> None:
+def show(
+    drives: Sequence[DriveStatistics], checks: Mapping[str, Sequence[ClaimCheck]], left_out: Sequence[str]
+) -> None:
     """The cameras of each drive, the drives beside each other, claims, and what to know of them."""
     console = Console(width=None if sys.stdout.isatty() else 190)
     for drive in drives:

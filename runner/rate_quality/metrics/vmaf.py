@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.errors import RunError, UserError
-from runner.rate_quality.metrics.interface import Luma, Mask, Metric, Size, check
+from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
 
 PATIENCE_S = 120.0  # a busy machine scores a picture in less
 PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
@@ -63,7 +63,7 @@ def metric(model: str) -> Metric:
     )
 
 
-def meter(tool: Tool, model: str, size: Size, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
+def meter(tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
     """Meter of one lane. There is never a mask: the metric says so."""
     return VmafMeter(tool, model, size, fps, stride)
 
@@ -145,7 +145,7 @@ def command(exe: str, inputs: Sequence[Sequence[str]], model: str, stride: int) 
     return [exe, "-nostdin", "-v", "error", *raw, "-lavfi", f"[0:v][1:v]libvmaf={options}", "-f", "null", "-"]
 
 
-def picture_format(size: Size, pixel_format: str, fps: Fraction) -> list[str]:
+def picture_format(size: PictureSize, pixel_format: str, fps: Fraction) -> list[str]:
     """Options of a raw video."""
     return ["-pix_fmt", pixel_format, "-s", f"{size[0]}x{size[1]}", "-r", f"{fps.numerator}/{fps.denominator}"]
 
@@ -168,7 +168,7 @@ def complaint(directory: Path, status: int) -> RunError:
     return RunError(f"ffmpeg failed to score VMAF: {why}")
 
 
-def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, model: str) -> list[float]:
+def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format: str, model: str) -> list[float]:
     """Score of each picture of a raw video.
 
     pixel_format  of both files, as ffmpeg names it
@@ -195,7 +195,7 @@ class VmafMeter:
 
     version = ""  # of libvmaf, known at the end
 
-    def __init__(self, tool: Tool, model: str, size: Size, fps: Fraction, stride: int) -> None:
+    def __init__(self, tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int) -> None:
         self._size = size
         self._frames: list[int] = []
         self._sound = True  # no picture went in by half
