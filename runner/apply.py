@@ -23,7 +23,7 @@ from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
-from runner.gst.video_files import VideoFile, VideoFiles, born
+from runner.gst.video_files import VideoFile, VideoFiles, captured_at
 from runner.gst.watched import WatchedSource
 
 if TYPE_CHECKING:
@@ -157,27 +157,29 @@ def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
 class VehicleSide:
     """All cameras of the vehicle, streaming. Keeps where each knob is wanted, and writes it all again after a rebuild.
 
-    report  told, from another thread, when a camera's pipeline comes, goes or fails
+    on_report  called, from another thread, when a camera's pipeline starts, stops or fails
     video   where what is sent is kept; None: nowhere
     raises  RunError where the port is in use, or what `video` needs is not installed
 
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, report: OnReport, video: VideoFiles | None = None) -> None:
-        self._report, self._video = report, video
+    def __init__(
+        self, plans: Sequence[Plan], media: Media, on_report: OnReport, video: VideoFiles | None = None
+    ) -> None:
+        self._on_report, self._video = on_report, video
         plans = _kept(plans, video)
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
         self._server: CameraServer | None = None
-        self._callers = {p.camera.name: CameraCaller(p, self._build, report) for p in plans if not p.serves}
+        self._callers = {p.camera.name: CameraCaller(p, self._build, on_report) for p in plans if not p.serves}
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, report)
+                self._server = CameraServer(served, media, self._build, on_report)
             for caller in self._callers.values():
                 caller.start()
 
@@ -217,13 +219,13 @@ class VehicleSide:
 
     def faults(self) -> list[str]:
         """What elements refused since the last call; each is a defect or a wrong graph."""
-        told = []
+        faults = []
         for name in self._wanted:
             pipeline = self._pipeline(name)
             if pipeline:
-                told += pipeline.knobs.faults
+                faults += pipeline.knobs.faults
                 pipeline.knobs.faults.clear()
-        return told
+        return faults
 
     def sources(self) -> dict[str, str]:
         """By camera, what is wrong with a source that has failed and is being replaced; the others are left out."""
@@ -244,10 +246,10 @@ class VehicleSide:
         name = plan.camera.name
         source = None
         if plan.frozen_s is not None:
-            source = WatchedSource(plan, lambda what: self._report(name, what))
+            source = WatchedSource(plan, lambda what: self._on_report(name, what))
             source.take_place(pipeline, plan)
         if self._video:
-            VideoFile(self._video, name, "vehicle", born, self._report).follow(pipeline)
+            VideoFile(self._video, name, "vehicle", captured_at, self._on_report).follow(pipeline)
         return CameraPipeline(pipeline, plan, self._wanted_of(name), self._turned, source)
 
     def _turned(self) -> None:
@@ -266,9 +268,9 @@ class VehicleSide:
 class OperatorSide:
     """All cameras of the vehicle, received and decoded.
 
-    report      told, from another thread, what happens to which cameras
-    on_unit     told, from the camera's streaming thread, each access unit that comes
-    on_picture  told, from the camera's streaming thread, each decoded picture
+    on_report   called, from another thread, with cameras and what happened to them
+    on_unit     called, from the camera's streaming thread, with each access unit received
+    on_picture  called, from the camera's streaming thread, with each decoded picture
     arrivals    keep when each access unit came, for the samples
     video       where what is received is kept; None: nowhere
     operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
@@ -279,7 +281,7 @@ class OperatorSide:
     def __init__(
         self,
         plans: Sequence[Plan],
-        report: OnReport,
+        on_report: OnReport,
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
@@ -288,7 +290,7 @@ class OperatorSide:
     ) -> None:
         plans = _kept(plans, video)
         self._glib = _Glib()
-        self._gathered = gathered = Gathered(report)
+        self._gathered = gathered = Gathered(on_report)
         self._receivers = {
             plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator) for plan in plans
         }

@@ -58,7 +58,7 @@ def findings(document: Any, schema: str) -> list[Finding]:
 
     schema  name of a file in schemas/ without its ending
     """
-    odd = list(_oddities(document, ()))
+    odd = list(_unrepresentable(document, ()))
     seen = {f.path for f in odd}
     errors = sorted(validator(schema).iter_errors(document), key=lambda e: [str(part) for part in e.absolute_path])
     found = [f for f in _explained(errors) if not any(f.path[: len(path)] == path for path in seen)]
@@ -240,17 +240,17 @@ def _registry() -> Any:
     return Registry().with_resources((f"{name}.schema.json", resource(name)) for name in schema_names())
 
 
-def _oddities(value: Any, path: Path) -> Iterator[Finding]:
+def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
     """What YAML can say and JSON Schema cannot speak of: keys that are no text, numbers that are none."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if isinstance(key, str):
-                yield from _oddities(inner, (*path, key))
+                yield from _unrepresentable(inner, (*path, key))
             else:
                 yield Finding((*path, key), None, "a key must be text, quote it")
     elif isinstance(value, list):
         for index, inner in enumerate(value):
-            yield from _oddities(inner, (*path, index))
+            yield from _unrepresentable(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
     elif isinstance(value, int) and abs(value) >= 10**LONGEST_WHOLE:

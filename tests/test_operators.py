@@ -25,16 +25,16 @@ def test_any_message_of_its_own_brings_an_operator_back() -> None:
     operators = Operators(1.0)
     operators.connected("a", 0.0)
     operators.silent(5.0)
-    assert not operators.heard("b", 6.0)
+    assert not operators.message_received("b", 6.0)
     assert operators.present == frozenset()
-    assert operators.heard("a", 6.0)
-    assert not operators.heard("a", 6.1)
+    assert operators.message_received("a", 6.0)
+    assert not operators.message_received("a", 6.1)
     assert operators.present == {"a"}
 
 
 def test_who_never_announced_itself_is_no_operator() -> None:
     operators = Operators(1.0)
-    assert not operators.heard("predictor", 0.0)
+    assert not operators.message_received("predictor", 0.0)
     assert operators.present == frozenset()
 
 
@@ -43,12 +43,12 @@ def test_the_operator_who_has_been_present_longest_is_in_control() -> None:
     assert operators.in_control == ""
     operators.connected("b", 0.0)
     operators.connected("a", 0.5)
-    operators.heard("b", 1.2)
+    operators.message_received("b", 1.2)
     assert operators.in_control == "b"
     operators.silent(2.0)  # a
-    operators.heard("a", 2.1)
+    operators.message_received("a", 2.1)
     operators.disconnected("b")
-    operators.heard("b", 2.2)
+    operators.message_received("b", 2.2)
     assert operators.in_control == "a"
 
 
@@ -56,7 +56,7 @@ def test_the_longest_absent_is_forgotten_first() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     for number in range(10 * MOST):
-        operators.heard(f"stranger{number}", float(number))
+        operators.message_received(f"stranger{number}", float(number))
     assert operators.present == {"driver"}
 
 

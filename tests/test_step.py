@@ -333,19 +333,19 @@ NO_BITRATE = "must be kbit/s from 0 as an exact number (int or Fraction)"
         (leaves, "rule mine failed: SystemExit: 3"),
         (lambda draft, memory: None, "rule mine failed: TypeError: cannot unpack non-iterable NoneType object"),
         (lambda draft, memory: ("draft", memory), "rule mine failed: it must return a Draft and the memory"),
-        (lambda d, m: (d.but(total=Fraction(-1)), m), f"rule mine failed: total Fraction(-1, 1): {NO_BITRATE}"),
-        (lambda d, m: (d.but(total=1000.0), m), f"rule mine failed: total 1000.0: {NO_BITRATE}"),
-        (lambda d, m: (d.but(total=True), m), f"rule mine failed: total True: {NO_BITRATE}"),
+        (lambda d, m: (d.replaced(total=Fraction(-1)), m), f"rule mine failed: total Fraction(-1, 1): {NO_BITRATE}"),
+        (lambda d, m: (d.replaced(total=1000.0), m), f"rule mine failed: total 1000.0: {NO_BITRATE}"),
+        (lambda d, m: (d.replaced(total=True), m), f"rule mine failed: total True: {NO_BITRATE}"),
         (
-            lambda d, m: (d.but(bitrate={**d.bitrate, "top_rear": float("nan")}), m),
+            lambda d, m: (d.replaced(bitrate={**d.bitrate, "top_rear": float("nan")}), m),
             f"rule mine failed: bitrate of top_rear nan: {NO_BITRATE}",
         ),
         (
-            lambda d, m: (d.but(scaling={}), m),
+            lambda d, m: (d.replaced(scaling={}), m),
             "rule mine failed: scaling of front_left None: must be a Fraction in ]0, 1]",
         ),
         (
-            lambda d, m: (d.but(demand=None), m),
+            lambda d, m: (d.replaced(demand=None), m),
             "rule mine failed: demand None: must be a mapping by camera",
         ),
     ],
@@ -372,7 +372,7 @@ def test_a_mode_whose_rules_fail_is_not_entered() -> None:
 def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
     drive = failing(lambda d, m: (d, m), Mode.AUTOMATIC)
     first = drive.vehicle.modes[Mode.AUTOMATIC][-1].rule
-    wrong = replace(first, function=lambda vehicle, state, draft, memory: (draft.but(total=-1), memory))
+    wrong = replace(first, function=lambda vehicle, state, draft, memory: (draft.replaced(total=-1), memory))
     lists = {**drive.vehicle.modes, Mode.AUTOMATIC: (*drive.vehicle.modes[Mode.AUTOMATIC][:-1], rules.RuleCall(wrong))}
     with pytest.raises(rules.RuleFailed, match="rule mine failed: total -1: must be kbit/s"):
         start(replace(drive.vehicle, modes=lists))

@@ -23,11 +23,11 @@ def settings(document: Mapping[str, Any]) -> SettingsByPath:
 def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str:
     """What the operator's configuration and the vehicle's differ in, in one line, or ""."""
     paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
-    told = [
+    parts = [
         f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]
     ]
     more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
-    return "; ".join([*told, *more])
+    return "; ".join([*parts, *more])
 
 
 def _leaves(value: Any, path: Path) -> Iterator[tuple[str, Any]]:

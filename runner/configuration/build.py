@@ -38,7 +38,7 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
@@ -73,14 +73,14 @@ class Builder:
         """The builder of a configuration, with its vehicle built."""
         builder = cls(composed, runnable, check, fits)
         builder.vehicle = builder._vehicle()
-        builder._blame()
+        builder._attribute_problems()
         return builder
 
     def _vehicle(self) -> Vehicle | None:
         document = self.composed.document
         unknown = {key: value for key, value in document.items() if key not in self.fits}
         found = schema.findings(unknown, "composed")
-        wrong = list(self._told_once([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
+        wrong = list(self._without_repeats([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
@@ -132,7 +132,7 @@ class Builder:
         """Whether the schema found nothing wrong at or below a path, nor with what it is a part of."""
         return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
 
-    def _told_once(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
+    def _without_repeats(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
         """A name below cameras that no kind is mounted under is one mistake, not many missing keys."""
         missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
         unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
@@ -157,7 +157,7 @@ class Builder:
         self.broken[where] = self.composed.problem(where, found, error.rule)
         self.problems.append(self.broken[where])
 
-    def _blame(self) -> None:
+    def _attribute_problems(self) -> None:
         """Tell a rule that joins several values of the file or override whose word broke it.
 
         The value that the rule names may stand in a file that is right by itself: leave out one by one what was said
@@ -255,7 +255,7 @@ class Builder:
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
             elif key == "clip" and not Path(str(given)).is_file():
-                self._report(where, ModelError(key, repr(given), why_no_file(Path(str(given)))))
+                self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
     def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
         """Whether everything that source, graph and recording refer to is there."""

@@ -81,9 +81,9 @@ class Composed:
             above = (part for part in inside if len(part.package) < length)
             holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
             # For a missing key ask who made its surroundings, the most local file first.
-            asked = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
-            if asked:
-                return asked[0]
+            candidates = [*holders, *makers] if length == len(path) else [*makers, *sorted(holders, key=_locality)]
+            if candidates:
+                return candidates[0]
         vehicle = (part for part in self.parts if part.path and part.path.parent.name == "vehicle")
         return next(vehicle, self.parts[-1]) if path[:1] in (("name",), ("cameras",)) else self.parts[-1]
 

@@ -100,19 +100,19 @@ def rule(
 @rule(gives=["total"], reads=["prediction"])
 def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one comes."""
-    return draft.but(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+    return draft.replaced(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
 
 
 @rule(gives=["total"], reads=["collective_total"])
 def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode C: the total is the operator's; `start_kbps` where a run starts in C and none was set yet."""
-    return draft.but(total=start_kbps if state.collective_total is None else state.collective_total), memory
+    return draft.replaced(total=start_kbps if state.collective_total is None else state.collective_total), memory
 
 
 @rule(gives=["total"], reads=[])
 def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
     """The total is what the file says, whatever is predicted: for comparison."""
-    return draft.but(total=kbps), memory
+    return draft.replaced(total=kbps), memory
 
 
 @rule(gives=["demand"], reads=["on", "rois"])
@@ -124,14 +124,14 @@ def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
         else allocation.ZERO
         for name, camera in vehicle.cameras.items()
     }
-    return draft.but(demand=demands), memory
+    return draft.replaced(demand=demands), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
     assert draft.total is not None
-    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
@@ -141,7 +141,7 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
     wanted = {name: demand for name, demand in draft.demand.items() if demand}
     weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
-    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
@@ -157,7 +157,7 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = "" if not kbps or roi is full or roi == full else f", as {_whole(bitrate)} for the full image"
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
-    return draft.but(scaling=factors, reasons=reasons), memory
+    return draft.replaced(scaling=factors, reasons=reasons), memory
 
 
 @rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
@@ -168,7 +168,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
     total = sum(bitrates.values(), allocation.ZERO)
-    return draft.but(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+    return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
 # --- answers to inputs that are stale or lost: modes=safe -------------------------------------------------------------
@@ -248,7 +248,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
             now[name] = (held, since)
             factors[name] = held
             reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
-    return draft.but(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
+    return draft.replaced(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
 
 
 # --- running a list ---------------------------------------------------------------------------------------------------

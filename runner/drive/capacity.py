@@ -36,7 +36,7 @@ class Cell(NamedTuple):
     samples: int
 
 
-def cannot_tell(drive: Series) -> str:
+def capacity_problem(drive: Series) -> str:
     """Why a drive says nothing of the link, or ""."""
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
@@ -45,7 +45,7 @@ def cannot_tell(drive: Series) -> str:
 
 def limited_samples(drive: Series) -> list[CapacitySample]:
     """The samples of a drive in which the link was the limit; none where it cannot tell."""
-    if cannot_tell(drive) or drive.positions is None:
+    if capacity_problem(drive) or drive.positions is None:
         return []
     received = [camera.received for camera in drive.cameras.values() if camera.received]
     t, kbps = drive.actual

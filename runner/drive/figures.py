@@ -16,7 +16,7 @@ from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Ser
 from runner.drive.statistics import DriveStatistics, latencies, per_second, to_arrival
 
 MINUTES_FROM_S = 900.0
-APART = 0.014  # of the largest factor, between steps that would lie on one another
+STEP_OFFSET = 0.014  # of the largest factor, between steps that would lie on one another
 WIDE = 8.0  # latencies that spread over more than this ratio have a logarithmic axis
 DECADES = 50.0  # over more than this ratio fewer of them are numbered
 QUANTILES = np.concatenate([np.linspace(0, 0.95, 96), np.linspace(0.951, 1, 50)])
@@ -48,7 +48,7 @@ class Curve:
     around     lowest and highest of the cameras that the curve is the mean of
     steps      each value holds until the next
     filled     down to 0, without a line
-    why        of each value, for whoever points at it
+    reasons    of each value, shown when it is hovered over
     """
 
     label: str
@@ -60,7 +60,7 @@ class Curve:
     around: tuple[FloatSeries, FloatSeries] | None = None
     steps: bool = False
     filled: bool = False
-    why: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
 
 
 class Bars(NamedTuple):
@@ -200,11 +200,11 @@ def scaling(drives: Drives) -> Rows:
         meet = any(a & b for a, b in combinations(used, 2))
         for dash, names in enumerate(groups):
             camera = drive.series.cameras[names[0]]
-            offset = ((len(groups) - 1) / 2 - dash) * APART * reach * meet
+            offset = ((len(groups) - 1) / 2 - dash) * STEP_OFFSET * reach * meet
             label = _named(names, panel) + (f" (offset {offset:+.3f})" if offset else "")
             curve = _steps(label, TimeSeries(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
-            why = tuple(_why(names, camera, drive.series.end))
-            yield replace(curve, y=curve.y + offset, why=why)
+            reasons = tuple(_step_reasons(names, camera, drive.series.end))
+            yield replace(curve, y=curve.y + offset, reasons=reasons)
 
     def axis(part: int, _: Sequence[Sequence[Curve]]) -> Axis:
         panels = [(drive, panel) for drive in drives for panel in drive.series.panels[part : part + 1]]
@@ -312,14 +312,14 @@ def _factors(drive: DriveStatistics, panel: Panel) -> set[float]:
     return {float(factor) for each in (*ladders, *used) for factor in each if factor} or {1.0}
 
 
-def _why(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
+def _step_reasons(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
     """Of each step of a factor, the time, the factor and the reason."""
     decided = camera.decided
-    told = [
+    reasons = [
         f"{', '.join(names)} from {t:.1f} s: {'off' if np.isnan(factor) else f'{factor:g}'}\n{reason}"
         for t, factor, reason in zip(*_factor(camera), decided.reason, strict=True)
     ]
-    return told + told[-1:] if told and decided.t[-1] < end else told
+    return reasons + reasons[-1:] if reasons and decided.t[-1] < end else reasons
 
 
 def _by_panel(

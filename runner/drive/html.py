@@ -77,7 +77,7 @@ def _body(
     left_out: Sequence[str],
 ) -> Iterable[str]:
     several = len(drives) > 1
-    yield from (_about(drive, several=several) for drive in drives)
+    yield from (_drive_section(drive, several=several) for drive in drives)
     if notes := _notes(drives, left_out):
         yield f"<section>{notes}</section>"
     if several:
@@ -112,10 +112,10 @@ def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
     return f'<ul class="warnings" aria-label="What to know">{items}</ul>' if items else ""
 
 
-def _once(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def _once(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """Each text once, with the labels of what it is said of."""
     found: dict[str, list[str]] = {}
-    for text, label in said:
+    for text, label in notes:
         found.setdefault(text, []).append(label)
     return found
 
@@ -148,7 +148,7 @@ def _table(caption: str, table: HtmlTable, more: str = "") -> str:
     )
 
 
-def _about(drive: DriveStatistics, *, several: bool) -> str:
+def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
     """What was driven, when, with what, and how it ended."""
     series = drive.series
     ends = ", ".join(f"{side}: {'ended cleanly' if clean else 'cut off'}" for side, clean in series.ended.items())
@@ -234,10 +234,10 @@ def _curve(curve: Curve) -> dict[str, Any]:
     kept[:: 1 + len(x) // MOST_POINTS] = True
     if curve.steps and x.size:
         changed = np.append(True, ~np.isclose(y[1:], y[:-1], equal_nan=True))
-        kept = changed | (kept if curve.why else False)
+        kept = changed | (kept if curve.reasons else False)
         kept[-1] = True
     around = curve.around and [_rounded(side[kept]) for side in curve.around]
-    why = [curve.why[at] for at in np.flatnonzero(kept)] if curve.why else None
+    why = [curve.reasons[at] for at in np.flatnonzero(kept)] if curve.reasons else None
     points = {"x": _rounded(x[kept]), "y": _rounded(y[kept]), "around": around, "why": why}
     return {key: getattr(curve, key) for key in keys} | points
 

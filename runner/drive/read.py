@@ -15,7 +15,7 @@ from runner.records import Began, Ended, Json, LinesDropped, Record, from_json, 
 from runner.schema import event_problem, log_problem, read_json
 
 T = TypeVar("T")
-PASSED_OVER = (
+SKIPPED_KINDS = (
     "decision",
     "telemetry",
     "note",
@@ -125,7 +125,7 @@ def read_lines(
         line, problem = read_line(text)
         if is_log(line):
             drive = True
-            if events and line["log"] in PASSED_OVER:
+            if events and line["log"] in SKIPPED_KINDS:
                 continue
             problem = problem or log_problem(line)
         if problem and drive and not text.endswith("\n"):

@@ -301,8 +301,8 @@ def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mappin
         yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
     received = [camera.received for camera in cameras.values() if camera.received]
     lowest = min((float(np.nanmin(got.clocks_ms)) for got in received if np.isfinite(got.clocks_ms).any()), default=0.0)
-    told = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
-    ahead_ms = max(-lowest, told)
+    reported_ms = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
+    ahead_ms = max(-lowest, reported_ms)
     if ahead_ms > -CLOCKS_APART_MS:
         rule = f"latencies are unknown up to {TRUSTED_AGAIN_S:g} s before and after"
         yield f"the vehicle's clock was ahead of the operator's by at least {ahead_ms:.0f} ms: {rule}"

@@ -194,14 +194,14 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Driv
 
 
 def camera_statistics(camera: CameraSeries, end: float, model: Model | None = None) -> CameraStatistics:
-    source, got, decided = camera.received or camera.sent, camera.received, camera.decided
+    source, received, decided = camera.received or camera.sent, camera.received, camera.decided
     begin, until = (float(source.t[0]), float(source.t[-1])) if source else (0.0, end)
     sending = [(max(a, begin), min(b, until)) for a, b in sending_spans(decided, end)]
     sending_s = sum(max(0.0, b - a) for a, b in sending)
     frames = float(source.frames[-1] - source.frames[0]) if source else NAN
     kbps = ratio(float(source.bytes[-1] - source.bytes[0]) * 8 / 1000, until - begin) if source else NAN
     allocated = mean_held(TimeSeries(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
-    stood = tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None
+    frozen_spans = tuple(freezes(received.arrival_t, sending)) if received and _arrivals_logged(received) else None
     return CameraStatistics(
         name=camera.name,
         frames=int(source.frames[-1]) if source else 0,
@@ -212,19 +212,19 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         share=ratio(kbps, allocated),
         factors=factor_shares(camera, begin, until),
         sizes=size_shares(camera, begin, until),
-        arrival=latency(got.arrival_ms) if got else Latency(),
-        decode=latency(got.latency_ms) if got else Latency(),
-        freezes=stood,
-        frozen=NAN if stood is None else ratio(sum(freeze.seconds for freeze in stood), sending_s),
-        lost=int(got.lost[-1]) if got else None,
-        rebuilt=int(got.rebuilt[-1]) if got else None,
-        quality=estimate(camera, model, stood or ()) if model else None,
+        arrival=latency(received.arrival_ms) if received else Latency(),
+        decode=latency(received.latency_ms) if received else Latency(),
+        freezes=frozen_spans,
+        frozen=NAN if frozen_spans is None else ratio(sum(freeze.seconds for freeze in frozen_spans), sending_s),
+        lost=int(received.lost[-1]) if received else None,
+        rebuilt=int(received.rebuilt[-1]) if received else None,
+        quality=estimate(camera, model, frozen_spans or ()) if model else None,
     )
 
 
-def _arrivals_logged(got: ReceivedSeries) -> bool:
+def _arrivals_logged(received: ReceivedSeries) -> bool:
     """An operator who logged frames but no arrivals kept none of them."""
-    return bool(got.arrival_t.size) or not got.frames[-1]
+    return bool(received.arrival_t.size) or not received.frames[-1]
 
 
 def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
@@ -337,8 +337,10 @@ def factor_shares(camera: CameraSeries, begin: float, end: float) -> dict[float,
 
 def size_shares(camera: CameraSeries, begin: float, end: float) -> dict[tuple[int, int], float]:
     """Share of the time by size of the picture received, or of the one decided where no operator logged, px."""
-    got, decided = camera.received, camera.decided
-    t, width, height = (got.t, got.width, got.height) if got else (decided.t, decided.width, decided.height)
+    received, decided = camera.received, camera.decided
+    t, width, height = (
+        (received.t, received.width, received.height) if received else (decided.t, decided.width, decided.height)
+    )
     shares = _shares([(int(w), int(h)) for w, h in zip(width, height, strict=True)], spans(t, begin, end))
     return {size: share for size, share in shares.items() if size[0]}
 
@@ -365,7 +367,7 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
     return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
 
 
-def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -> Estimate:
+def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] = ()) -> Estimate:
     """Quality that the pictures of a camera have by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
@@ -387,7 +389,7 @@ def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -
         quality[at] = np.interp(np.log(full[at]), np.log(curve.kbps), curve.quality)
         outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
     moving = np.ones(t.shape, dtype=bool)
-    for freeze in stood:
+    for freeze in frozen_spans:
         _hold(quality, moving, t, freeze)
     known = np.isfinite(quality) & moving
     clamped = ratio(int((outside & known).sum()), int(known.sum()))

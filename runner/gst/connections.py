@@ -31,7 +31,7 @@ class RtspConnection:
     viewer       where it comes from and for whom
     cameras      what it watches, with the library's transport once there is one
     interleaved  whether video runs through this connection, too
-    heard        monotonic time of its last complete request, s
+    last_request monotonic time of its last complete request, s
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
@@ -44,7 +44,7 @@ class RtspConnection:
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.interleaved = False
-        self.heard = self._writable = time.monotonic()
+        self.last_request = self._writable = time.monotonic()
         self._buffer = 0
         self._written: deque[tuple[float, int]] = deque()  # when, bytes ever written by then
 

@@ -20,11 +20,11 @@ class KnobPanel:
     element that changes then sets them all at once. Set one after the other while a frame passes, crop edges leave
     moments without any picture, which ends the stream.
 
-    turned  called, from any thread, when knobs were set: `applied` has what was read back
+    on_turned  called, from any thread, when knobs were set: `applied` holds the values that were read back
     """
 
-    def __init__(self, pipeline: Gst.Bin, camera: Camera, turned: Callable[[], None]) -> None:
-        self._camera, self._turned = camera, turned
+    def __init__(self, pipeline: Gst.Bin, camera: Camera, on_turned: Callable[[], None]) -> None:
+        self._camera, self._on_turned = camera, on_turned
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
         # Reentrant: new caps send an event up through the very pad whose probe sets them, which calls it once more.
@@ -67,7 +67,7 @@ class KnobPanel:
                 self.faults += wrong
                 if not wrong:
                     self.applied[knob] = value
-        self._turned()
+        self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
         return assignments(self._camera, knob, value)

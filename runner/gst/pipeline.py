@@ -30,12 +30,12 @@ class CameraPipeline:
         pipeline: Gst.Bin,
         plan: Plan,
         wanted: Mapping[str, KnobValue],
-        turned: Callable[[], None],
+        on_turned: Callable[[], None],
         source: WatchedSource | None = None,
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted = wanted
-        self.knobs = KnobPanel(pipeline, plan.camera, turned)
+        self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
             loop_clip(pipeline, plan)
         self._started = False

@@ -89,7 +89,7 @@ class Receiver:
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
         self._before = Reception()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
-        self._told_foreign = False
+        self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
@@ -106,8 +106,8 @@ class Receiver:
     def sample(self) -> Reception:
         """What has come so far; asks for the latency of the next frame."""
         received = replace(self._count(), arrivals=self._arrived())
-        if received.foreign and not self._told_foreign:
-            self._told_foreign = True
+        if received.foreign and not self._foreign_reported:
+            self._foreign_reported = True
             self._report(self._name, "packets that do not come from the vehicle are dropped")
         now = time.monotonic()
         if not self.should_send:

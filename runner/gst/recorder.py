@@ -39,7 +39,7 @@ class Recorded:
     left_out   frames that the source left out to keep its rate, likewise
     width, height  px, 0 before the first frame
     began      time of the first frame, s since 1970; 0 before it
-    why        what failed, or ""
+    failure    what failed, or ""
     """
 
     stage: Stage = Stage.RECORDING
@@ -52,7 +52,7 @@ class Recorded:
     width: int = 0
     height: int = 0
     began: float = 0.0
-    why: str = ""
+    failure: str = ""
 
 
 class Recorder:
@@ -114,7 +114,7 @@ class Recorder:
             self._close(Stage.FAILED, "stopped before its file was finished")
 
     def _close(self, stage: Stage, why: str = "") -> None:
-        self._recorded = replace(self._count(), stage=stage, why=why)
+        self._recorded = replace(self._count(), stage=stage, failure=why)
         GLib.source_remove(self._watching)
         self._pipeline.get_bus().remove_signal_watch()
         self._pipeline.set_state(Gst.State.NULL)

@@ -87,7 +87,7 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
                 yield ModelError(f"{path}.element", repr(element.factory), rule)
             continue
         for key, value in element.properties.items():
-            rule = _objection(element.factory, key, value)
+            rule = _property_problem(element.factory, key, value)
             if rule:
                 yield ModelError(f"{path}.properties.{key}", _shown(value), rule)
 
@@ -109,7 +109,7 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
             if element is None:
                 continue
             path = f"graph.knobs.{knob}[{index}]"
-            rule = _objection(factory, key, filled)
+            rule = _property_problem(factory, key, filled)
             if rule:
                 yield ModelError(f"{path}.property", repr(key), rule)
             elif not _may_change(element, key) and (name, key) not in camera.graph.mutable:
@@ -145,7 +145,7 @@ def _unlinkable(line: str) -> str | None:
 
 
 @lru_cache(maxsize=None, typed=True)
-def _objection(factory: str, key: str, value: Value) -> str:
+def _property_problem(factory: str, key: str, value: Value) -> str:
     """Why an element does not take this value for this property; "" if it does."""
     element = _template(factory)
     assert element is not None

@@ -89,14 +89,14 @@ class CameraServer:
     """RTSP server with one mount point per camera.
 
     build   makes a `CameraPipeline` of each that was built
-    report  told of pipelines that come and go, and of viewers that are closed
+    on_report  called when pipelines start and stop, and when viewers are disconnected
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, report: OnReport) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, on_report: OnReport) -> None:
         check_port_free(media)
-        self._media, self._build, self._report = media, build, report
+        self._media, self._build, self._on_report = media, build, on_report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
         self._changed = threading.Condition()  # a camera's stage; also guards all that clients' threads share
@@ -165,7 +165,7 @@ class CameraServer:
         media.connect("target-state", self._on_target_state, camera)
         # Only after the factory's own handler, which forgets the media, is another one built.
         media.connect_after("unprepared", self._on_unprepared, camera, built)
-        self._report(camera.name, "pipeline built")
+        self._on_report(camera.name, "pipeline built")
 
     def _on_stage(self, media: GstRtspServer.RTSPMedia, camera: _Camera, stage: _Stage) -> None:
         with self._changed:
@@ -185,12 +185,12 @@ class CameraServer:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
-        self._report(camera.name, "pipeline gone")
+        self._on_report(camera.name, "pipeline gone")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
             return  # that ends the file, and not the stream
-        self._report(camera.name, message.parse_error()[0].message)
+        self._on_report(camera.name, message.parse_error()[0].message)
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
@@ -281,7 +281,7 @@ class CameraServer:
     def _on_answered(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
         connection = self._connection(client)
         if connection:
-            connection.heard = time.monotonic()
+            connection.last_request = time.monotonic()
 
     def _on_describe(
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
@@ -367,7 +367,7 @@ class CameraServer:
 
     def _close(self, connection: RtspConnection, why: str) -> None:
         for camera in sorted(connection.cameras):
-            self._report(camera, f"closed the viewer at {connection}: {why}")
+            self._on_report(camera, f"closed the viewer at {connection}: {why}")
         connection.close()
 
     def _watch_connections(self) -> bool:
@@ -381,7 +381,7 @@ class CameraServer:
         for client, connection in connections:
             if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
-            elif now - connection.heard > self._media.session_timeout_s and not client.session_filter(None):
+            elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
         return True
 

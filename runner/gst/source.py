@@ -21,7 +21,7 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     identity = pipeline.get_by_name(plan.source[-1].name)
     pace = identity.get_static_pad("sink")
     _Loop(pace.get_peer(), identity, float(plan.camera.fps))
-    _born_on_release(pace)
+    _report_no_latency(pace)
     clip = _Pace(identity, float(plan.camera.fps))
     GLib.timeout_add(CHECK_MS, clip.keep)
 
@@ -119,7 +119,7 @@ def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
     return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]
 
 
-def _born_on_release(pad: Gst.Pad) -> None:
+def _report_no_latency(pad: Gst.Pad) -> None:
     """A frame of a clip is captured when it is released: decoding ahead of time is no latency."""
 
     def on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:

@@ -115,7 +115,7 @@ def concerns_file(message: Gst.Message) -> bool:
     return bool(message.src) and message.src.get_name().startswith(_MARK)
 
 
-def born(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
+def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
     """When a frame was captured on this machine, s since 1970, by its place in the stream's running time."""
     element = pad.get_parent_element()
     segment, clock = pad.get_sticky_event(Gst.EventType.SEGMENT, 0), element.get_clock()

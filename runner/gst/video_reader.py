@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.errors import RunError
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
 SILENT = 100  # waits without a unit, an end or an error, after which the file is given up
@@ -38,7 +38,7 @@ def read_video(path: Path) -> Iterator[Unit]:
     raises  RunError where the file is none or is damaged; what was read before stays good
     """
     if not path.is_file():
-        raise RunError(f"{path}: {why_no_file(path)}")
+        raise RunError(f"{path}: {file_problem(path)}")
     pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")
     pipeline.get_by_name("file").set_property("location", str(path))
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))

@@ -46,7 +46,7 @@ def over_uplink(address: str) -> bool:
 
 
 def admit(
-    viewers: Sequence[StreamViewer], newcomer: StreamViewer, limit: int, controller: str
+    viewers: Sequence[StreamViewer], new_viewer: StreamViewer, limit: int, controller: str
 ) -> list[StreamViewer] | None:
     """Which viewers of a camera have to leave for a newcomer, or None where the newcomer is refused.
 
@@ -56,14 +56,14 @@ def admit(
     returns     for the controller the newest of the others, and where all are the controller's own, the oldest: it is
                 what an operator leaves behind whose address changed
     """
-    if not over_uplink(newcomer.address):
+    if not over_uplink(new_viewer.address):
         return []
     counted = [viewer for viewer in viewers if over_uplink(viewer.address)]
-    excess = len(counted) + 1 - limit
-    if excess <= 0:
+    surplus = len(counted) + 1 - limit
+    if surplus <= 0:
         return []
-    if not controller or newcomer.operator != controller:
+    if not controller or new_viewer.operator != controller:
         return None
     others = [viewer for viewer in reversed(counted) if viewer.operator != controller]
     own = [viewer for viewer in counted if viewer.operator == controller]
-    return (others + own)[:excess]
+    return (others + own)[:surplus]

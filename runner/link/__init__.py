@@ -37,15 +37,15 @@ OnLinkSample = Callable[[LinkSample], None]
 class LimitedLink:
     """A link that exists. Its rate is that of the start until `start` says when the drive begins.
 
-    record  called with each sample from a thread of the link
+    on_sample  called with each sample from a thread of the link
 
     `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
     """
 
-    def __init__(self, limit: Limit, ends: Ends, record: OnLinkSample) -> None:
+    def __init__(self, limit: Limit, ends: Ends, on_sample: OnLinkSample) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
-        self._limit, self._shaper, self._record = limit, ends.shaper, record
+        self._limit, self._shaper, self._on_sample = limit, ends.shaper, on_sample
         self._stopped = threading.Event()
         self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -91,7 +91,7 @@ class LimitedLink:
                 in_force, counters = kbps, self._shaper.limit(kbps)
             if logs:
                 line = int(t / LOG_S) + 1
-                self._record(_sample(t, kbps, counters))
+                self._on_sample(_sample(t, kbps, counters))
 
 
 def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
@@ -107,21 +107,21 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
 
 @contextmanager
 def limited_link(
-    kind: str, limit: Limit, media: Endpoint, control: Endpoint, record: OnLinkSample
+    kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample
 ) -> Iterator[LimitedLink]:
     """The link while it is needed; everything that belongs to it is gone at the end.
 
     kind            netns or relay
     limit           what it does
     media, control  RTSP server and broker as the configuration states them
-    record          called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
+    on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
                     since the link was made
     raises          RunError where it cannot be made, with what to do; at the end, where it has failed meanwhile
     """
     if kind not in KINDS:
         raise RunError(f"link={kind}: unknown kind, {suggest(kind, KINDS)}")
     with KINDS[kind](limit, media, control) as ends:
-        link = LimitedLink(limit, ends, record)
+        link = LimitedLink(limit, ends, on_sample)
         try:
             yield link
         finally:

@@ -57,18 +57,18 @@ class Child:
 
     def answer(self) -> Any:
         """The next answer. raises RunError as `ask`"""
-        complaints: list[str] = []
+        errors: list[str] = []
         for line in self._lines():
             if line[:1] in ("{", "["):
-                if complaints:
+                if errors:
                     break
                 return json.loads(line)
-            complaints.append(line.strip())
+            errors.append(line.strip())
         else:
             # Of a traceback the last line says it all.
-            complaints = complaints[-1:] if complaints[:1] == ["Traceback (most recent call last):"] else complaints
-            complaints.append(f"it ended: {children.ending(self._process.wait(END_S))}")
-        raise RunError(f"{self._name}: {'; '.join(complaints)}")
+            errors = errors[-1:] if errors[:1] == ["Traceback (most recent call last):"] else errors
+            errors.append(f"it ended: {children.ending(self._process.wait(END_S))}")
+        raise RunError(f"{self._name}: {'; '.join(errors)}")
 
     def check(self) -> None:
         """raises RunError where it has ended"""

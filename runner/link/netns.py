@@ -143,13 +143,13 @@ def _join(one: _End, other: _End) -> None:
 
 def _remove(ip: str, name: str) -> None:
     """Remove a link and whatever still runs in it; what is not there need not be removed."""
-    _said(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
+    _output_of(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
     for namespace in (name, _router(name)):
         try:
             identity = (RUN / namespace).stat().st_ino
         except FileNotFoundError:
             continue
-        _said(ip, "netns", "delete", namespace)  # first: from now on nobody enters
+        _output_of(ip, "netns", "delete", namespace)  # first: from now on nobody enters
         for pid in _inside(identity):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -229,7 +229,7 @@ def _run(*command: str) -> str:
     return done.stdout
 
 
-def _said(*command: str) -> str:
+def _output_of(*command: str) -> str:
     """Standard output of a command that may fail."""
     return _done(command).stdout
 

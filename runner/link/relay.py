@@ -34,7 +34,7 @@ UDP_HEADERS = 28  # bytes of IPv4 and UDP
 TCP_HEADERS = 52  # bytes of IPv4 and TCP with time stamps
 SEGMENT = 1448  # bytes of TCP payload in one packet of 1500
 WINDOW = 32_768  # bytes that TCP may hold here before the limit; the rest waits at the sender, as on a real link
-AT_ONCE = 64  # datagrams that are read before others get their turn
+DATAGRAMS_PER_TURN = 64  # datagrams that are read before others get their turn
 PAIR_TRIES = 200
 WAIT_S = 0.5  # for a server that has to accept
 
@@ -211,7 +211,7 @@ class Ports:
     def _read(self, index: int, sock: socket.socket) -> None:
         host, first = self._operator
         operator = (host, first + index)
-        for _ in range(AT_ONCE):
+        for _ in range(DATAGRAMS_PER_TURN):
             try:
                 data, source = sock.recvfrom(65_536)
             except OSError:

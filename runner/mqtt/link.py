@@ -69,7 +69,7 @@ class ControlLink:
     ) -> None:
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._report = on_connected, report
-        self._trouble = ""  # why there is no connection, as reported
+        self._connection_fault = ""  # why there is no connection, as reported
         self._faults: set[str] = set()  # as reported
         self.dropped = 0
         self._listening, self._closing = threading.Event(), threading.Event()
@@ -151,8 +151,8 @@ class ControlLink:
         if refused := [wanted for wanted, code in zip(self._listen, codes, strict=False) if code.is_failure]:
             self._failed_to_connect(RunError(f"refuses to send {', '.join(refused)}"))
             return
-        if self._trouble:
-            self._trouble = ""
+        if self._connection_fault:
+            self._connection_fault = ""
             self._report(f"connected to the MQTT broker at {self._broker}")
         self._listening.set()
         self._on_connected(True)
@@ -168,8 +168,8 @@ class ControlLink:
 
     def _failed_to_connect(self, error: BaseException | None) -> None:
         why = str(getattr(error, "strerror", None) or error).lower()
-        if why != self._trouble and not self._closing.is_set():
-            self._trouble = why
+        if why != self._connection_fault and not self._closing.is_set():
+            self._connection_fault = why
             self._report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
 
 

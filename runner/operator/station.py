@@ -59,7 +59,7 @@ class CameraRow(NamedTuple):
     state: CameraState | None
 
 
-class _Asked(NamedTuple):
+class _PendingRequest(NamedTuple):
     on_reply: OnReply | None
     event: str
     until: float
@@ -83,11 +83,11 @@ class Station:
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self._telemetry: Telemetry | None = None
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it came
-        self._heard = 0.0
+        self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name of those that the broker knows, whether they are online
         self._connected_at: float | None = None
         self._differences = ""
-        self._asked: dict[str, _Asked] = {}
+        self._pending: dict[str, _PendingRequest] = {}
         self._lock = threading.Lock()
         self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
         self.clocks = Clocks()
@@ -124,7 +124,7 @@ class Station:
             return
         identity, now = uuid.uuid4().hex, time.monotonic()
         with self._lock:
-            self._asked[identity] = _Asked(on_reply, event["event"], now + self.answer_s)
+            self._pending[identity] = _PendingRequest(on_reply, event["event"], now + self.answer_s)
         self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
 
     def _vehicle_now(self, now: float) -> float:
@@ -152,8 +152,8 @@ class Station:
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
         """A sample of every camera's counters; to be called a few times a second, since time is judged here too."""
         now = time.monotonic()
-        if self.state and now - self._heard > SILENT_S:
-            self._lose(f"the vehicle has been silent for {SILENT_S:g} s")
+        if self.state and now - self._last_message > SILENT_S:
+            self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
         self._look_for_vehicle(now)
         self.ask({"event": "operator_connected"})  # the sign of life
@@ -223,14 +223,14 @@ class Station:
             raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")
         self._published = state
         if state:
-            self._hear()
+            self._vehicle_online()
         else:
-            self._lose("the vehicle is offline")
+            self._vehicle_lost("the vehicle is offline")
 
-    def _hear(self) -> None:
+    def _vehicle_online(self) -> None:
         """The vehicle is online, once state and telemetry have come."""
         before, state = self.state, self._published
-        self._heard = time.monotonic()
+        self._last_message = time.monotonic()
         if state is None or before is state or not self._telemetry:
             return
         self._set_state(state)
@@ -257,7 +257,7 @@ class Station:
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         if self._published:  # else it is the retained telemetry of a vehicle that is gone
-            self._hear()
+            self._vehicle_online()
 
     def _on_configuration(self, message: MqttMessage) -> None:
         """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""
@@ -279,7 +279,7 @@ class Station:
     def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)
         with self._lock:
-            asked = self._asked.pop(reply.id, None)
+            asked = self._pending.pop(reply.id, None)
         if asked is None:
             return
         if asked.on_reply:
@@ -289,9 +289,9 @@ class Station:
 
     def _time_out(self, now: float) -> None:
         with self._lock:
-            late = {identity: asked for identity, asked in self._asked.items() if now > asked.until}
+            late = {identity: asked for identity, asked in self._pending.items() if now > asked.until}
             for identity in late:
-                del self._asked[identity]
+                del self._pending[identity]
         for asked in late.values():
             if asked.on_reply:
                 reason = f"no answer from the vehicle within {self.answer_s:g} s"
@@ -301,9 +301,9 @@ class Station:
         self._connected_at = time.monotonic() if here else None
         if not here:
             self._published = None
-            self._lose("the control link is lost")
+            self._vehicle_lost("the control link is lost")
 
-    def _lose(self, why: str) -> None:
+    def _vehicle_lost(self, why: str) -> None:
         if self.state:
             self.note(why)
         self._telemetry = None

@@ -117,7 +117,7 @@ class PageServer(Listener):
     def _logger(self) -> logging.Logger:
         """What the server library complains of, without its tracebacks."""
         logger = logging.Logger("page")
-        logger.addHandler(_Complaints(self._station.note))
+        logger.addHandler(_FaultHandler(self._station.note))
         return logger
 
     def _connection(self) -> asyncio.Protocol:
@@ -264,7 +264,7 @@ def _recent(camera: Camera) -> Recent:
     return Recent(None if period is None else float(period), video_codec(camera.graph))
 
 
-class _Complaints(logging.Handler):
+class _FaultHandler(logging.Handler):
     """Notes each fault of this server once. What is not HTTP is its sender's fault, and answered with 400."""
 
     def __init__(self, note: Callable[[str], None]) -> None:

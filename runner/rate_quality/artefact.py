@@ -150,9 +150,9 @@ def dumps(document: Mapping[str, Any]) -> bytes:
 
 
 def _clip_to_json(clip: Clip) -> dict[str, Any]:
-    said = {key: value for key, value in asdict(clip).items() if key != "path"}
-    rounded = {key: round(value, 3) for key, value in said.items() if key.startswith(("si", "ti"))}
-    return {"file": Path(clip.path).name, **said, "fps": plain(Fraction(clip.fps)), **rounded}
+    properties = {key: value for key, value in asdict(clip).items() if key != "path"}
+    rounded = {key: round(value, 3) for key, value in properties.items() if key.startswith(("si", "ti"))}
+    return {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
 
 
 def _point_to_json(point: Point) -> dict[str, Any]:

@@ -51,10 +51,10 @@ class Cancelled(Exception):
     """The person has had enough."""
 
 
-def run_task(task: Task, told: Callable[[float], None] = lambda share: None) -> list[Point]:
+def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: None) -> list[Point]:
     """Encode, decode and score all lanes of a task.
 
-    told    the share that is done, a few times a second; what it raises ends the task
+    on_progress  called with the share that is done, a few times a second; an exception that it raises ends the task
     raises  RunError
     """
     from runner.apply import run_lanes
@@ -66,7 +66,7 @@ def run_task(task: Task, told: Callable[[float], None] = lambda share: None) -> 
             task.compiled,
             references.put,
             lambda lane, frame, luma: scoring[lane].take(frame, luma, references),
-            lambda frames: told(frames / task.frames),
+            lambda frames: on_progress(frames / task.frames),
         )
         for one in scoring:
             one.finish(references)

@@ -65,14 +65,14 @@ class VerbProcess:
     """
 
     def __init__(
-        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), said: IO[str] | None = None
+        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), stderr: IO[str] | None = None
     ) -> None:
-        self.name, self._said = name, said
+        self.name, self._stderr = name, stderr
         read, self._lifeline = os.pipe()
         try:
             self.process = subprocess.Popen(
                 [*before, sys.executable, "-m", "runner", verb, *words],
-                stderr=said,
+                stderr=stderr,
                 env={**environment(), LIFELINE: str(read)},
                 pass_fds=[read],
                 start_new_session=True,
@@ -90,9 +90,9 @@ class VerbProcess:
         if status is None:
             return
         text = ""
-        if self._said:
-            self._said.seek(0)
-            text = self._said.read().strip()
+        if self._stderr:
+            self._stderr.seek(0)
+            text = self._stderr.read().strip()
         raise RunError(f"{self.name} ended early ({ending(status)})" + (f":\n{text}" if text else ""))
 
     def ask(self) -> None:

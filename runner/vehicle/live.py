@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 STUCK_S = 2.0  # a loop that finishes nothing for so long is stuck
 WATCH_S = 0.25  # how often that is looked at
 END_S = 5.0  # a loop that does not end within this is left behind
-ANOTHER_S = 0.5  # a vehicle sends telemetry five times a second; who hears none of this name by then has it
+NAME_CHECK_S = 0.5  # a vehicle sends telemetry five times a second; who hears none of this name by then has it
 CONSOLE_LINES = 1000
 TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
 
@@ -58,7 +58,7 @@ class LiveVehicle:
 
     def start(self) -> None:
         """Run the loop in a thread, until the vehicle is left."""
-        self._thread = threading.Thread(target=self._run_apart, name="loop", daemon=True)
+        self._thread = threading.Thread(target=self._run_in_thread, name="loop", daemon=True)
         self._thread.start()
 
     def run(self, duration_s: float | None = None) -> None:
@@ -74,7 +74,7 @@ class LiveVehicle:
         if self.failure:
             raise self.failure
 
-    def _run_apart(self) -> None:
+    def _run_in_thread(self) -> None:
         try:
             self.run()
         except RunError as error:
@@ -134,7 +134,7 @@ class _Console:
             self._say(line)
 
 
-class _ControlEnd:
+class _VehicleControl:
     """The vehicle's end of the control link: requests in, replies, state, telemetry and configuration out.
 
     Nothing is published before it is known that no other vehicle of this name is at the broker.
@@ -145,7 +145,7 @@ class _ControlEnd:
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._alone = threading.Event()
-        self._asked: threading.Timer | None = None
+        self._announce_timer: threading.Timer | None = None
         listen = {
             self._topic("request", "+"): self._on_request,
             self._topic("telemetry"): self._on_telemetry,
@@ -163,8 +163,8 @@ class _ControlEnd:
             self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
     def close(self) -> None:
-        if self._asked:
-            self._asked.cancel()
+        if self._announce_timer:
+            self._announce_timer.cancel()
         self._link.close(*([(self._topic("state"), OFFLINE)] if self._alone.is_set() else []))
 
     def _topic(self, *parts: str) -> str:
@@ -174,9 +174,9 @@ class _ControlEnd:
         if here and self._alone.is_set():
             self._announce()
         elif here:
-            self._asked = threading.Timer(ANOTHER_S, self._announce)
-            self._asked.daemon = True
-            self._asked.start()
+            self._announce_timer = threading.Timer(NAME_CHECK_S, self._announce)
+            self._announce_timer.daemon = True
+            self._announce_timer.start()
 
     def _announce(self) -> None:
         if self._live.failure:
@@ -252,7 +252,7 @@ def live_vehicle(
 
     video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
-    control = _ControlEnd(vehicle, document, report)
+    control = _VehicleControl(vehicle, document, report)
     loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report)
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)

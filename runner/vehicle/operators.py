@@ -20,7 +20,7 @@ MOST = 64  # operators remembered; the one that has been silent longest is forgo
 
 @dataclass(slots=True)
 class _Operator:
-    heard: float
+    last_message: float
     since: float = 0.0
     present: bool = False
     announced: bool = False
@@ -51,12 +51,12 @@ class Operators:
         """An operator announces itself, or does so again as its sign of life; returns whether it was away."""
         operator = self._operator(name, t)
         operator.announced = True
-        return self.heard(name, t)
+        return self.message_received(name, t)
 
-    def heard(self, name: str, t: float) -> bool:
+    def message_received(self, name: str, t: float) -> bool:
         """Any message of an operator at time t, s; returns whether it brings a present operator back."""
         operator = self._operator(name, t)
-        operator.heard = t
+        operator.last_message = t
         returns = operator.announced and not operator.present
         if returns:
             operator.present, operator.since = True, t
@@ -72,7 +72,7 @@ class Operators:
 
     def silent(self, t: float) -> list[str]:
         """Operators who have been silent for too long since the last call; they count as away now."""
-        gone = [name for name, o in self._known.items() if o.present and t - o.heard > SILENT_S]
+        gone = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
         for name in gone:
             self._known[name].present = False
         return gone
@@ -95,6 +95,6 @@ class Operators:
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:
             if len(self._known) >= MOST:
-                del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].heard))]
-            self._known[name] = _Operator(heard=t)
+                del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].last_message))]
+            self._known[name] = _Operator(last_message=t)
         return self._known[name]

@@ -198,10 +198,10 @@ def _drive(run: _Run, duration_s: float) -> None:
 def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) -> Iterator[tuple[VerbProcess, ...]]:
     """Both sides as processes, vehicle and operator. What the vehicle says is told only where it matters."""
     to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
-    with tempfile.TemporaryFile("w+") as said, ExitStack() as stack:
+    with tempfile.TemporaryFile("w+") as stderr, ExitStack() as stack:
         before = link.vehicle_command if link else ()
         sides = (
-            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, said),
+            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr),
             VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={duration_s}"]),
         )
         for side in sides:
@@ -210,8 +210,8 @@ def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) ->
             yield sides
         finally:
             _end(sides)
-            said.seek(0)
-            for line in said:
+            stderr.seek(0)
+            for line in stderr:
                 if WITHOUT_LOG in line:
                     say(line.rstrip())
 

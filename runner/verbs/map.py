@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner.drive.capacity import CapacitySample, Cell, cannot_tell, cells, limited_samples
+from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.errors import RunError, UserError
@@ -32,7 +32,7 @@ def run(arguments: Arguments) -> int:
     for word in arguments.words:
         drive = series(read_drive(Path(word)))
         print("".join(f"{warning}\n" for warning in drive.warnings), end="", file=sys.stderr)
-        if why := cannot_tell(drive):
+        if why := capacity_problem(drive):
             without.append(f"{word} {why}")
             continue
         samples += limited_samples(drive)

@@ -108,7 +108,7 @@ class _Session:
         unfinished = recordings.part(self._directory, name)
         if recorded.stage.value == "failed":
             before = f"; what came before is in {unfinished}" if unfinished.stat().st_size else ""
-            self._fail(f"{name}: {recorded.why}{before}")
+            self._fail(f"{name}: {recorded.failure}{before}")
             return
         try:
             recordings.keep(self._directory, name)
@@ -159,7 +159,7 @@ class _Session:
         kept = camera.name in self._kept
         path = (recordings.final if kept else recordings.part)(self._directory, camera.name)
         if not path.exists():
-            return {"failed": recorded.why}
+            return {"failed": recorded.failure}
         entry: dict[str, Any] = {
             "file": path.name,
             "bytes": path.stat().st_size,
@@ -174,7 +174,7 @@ class _Session:
             "left_out_frames": recorded.left_out,
             "began": round(recorded.began, 3),
         }
-        return entry if kept else {"failed": recorded.why or "not named", **entry}
+        return entry if kept else {"failed": recorded.failure or "not named", **entry}
 
     def _line(self, name: str, entry: Mapping[str, Any]) -> str:
         size = f"{entry['width_px']}x{entry['height_px']} at {entry['fps']:g} Hz"

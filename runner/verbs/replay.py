@@ -48,7 +48,7 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
-Heard = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
+InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
 
 _encode = json.JSONEncoder(ensure_ascii=False).encode
 
@@ -104,7 +104,7 @@ def _log(arguments: Arguments, config: Mapping[str, Any], began: Began | None) -
 
 
 def replay(
-    vehicle: Vehicle, inputs: Iterable[Heard], pqos: Pqos | None = None, log: Log | None = None
+    vehicle: Vehicle, inputs: Iterable[InputEvent], pqos: Pqos | None = None, log: Log | None = None
 ) -> Iterator[str]:
     """One line of JSON per event, in order.
 
@@ -119,7 +119,7 @@ def replay(
         yield answers.line(document, now)
 
 
-def _predicted(inputs: Iterable[Heard], pqos: Pqos) -> Iterator[Heard]:
+def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
     """The events with the predictions of another source in place of their own."""
     for document, event in inputs:
         if not isinstance(event, BitratePredicted):
@@ -149,12 +149,12 @@ class _Answers:
         return f'{_encode(heard)[:-1]}, {self._in_force(now.decision)}, "commands": {commands}}}\n'
 
     def _in_force(self, decision: Decision) -> str:
-        if self._decision is None or not decision.says_the_same(self._decision):
+        if self._decision is None or not decision.equals_with_reasons(self._decision):
             self._decision, self._text = decision, _encode(records.to_json(InForce.of(decision)))[1:-1]
         return self._text
 
 
-def events(lines: Iterable[str], name: str) -> Iterator[Heard]:
+def events(lines: Iterable[str], name: str) -> Iterator[InputEvent]:
     """Events of a JSON Lines text, each with the JSON it came from. What else a drive's file says is passed over.
 
     raises  UserError with the number of the line

@@ -47,8 +47,8 @@ from runner.verbs import Arguments
 DATA = ("maps", "traces")  # folders for what pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files meet each other
 STANDING_ALONE = ("experiment", "link")  # packaged, never meet a choice of the command line
-Ask = Callable[[Configuration], object]
-READERS: dict[str, Ask] = {  # by group, what reads its part of the configuration, if not the vehicle
+ConfigReader = Callable[[Configuration], object]
+READERS: dict[str, ConfigReader] = {  # by group, what reads its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
     "study": Configuration.study,
     "link": Configuration.experiment,
@@ -63,7 +63,7 @@ class ExperimentRun(NamedTuple):
     path: str
     words: tuple[str, ...]
 
-    def blamed(self, problem: Problem) -> Problem:
+    def attributed(self, problem: Problem) -> Problem:
         """A problem of the command line, told of the run if that has the word."""
         word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
         if problem.file != COMMAND_LINE or word is None:
@@ -83,7 +83,7 @@ class ValidationTask(NamedTuple):
         return (*self.overrides, *words_of(dict(self.choices)), *(self.run.words if self.run else ()))
 
     @property
-    def asks(self) -> Sequence[Ask]:
+    def readers(self) -> Sequence[ConfigReader]:
         """What is asked of the configuration."""
         if not self.choices or "experiment" in dict(self.choices):
             return Configuration.pqos, Configuration.experiment
@@ -332,7 +332,7 @@ class _Checker:
         sections = {(key, id(value)) for key, value in assembled.document.items()}
         fits = {key for key, _ in sections & self.fine}
         config = Configuration(assembled, self.user, runnable=False, check=self._registry, fits=fits)
-        if _problems(config, task.asks):
+        if _problems(config, task.readers):
             return False
         self.fine |= sections
         return True
@@ -341,19 +341,19 @@ class _Checker:
         try:
             composed = _composed(task.words, self.user)
             config = Configuration(composed, self.user, runnable=False, check=self._registry)
-            problems = _problems(config, task.asks)
+            problems = _problems(config, task.readers)
         except ConfigError as error:
             problems = error.problems
         if problems and len(task.choices) == 1:
             self.broken |= set(task.choices)
-        self.problems += map(task.run.blamed, problems) if task.run else problems
+        self.problems += map(task.run.attributed, problems) if task.run else problems
 
 
-def _problems(config: Configuration, asks: Iterable[Ask]) -> list[Problem]:
+def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Problem]:
     problems = []
-    for ask in asks:
+    for read in readers:
         try:
-            ask(config)
+            read(config)
         except ConfigError as error:
             problems += error.problems
     return problems

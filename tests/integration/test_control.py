@@ -329,9 +329,9 @@ def mine(vehicle, state, draft, memory):
     if kbps == 666:
         raise ZeroDivisionError("division by zero")
     if kbps == 667:
-        return draft.but(total=Fraction(-1)), memory
+        return draft.replaced(total=Fraction(-1)), memory
     if kbps == 668:
-        return draft.but(total=1.5), memory
+        return draft.replaced(total=1.5), memory
     if kbps == 669:
         time.sleep(4)
     return draft, memory

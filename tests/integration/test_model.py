@@ -245,7 +245,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, 
 WATCHED = """
 import gc, sys, threading, time
 from runner.__main__ import main
-from runner.rate_quality.workers import uncollected
+from runner.rate_quality.workers import without_cycle_collection
 
 def watch():
     while True:
@@ -255,7 +255,7 @@ def watch():
 gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # others run meanwhile
 gc.set_threshold(50)
 threading.Thread(target=watch, daemon=True).start()
-sys.exit(uncollected(main, sys.argv[1:]))
+sys.exit(without_cycle_collection(main, sys.argv[1:]))
 """
 
 

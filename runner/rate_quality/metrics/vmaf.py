@@ -27,7 +27,7 @@ PATIENCE_S = 120.0  # a busy machine scores a picture in less
 PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
 SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, which they say
 GREY = 128  # chroma, which VMAF does not look at
-LOG, COMPLAINTS = "scores.json", "stderr"
+LOG, STDERR_FILE = "scores.json", "stderr"
 
 
 class Tool(NamedTuple):
@@ -163,7 +163,7 @@ def read_log(directory: Path, status: int) -> Scores:
 
 def complaint(directory: Path, status: int) -> RunError:
     """An end of ffmpeg that should not be, with its first words: the last ones name no cause."""
-    said = (directory / COMPLAINTS).read_text(errors="replace").strip().splitlines()
+    said = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
     why = re.sub(r"^\[[^]]*\] ", "", said[0]) if said else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
 
@@ -177,7 +177,7 @@ def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format:
     tool = find_tool()
     layout = picture_format(size, pixel_format, Fraction(25))
     inputs = [[*layout, "-i", str(path.resolve())] for path in (picture, reference)]
-    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / COMPLAINTS).open("w") as complaints:
+    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / STDERR_FILE).open("w") as complaints:
         words = command(tool.exe, inputs, model, 1)
         status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=complaints).returncode
         return list(read_log(Path(name), status).by_picture.values())
@@ -224,7 +224,7 @@ class VmafMeter:
                 with suppress(OSError, AttributeError):
                     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
             words = command(exe, [[*layout, "-i", f"pipe:{pipe}"] for pipe in theirs], model, stride)
-            with (self._path / COMPLAINTS).open("wb") as complaints:
+            with (self._path / STDERR_FILE).open("wb") as complaints:
                 return subprocess.Popen(
                     words,
                     cwd=self._path,
