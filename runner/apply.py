@@ -70,7 +70,7 @@ def check_machine(plans: Sequence[Plan]) -> None:
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
     if missing:
         raise RunError("\n".join(missing))
-    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _opening_fails(plan))]
+    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _source_problem(plan))]
     if refused:
         raise RunError("\n".join(refused))
 
@@ -85,12 +85,12 @@ def check_recorders(plans: Sequence[Plan]) -> None:
         raise RunError("\n".join(missing))
 
 
-def _opening_fails(plan: Plan) -> str:
-    """What GStreamer says when the source is opened, or "". Devices are opened on the way to READY."""
+def _source_problem(plan: Plan) -> str | None:
+    """GStreamer's error when the source is opened; None if it opens. Devices are opened on the way to READY."""
     pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
     try:
         if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
-            return ""
+            return None
         message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
         return str(message.parse_error()[0].message) if message else "its source does not start"
     finally:

@@ -179,8 +179,8 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def event_problem(document: Any) -> str:
-    """What is wrong with the JSON of an event, in one line; "" if nothing is."""
+def event_problem(document: Any) -> str | None:
+    """The problems of an event in JSON, in one line; None if it is valid."""
     if not isinstance(document, dict):
         return f"{shown(document)}: must be a mapping with t and event"
     name = document.get("event")
@@ -192,8 +192,8 @@ def event_problem(document: Any) -> str:
     return _in_one_line(check, document)
 
 
-def log_problem(document: Mapping[str, Any]) -> str:
-    """What is wrong with a line of a drive's file that is no event, in one line; "" if nothing is."""
+def log_problem(document: Mapping[str, Any]) -> str | None:
+    """The problems of a line of a drive log that is not an event, in one line; None if it is valid."""
     kind = document["log"]
     check = log_validator(kind) if isinstance(kind, str) else None
     if check is None:
@@ -201,8 +201,8 @@ def log_problem(document: Mapping[str, Any]) -> str:
     return _in_one_line(check, document)
 
 
-def message_problem(kind: str, document: Any) -> str:
-    """What is wrong with a message of the vehicle, in one line; "" if nothing is."""
+def message_problem(kind: str, document: Any) -> str | None:
+    """The problems of a message of the vehicle, in one line; None if it is valid."""
     return _in_one_line(message_validator(kind), document)
 
 
@@ -257,10 +257,10 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
         yield Finding(path, None, f"must have at most {LONGEST_WHOLE} digits")
 
 
-def _in_one_line(check: Draft202012Validator, document: Any) -> str:
-    """All that is wrong with a document; "" if nothing is."""
+def _in_one_line(check: Draft202012Validator, document: Any) -> str | None:
+    """All problems of a document; None if it is valid."""
     if check.is_valid(document):  # much cheaper than to look for all errors
-        return ""
+        return None
     found = _explained(check.iter_errors(document))
     return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 

@@ -63,17 +63,17 @@ def test_the_longest_absent_is_forgotten_first() -> None:
 @pytest.mark.parametrize(
     "delays, delay, expired",
     [
-        ([], 0.99, ""),
+        ([], 0.99, None),
         ([], 1.01, "1.01 s old, limit 1.00 s"),
-        ([0.2, 0.3], 1.19, ""),  # beyond the round trip, the least delay there was
+        ([0.2, 0.3], 1.19, None),  # beyond the round trip, the least delay there was
         ([0.2, 0.3], 1.21, "1.21 s old, limit 1.20 s"),
         ([6.0, 6.0], 6.0, f"6.00 s old, limit {1 + MAX_ROUND_TRIP_S:.2f} s"),
-        ([0.01] + [0.4] * DELAYS, 1.39, ""),  # the path has become longer
-        ([], -0.05, ""),
+        ([0.01] + [0.4] * DELAYS, 1.39, None),  # the path has become longer
+        ([], -0.05, None),
         ([], -0.2, "as_of 100.2 is ahead of the vehicle's time, 100"),
     ],
 )
-def test_a_request_expires(delays: list[float], delay: float, expired: str) -> None:
+def test_a_request_expires(delays: list[float], delay: float, expired: str | None) -> None:
     operators = Operators(1.0)
     for earlier in delays:
         operators.expired("a", 50.0, 50.0 - earlier)

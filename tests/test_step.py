@@ -358,7 +358,7 @@ def test_a_rule_that_fails_leaves_the_last_decision_in_force(misbehave: Any, fau
     assert after.state.prediction is not None and after.state.prediction.kbps == 2000
     assert drive.tell("position_reported", lat=1, lon=1).fault == fault  # nothing that the rules read has changed
     again = drive.accept("bitrate_predicted", kbps=3000)
-    assert (drive.total, again.fault) == (3000, "")
+    assert (drive.total, again.fault) == (3000, None)
 
 
 def test_a_mode_whose_rules_fail_is_not_entered() -> None:
@@ -366,7 +366,7 @@ def test_a_mode_whose_rules_fail_is_not_entered() -> None:
     before = drive.accept("bitrate_predicted", kbps=1500)
     after = drive.tell("mode_selected", mode="collective")
     assert after.refused == "mode collective: rule mine failed: ZeroDivisionError: division by zero"
-    assert (after.state.mode, after.decision, after.fault) == (Mode.AUTOMATIC, before.decision, "")
+    assert (after.state.mode, after.decision, after.fault) == (Mode.AUTOMATIC, before.decision, None)
 
 
 def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:

@@ -20,14 +20,14 @@ def settings(document: Mapping[str, Any]) -> SettingsByPath:
     return dict(pair for key in SECTIONS for pair in _leaves(document.get(key), (key,)))
 
 
-def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str:
-    """What the operator's configuration and the vehicle's differ in, in one line, or ""."""
+def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str | None:
+    """The differences of the operator's configuration and the vehicle's, in one line; None if they agree."""
     paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
     parts = [
         f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]
     ]
     more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
-    return "; ".join([*parts, *more])
+    return "; ".join([*parts, *more]) or None
 
 
 def _leaves(value: Any, path: Path) -> Iterator[tuple[str, Any]]:

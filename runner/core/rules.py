@@ -272,8 +272,8 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
     return Decision(state.mode, draft.total, {name: _setting(state, draft, name) for name in vehicle.cameras}), memory
 
 
-def _draft_problem(state: State, before: Draft, draft: Any) -> str:
-    """Why the cameras cannot be sent with what a rule has changed in the draft, or ""."""
+def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
+    """Why the cameras cannot be sent with the parts of the draft that a rule has changed; None if they can."""
     if not isinstance(draft, Draft):
         return "it must return a Draft and the memory"
     if draft.total is not before.total and not _is_bitrate(draft.total):
@@ -287,7 +287,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str:
         for name, on in state.on.items():
             if on and not fits(values.get(name)):
                 return f"{part} of {name} {values.get(name)!r}: {rule}"
-    return ""
+    return None
 
 
 def _is_bitrate(value: Any) -> bool:

@@ -23,8 +23,8 @@ class Run:
 
     commanded  by camera and knob, what has been commanded so far
     commands   what this event made of it: the difference
-    refused    why the event was not accepted, or ""
-    fault      why the rules could not decide, so that an earlier decision stays in force, or ""
+    refused    why the event was not accepted; None if it was
+    fault      why the rules could not decide, so that an earlier decision stays in force; None if they could
     """
 
     state: State
@@ -32,8 +32,8 @@ class Run:
     decision: Decision
     commanded: Mapping[str, KnobValues] = field(default_factory=lambda: NOTHING)
     commands: tuple[Command, ...] = ()
-    refused: str = ""
-    fault: str = ""
+    refused: str | None = None
+    fault: str | None = None
 
 
 def start(vehicle: Vehicle) -> Run:
@@ -56,7 +56,8 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
 
     Where a rule fails, the last decision stays in force and `fault` says why. A mode whose rules fail is not entered.
     """
-    refused, fault = "", run.fault
+    refused: str | None = None
+    fault = run.fault
     state, memory, decision = run.state, run.memory, run.decision
     try:
         state = advance(vehicle, run.state, event, run.decision)
@@ -67,7 +68,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
     if any(_differ(getattr(state, name), getattr(run.state, name)) for name in inputs):
         try:
             decision, memory = rules.decide(vehicle, state, run.memory)
-            fault = ""
+            fault = None
         except rules.RuleFailed as failed:
             if state.mode is run.state.mode:
                 fault = str(failed)

@@ -36,11 +36,11 @@ class Cell(NamedTuple):
     samples: int
 
 
-def capacity_problem(drive: Series) -> str:
-    """Why a drive says nothing of the link, or ""."""
+def capacity_problem(drive: Series) -> str | None:
+    """Why a drive does not show the capacity of the link; None if it does."""
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
-    return "" if drive.positions else "has no positions"
+    return None if drive.positions else "has no positions"
 
 
 def limited_samples(drive: Series) -> list[CapacitySample]:

@@ -165,12 +165,12 @@ class _File:
         self.path, self._fd = path, fd
         self._size = 0
 
-    def append(self, data: bytes) -> str:
-        """Write a line; returns why it was not written, or ""."""
+    def append(self, data: bytes) -> str | None:
+        """Write a line; returns why it was not written, None if it was."""
         try:
             if os.write(self._fd, data) == len(data):
                 self._size += len(data)
-                return ""
+                return None
             why = "no space left on device"
         except OSError as error:
             why = (error.strerror or str(error)).lower()
@@ -229,7 +229,7 @@ class _Writer:
     def _written(self, data: bytes) -> bool:
         """Write a line, however often that takes; False where the log is closed before it is written."""
         why = self._file.append(data)
-        if not why:
+        if why is None:
             return True
         self._report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
         while self._file.append(data):

@@ -136,15 +136,15 @@ def read_lines(
         yield number, line
 
 
-def read_line(text: str) -> tuple[Json, str]:
-    """The JSON of a line, and what is wrong with it as JSON and as an event, or ""."""
+def read_line(text: str) -> tuple[Json, str | None]:
+    """The JSON of a line, and its problem as JSON or as an event; None if it is valid."""
     try:
         line = read_json(text.rstrip())
     except json.JSONDecodeError as error:
         return {}, f"not JSON: {error.msg} (column {error.pos + 1})"
     except ValueError as error:
         return {}, f"not JSON: {error}"
-    return line, "" if is_log(line) else event_problem(line)
+    return line, None if is_log(line) else event_problem(line)
 
 
 def is_log(line: Any) -> bool:

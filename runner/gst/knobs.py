@@ -72,8 +72,8 @@ class KnobPanel:
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
         return assignments(self._camera, knob, value)
 
-    def _assign(self, turned: Assignment) -> str:
-        """Set one property and read it back; what is wrong, or ""."""
+    def _assign(self, turned: Assignment) -> str | None:
+        """Set one property and read it back; returns the fault, None if there is none."""
         name, key, value = turned
         element = self._by_name[name]
         wanted: Any = Gst.Caps.from_string(value) if key == "caps" else value
@@ -82,4 +82,4 @@ class KnobPanel:
             held = element.get_property(key)
             if not (held.is_equal(wanted) if key == "caps" else held == wanted):
                 return f"{self._camera.name}: {name}.{key} is {text(str(held))} after it was set to {text(value)}"
-        return ""
+        return None

@@ -22,9 +22,9 @@ class Outage:
         self._began = 0.0
 
     @property
-    def reason(self) -> str:
-        """Why it began; "" while there is none."""
-        return self._reasons[0] if self._reasons else ""
+    def reason(self) -> str | None:
+        """Why it began; None while there is no outage."""
+        return self._reasons[0] if self._reasons else None
 
     def failed(self, why: str, since: float) -> None:
         """Another failure.

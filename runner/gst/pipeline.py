@@ -47,9 +47,9 @@ class CameraPipeline:
         last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
 
     @property
-    def source_fault(self) -> str:
-        """What is wrong with a source that delivers nothing and is being replaced; "" while it delivers."""
-        return self._source.outage.reason if self._source else ""
+    def source_fault(self) -> str | None:
+        """The fault of a source that delivers nothing and is being replaced; None while it delivers."""
+        return self._source.outage.reason if self._source else None
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
         """Take the knobs to where they are wanted; `changed` is what is new."""

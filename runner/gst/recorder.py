@@ -39,7 +39,7 @@ class Recorded:
     left_out   frames that the source left out to keep its rate, likewise
     width, height  px, 0 before the first frame
     began      time of the first frame, s since 1970; 0 before it
-    failure    what failed, or ""
+    failure    what failed; None: nothing
     """
 
     stage: Stage = Stage.RECORDING
@@ -52,7 +52,7 @@ class Recorded:
     width: int = 0
     height: int = 0
     began: float = 0.0
-    failure: str = ""
+    failure: str | None = None
 
 
 class Recorder:
@@ -113,7 +113,7 @@ class Recorder:
         if self._recorded.stage is Stage.RECORDING:
             self._close(Stage.FAILED, "stopped before its file was finished")
 
-    def _close(self, stage: Stage, why: str = "") -> None:
+    def _close(self, stage: Stage, why: str | None = None) -> None:
         self._recorded = replace(self._count(), stage=stage, failure=why)
         GLib.source_remove(self._watching)
         self._pipeline.get_bus().remove_signal_watch()
@@ -163,14 +163,14 @@ class Recorder:
             self._count_down()
         return True
 
-    def _stuck(self) -> str:
-        """What has not moved on for too long, or ""."""
+    def _stuck(self) -> str | None:
+        """What has made no progress for too long; None: nothing."""
         still_s = time.monotonic() - self._moved[1]
         if self._finishing or self._end is not None:
-            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else ""
+            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
-            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else ""
-        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else ""
+            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else None
+        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else None
 
     def _count_down(self) -> None:
         """Look at every frame from now on, to cut at the right one."""

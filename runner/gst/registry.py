@@ -87,9 +87,9 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
                 yield ModelError(f"{path}.element", repr(element.factory), rule)
             continue
         for key, value in element.properties.items():
-            rule = _property_problem(element.factory, key, value)
-            if rule:
-                yield ModelError(f"{path}.properties.{key}", _shown(value), rule)
+            problem = _property_problem(element.factory, key, value)
+            if problem:
+                yield ModelError(f"{path}.properties.{key}", _shown(value), problem)
 
 
 def _check_knobs(plan: Plan) -> Iterator[ModelError]:
@@ -145,8 +145,8 @@ def _unlinkable(line: str) -> str | None:
 
 
 @lru_cache(maxsize=None, typed=True)
-def _property_problem(factory: str, key: str, value: Value) -> str:
-    """Why an element does not take this value for this property; "" if it does."""
+def _property_problem(factory: str, key: str, value: Value) -> str | None:
+    """Why an element does not accept this value of this property; None if it does."""
     element = _template(factory)
     assert element is not None
     spec = element.find_property(key)
@@ -160,7 +160,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str:
         return f"must be one of {', '.join(nicks)}" if nicks else f"must be a {kind.removeprefix('g')}"
     if hasattr(spec, "minimum") and not spec.minimum <= float(value) <= spec.maximum:
         return f"must be from {spec.minimum} to {spec.maximum}"
-    return ""
+    return None
 
 
 def _readable(kind: str, value: str) -> bool:

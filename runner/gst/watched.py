@@ -45,7 +45,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._lock = threading.Lock()  # of the child: the server's threads start and stop, GLib's one replaces
         self._child: Gst.Bin | None = None
         self._timer = 0
-        self._failed = ""  # what the source itself said, from its threads
+        self._failed: str | None = None  # the error of the source itself, from its threads
         self._moved = (0, 0.0)  # frames at the last change of the counter, and when
         self._attempts = 0  # of this outage
         self._tried = (0, 0.0)  # frames when the last one began, and when
@@ -93,7 +93,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
         if frames != self._moved[0] or not self._plays():
-            self._moved, self._failed = (frames, now), ""  # an error that stops no frame is not the picture's
+            self._moved, self._failed = (frames, now), None  # an error that stops no frame is not the picture's
         if not frames:
             return True
         if not self._attempts:
@@ -131,7 +131,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             if not self._timer:
                 return
             self._empty()
-            self._failed = ""
+            self._failed = None
             child = self._fill()
         child.sync_state_with_parent()
 

@@ -69,7 +69,7 @@ class ControlLink:
     ) -> None:
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._report = on_connected, report
-        self._connection_fault = ""  # why there is no connection, as reported
+        self._connection_fault: str | None = None  # why there is no connection, as reported
         self._faults: set[str] = set()  # as reported
         self.dropped = 0
         self._listening, self._closing = threading.Event(), threading.Event()
@@ -152,7 +152,7 @@ class ControlLink:
             self._failed_to_connect(RunError(f"refuses to send {', '.join(refused)}"))
             return
         if self._connection_fault:
-            self._connection_fault = ""
+            self._connection_fault = None
             self._report(f"connected to the MQTT broker at {self._broker}")
         self._listening.set()
         self._on_connected(True)

@@ -97,39 +97,39 @@ def _checked(kind: str, payload: bytes) -> dict[str, Any]:
     return document
 
 
-class Asked(NamedTuple):
-    """A request as it came.
+class ParsedRequest(NamedTuple):
+    """A request as received.
 
     document  the event without id and as_of, not yet checked
-    identity  its id, "" if it has none
+    identity  its id; "": it has none
     as_of     see `runner.vehicle.operators`; None where it need not say it
-    problem   why it is no request, or ""
+    problem   why it is not a valid request; None: it is
     """
 
     document: dict[str, Any]
     identity: str = ""
     as_of: float | None = None
-    problem: str = ""
+    problem: str | None = None
 
 
-def read_request(message: MqttMessage) -> Asked:
-    """A request as it came. The event itself is checked when its time is known."""
+def read_request(message: MqttMessage) -> ParsedRequest:
+    """The request as received. The event itself is checked when its time is known."""
     try:
         document = read_message(message.payload)
     except ValueError as error:
-        return Asked({}, problem=str(error))
+        return ParsedRequest({}, problem=str(error))
     if not OPERATOR.fullmatch(message.sender):
-        return Asked({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
+        return ParsedRequest({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
     if not isinstance(identity, str) or not identity:
-        return Asked(document, problem="id: must be given, as text")
-    problem = ""
+        return ParsedRequest(document, problem="id: must be given, as text")
+    problem: str | None = None
     if message.retained:
         problem = "must not be retained: a request is for now"
     elif "t" in document:
         problem = "t: must not be given, the vehicle stamps events on receipt"
     elif document == {"event": OPERATOR_GONE["event"]}:
-        return Asked(document, identity)  # a last will cannot know when it is published
+        return ParsedRequest(document, identity)  # a last will cannot know when it is published
     elif isinstance(as_of, bool) or not isinstance(as_of, int | float) or not math.isfinite(as_of):
         problem = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
-    return Asked(document, identity, None if problem else float(as_of), problem)
+    return ParsedRequest(document, identity, None if problem else float(as_of), problem)

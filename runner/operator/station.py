@@ -86,7 +86,7 @@ class Station:
         self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name of those that the broker knows, whether they are online
         self._connected_at: float | None = None
-        self._differences = ""
+        self._differences: str | None = None
         self._pending: dict[str, _PendingRequest] = {}
         self._lock = threading.Lock()
         self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}

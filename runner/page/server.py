@@ -248,15 +248,15 @@ class PageServer(Listener):
         else:
             self._station.ask(document, on_reply)
 
-    def _problem(self, token: str, identity: object, event: object) -> str:
-        """Why a request is not even sent to the vehicle, or ""."""
+    def _problem(self, token: str, identity: object, event: object) -> str | None:
+        """Why a request is not sent to the vehicle; None if it is."""
         if not isinstance(identity, str) or not 0 < len(identity) <= 64:
             return "id: must be given, as text of at most 64 characters"
         if event not in EVENTS:
             return f"event: {event!r}: must be one of {', '.join(EVENTS)}"
         if self._control.seen_by(token) != "you":
             return "this page does not hold control; take it first"
-        return ""
+        return None
 
 
 def _recent(camera: Camera) -> Recent:

@@ -188,15 +188,15 @@ class _VehicleControl:
     def _on_request(self, message: MqttMessage) -> None:
         if self._live.loop.overrun(message.sender):
             return
-        asked = read_request(message)
+        parsed = read_request(message)
         reply = self._topic("reply", message.sender)
 
         def answer(outcome: Outcome) -> None:
-            self._link.publish(reply, {"id": asked.identity, **to_json(outcome)})
+            self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
-        request = Request(message.sender, asked.document, answer, asked.as_of)
-        if asked.problem:
-            self._live.loop.refuse(request, asked.problem)
+        request = Request(message.sender, parsed.document, answer, parsed.as_of)
+        if parsed.problem:
+            self._live.loop.refuse(request, parsed.problem)
         else:
             self._live.loop.take(request)
 

@@ -212,6 +212,7 @@ class ControlLoop:
         event = None if problem else parse(stamped)
         self._update_presence(request.sender, t, event)
         if event is None:
+            assert problem
             self._refuse(problem, t, request.answer)
         elif request.as_of is not None and (late := self._operators.expired(request.sender, t, request.as_of)):
             self.refused += 1
@@ -314,7 +315,7 @@ class ControlLoop:
             name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name))
             for name, setting in decision.settings.items()
         }
-        fault = self._run.fault or None
+        fault = self._run.fault
         return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:

@@ -77,8 +77,8 @@ class Operators:
             self._known[name].present = False
         return gone
 
-    def expired(self, name: str, t: float, as_of: float) -> str:
-        """Why a request is too old to be carried out at time t, or "".
+    def expired(self, name: str, t: float, as_of: float) -> str | None:
+        """Why a request is too old to be carried out at time t; None if it is not.
 
         as_of  the vehicle's time in the newest telemetry that the sender had, plus the time since by the sender's
                clock. So `t - as_of` is one round trip for a request that nothing held up; no clocks are compared.
@@ -90,7 +90,7 @@ class Operators:
         round_trip = min(operator.delays, default=0.0)
         operator.delays.append(max(0.0, delay))
         limit = self._expires_s + min(round_trip, MAX_ROUND_TRIP_S)
-        return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else ""
+        return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else None
 
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:

@@ -189,8 +189,8 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
-def _misplaced(group: str, relative: Path) -> str:
-    """Why Hydra would not find a file, or ""."""
+def _misplaced(group: str, relative: Path) -> str | None:
+    """Why Hydra would not find a file; None if it would."""
     first = relative.parts[0]
     if group and group not in GROUPS:
         nested = f"files stand in {first}/ itself, not in folders below" if first in GROUPS else ""
@@ -201,7 +201,7 @@ def _misplaced(group: str, relative: Path) -> str:
         return f"would be ignored: Hydra reads {relative.stem}.yaml"
     if group and not choosable(relative.stem):
         return "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
-    return ""
+    return None
 
 
 # --- what they compose to ---------------------------------------------------------------------------------------------
