@@ -205,7 +205,7 @@ class VehicleSide:
     def push(self, camera: str, frame: Any) -> bool:
         """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle`."""
         if camera not in self._wanted:
-            raise ValueError(f"camera {camera!r}: no such camera, {suggest(camera, self._wanted)}")
+            raise ValueError(f"camera {camera!r}: no such camera{suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 

@@ -188,7 +188,7 @@ def event_problem(document: Any) -> str | None:
         return "event: missing: must be given"
     check = event_validator(name) if isinstance(name, str) else None
     if check is None:
-        return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
+        return f"event: {shown(name)}: unknown event{suggest(str(name), event_names())}"
     return _in_one_line(check, document)
 
 
@@ -197,7 +197,7 @@ def log_problem(document: Mapping[str, Any]) -> str | None:
     kind = document["log"]
     check = log_validator(kind) if isinstance(kind, str) else None
     if check is None:
-        return f"log: {shown(kind)}: unknown kind of line, {suggest(str(kind), log_kinds())}"
+        return f"log: {shown(kind)}: unknown kind of line{suggest(str(kind), log_kinds())}"
     return _in_one_line(check, document)
 
 
@@ -280,7 +280,7 @@ def _explain(error: Any) -> Iterator[Finding]:
             known = parent.get("properties", {})
             for key in value:
                 if key not in known:
-                    yield Finding((*path, key), None, f"unknown key, {suggest(str(key), known)}")
+                    yield Finding((*path, key), None, f"unknown key{suggest(str(key), known)}")
         case "required":
             for key in limit:
                 if key not in value:
@@ -311,7 +311,7 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "enum":
             options = ["null" if option is None else str(option) for option in limit]
             hint = suggest(value, options) if isinstance(value, str) else ""
-            return f"must be one of {', '.join(options)}" + (f", {hint}" if "mean" in hint else "")
+            return f"must be one of {', '.join(options)}" + (hint if "did you mean" in hint else "")
         case "const":
             return f"must be {shown(limit)}"
         case "minItems" | "minLength" | "minProperties":

@@ -69,7 +69,7 @@ PSNR, MSSIM = find_metric("psnr"), find_metric("mssim")
     "name, message",
     [
         ("vmav", "metric: 'vmav': unknown metric, did you mean vmaf?"),
-        ("sharp", "metric: 'sharp': unknown metric, there is psnr, mssim, vmaf, brisque"),
+        ("sharp", "metric: 'sharp': unknown metric; expected one of psnr, mssim, vmaf, brisque"),
     ],
 )
 def test_unknown_name(name: str, message: str) -> None:

@@ -140,7 +140,7 @@ def test_standard_input_and_output() -> None:
         ('{"t": 1, "event": "bitrate_predicted", "kbps": NaN}', "not JSON: NaN is no number"),
         ('{"t": 1, "event": "bitrate_predicted", "kbps": -1}', "kbps: -1: must be at least 0"),
         ('{"t": 1, "event": "bitrate_predicted", "kbp": 1}', "kbp: unknown key, did you mean kbps?"),
-        ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key, there is t, event"),
+        ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key; expected one of t, event"),
     ],
 )
 def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, told: str | None) -> None:

@@ -320,7 +320,10 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
             f"command line: output: '{file}/deep': must be a directory, {file} is a file",
         ),
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
-        ([str(drive), out, "vehicle=x"], "command line: vehicle=x: unknown argument, there is output, models, conf"),
+        (
+            [str(drive), out, "vehicle=x"],
+            "command line: vehicle=x: unknown argument; expected one of output, models, conf",
+        ),
         ([str(drive), "--output"], "command line: --output: there are no flags; write NAME=VALUE, or --help"),
         ([str(tmp_path), out], f"{tmp_path}: holds no drive: neither drive.jsonl nor operator.jsonl"),
     ]

@@ -140,8 +140,8 @@ class Builder:
             others = [name for name in self.composed.document["cameras"] if ("cameras", name) not in unmounted]
             hint = suggest(str(path[1]), others)
             if "did you mean" not in hint:
-                hint = f"its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
-            yield schema.Finding(path, None, f"no camera of that name is mounted, {hint}")
+                hint = f"; its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
+            yield schema.Finding(path, None, f"no camera of that name is mounted{hint}")
         yield from (f for f in wrong if f.path[:2] not in unmounted)
 
     def attempt(self, path: schema.Path, make: Callable[[], T]) -> T | None:

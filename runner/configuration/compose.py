@@ -168,10 +168,10 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         where, wanted = missing.groups()
         group, name = _place(wanted)
         known = options(group, directories)
-        hint = suggest(name, known) if known else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
+        hint = suggest(name, known) if known else f"; expected one of the groups {', '.join(f'/{g}' for g in GROUPS)}"
         overriding = _overriding(group, name, directories)
         file = overriding or label(find_file(directories, *_place(where)))
-        return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
+        return Problem(file, "defaults", repr(wanted), f"no such file{hint}")
     lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
     rule = "; ".join(lines)
     twice = re.search(r"Multiple values for ([\w/@.-]+?)\. ", text)

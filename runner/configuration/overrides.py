@@ -88,7 +88,7 @@ def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator
     known = options(group, directories)
     if str(override.value) not in known:
         folders = " or ".join(f"{label(directory / group)}/" for directory in reversed(directories))
-        rule = f"no such file in {folders}, {suggest(str(override.value), known)}"
+        rule = f"no such file in {folders}{suggest(str(override.value), known)}"
         if len(directories) == 1 and "did you mean" not in rule:
             rule += "; files of your own need conf=DIR"
         yield Problem(COMMAND_LINE, override.key, str(override.value), rule)

@@ -46,11 +46,13 @@ def plain(number: Fraction) -> int | float:
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
+    """The end of a sentence on an unknown word, with its separator: the nearest known word, else all known words."""
     known = list(known)
     near = get_close_matches(word, known, 1)
     shown = [*known[:13], "..."] if len(known) > 13 else known
-    return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
+    if near:
+        return f", did you mean {near[0]}?"
+    return f"; expected {'one of ' if len(shown) > 1 else ''}{', '.join(shown)}" if shown else ""
 
 
 class ModeRule(Protocol):
@@ -179,7 +181,7 @@ class Graph:
         for knob, turns in self.knobs.items():
             for index, turn in enumerate(turns):
                 if turn.element not in names:
-                    rule = f"no such element, {suggest(turn.element, names)}"
+                    rule = f"no such element{suggest(turn.element, names)}"
                     raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
         turned = {(turn.element, turn.property) for turns in self.knobs.values() for turn in turns}
         for index, pair in enumerate(self.mutable):

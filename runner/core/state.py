@@ -133,7 +133,9 @@ def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
 def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
-    raise Refused(f"unknown camera {name!r}, {suggest(name, vehicle.cameras)}")
+    hint = suggest(name, vehicle.cameras)  # a replay prints this text
+    hint = hint.replace("; expected one of ", ", there is ").replace("; expected ", ", there is ")
+    raise Refused(f"unknown camera {name!r}{hint}")
 
 
 def _only_in(mode: Mode, state: State, event: ev.Event) -> None:

@@ -83,7 +83,7 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
         path = f"{where}[{index}]"
         if _template(element.factory) is None:
             if element.factory not in PACKAGE_OF:
-                rule = f"unknown element, {suggest(element.factory, _factory_names(element.factory))}"
+                rule = f"unknown element{suggest(element.factory, _factory_names(element.factory))}"
                 yield ModelError(f"{path}.element", repr(element.factory), rule)
             continue
         for key, value in element.properties.items():
@@ -151,7 +151,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
     assert element is not None
     spec = element.find_property(key)
     if spec is None:
-        return f"{factory} has no such property, {suggest(key, (p.name for p in element.list_properties()))}"
+        return f"{factory} has no such property{suggest(key, (p.name for p in element.list_properties()))}"
     if not int(spec.flags) & GObject.ParamFlags.WRITABLE:
         return f"{factory} does not let {key} be set"
     kind = spec.value_type.name

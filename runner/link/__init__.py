@@ -119,7 +119,7 @@ def limited_link(
     raises          RunError where it cannot be made, with what to do; at the end, where it has failed meanwhile
     """
     if kind not in KINDS:
-        raise RunError(f"link={kind}: unknown kind, {suggest(kind, KINDS)}")
+        raise RunError(f"link={kind}: unknown kind{suggest(kind, KINDS)}")
     with KINDS[kind](limit, media, control) as ends:
         link = LimitedLink(limit, ends, on_sample)
         try:

@@ -182,7 +182,7 @@ def _checked(path: Path, columns: Sequence[Column], text: _Text) -> NDArray[np.f
     if values is None:
         raise _not_a_number(path, text)
     if not len(values):
-        raise ModelError("file", path, "must have rows, there is none")
+        raise ModelError("file", path, "must have rows")
     good = (values >= [column.least for column in columns]) & (values <= [column.most for column in columns])
     times = [j for j, column in enumerate(columns) if column.time]
     for j in times:

@@ -146,7 +146,7 @@ def _check_name(verb: str, key: str) -> None:
         raise UserError("command line", name, None, rule)
     hint = suggest(name, (*own, *configured))
     if "did you mean" in hint:
-        raise UserError("command line", name, None, f"unknown name, {hint}")
+        raise UserError("command line", name, None, f"unknown name{hint}")
 
 
 def study_word(word: str) -> str:

@@ -61,7 +61,7 @@ def _verb(arguments: Arguments) -> str:
     if len(words) > 1:
         raise UserError("command line", "", words[1], "must be one verb")
     if words[0] not in VERBS:
-        raise UserError("command line", "", words[0], f"unknown verb, {suggest(words[0], VERBS)}")
+        raise UserError("command line", "", words[0], f"unknown verb{suggest(words[0], VERBS)}")
     return words[0]
 
 

@@ -51,7 +51,7 @@ def run(arguments: Arguments) -> int:
 def _wanted(arguments: Arguments) -> tuple[Path, float, float]:
     """File, percentile and size of a square."""
     if arguments.overrides:
-        rule = "unknown argument, there is output, percentile, cell_m"
+        rule = "unknown argument; expected one of output, percentile, cell_m"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
         raise UserError("command line", "", None, "must name a drive: a directory that log= wrote")

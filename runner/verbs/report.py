@@ -88,7 +88,7 @@ def check_report(output: Path, models: Path | None) -> None:
 
 def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
     if arguments.overrides:
-        rule = f"unknown argument, there is {', '.join((*_own(), 'conf'))}"
+        rule = f"unknown argument; expected one of {', '.join((*_own(), 'conf'))}"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
         raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")

@@ -194,7 +194,7 @@ def _misplaced(group: str, relative: Path) -> str | None:
     first = relative.parts[0]
     if group and group not in GROUPS:
         nested = f"files stand in {first}/ itself, not in folders below" if first in GROUPS else ""
-        return f"would be ignored: {nested or f'no such group as {group}/, {suggest(group, GROUPS)}'}"
+        return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
     if not group and relative.stem != "config":
         return f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
     if relative.suffix != ".yaml":

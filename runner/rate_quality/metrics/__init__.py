@@ -49,4 +49,4 @@ def find_metric(
 
             return brisque.metric(brisque_model, brisque_range)
         case _:
-            raise UserError("", "metric", repr(name), f"unknown metric, {suggest(name, NAMES)}")
+            raise UserError("", "metric", repr(name), f"unknown metric{suggest(name, NAMES)}")
