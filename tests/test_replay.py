@@ -122,7 +122,9 @@ def test_standard_input_and_output() -> None:
     story = lines([predicted(0, 3000), {"t": 1, "event": "camera_switched", "camera": "ü", "on": True}])
     result = process("replay", *PAPER, stdin=story)
     assert (result.status, result.err) == (0, "")
-    assert json.loads(result.out.splitlines()[1])["reason"].startswith("unknown camera 'ü', there is front_left,")
+    assert json.loads(result.out.splitlines()[1])["reason"].startswith(
+        "unknown camera 'ü'; expected one of front_left,"
+    )
     assert process("replay", *PAPER, stdin="") == (0, "", "")
 
 

@@ -133,9 +133,7 @@ def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
 def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
-    hint = suggest(name, vehicle.cameras)  # a replay prints this text
-    hint = hint.replace("; expected one of ", ", there is ").replace("; expected ", ", there is ")
-    raise Refused(f"unknown camera {name!r}{hint}")
+    raise Refused(f"unknown camera {name!r}{suggest(name, vehicle.cameras)}")
 
 
 def _only_in(mode: Mode, state: State, event: ev.Event) -> None:
