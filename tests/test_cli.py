@@ -44,7 +44,7 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
     [
         (["prnt"], "command line: prnt: unknown verb, did you mean print?"),
         (["fly"], f"command line: fly: unknown verb; expected one of {', '.join(VERBS)}"),
-        (["print", "--total", "3"], "command line: --total: there are no flags; write NAME=VALUE, or --help"),
+        (["print", "--total", "3"], "command line: --total: flags are not supported; write NAME=VALUE, or --help"),
         (["print", "total_kbps"], "command line: total_kbps: must be NAME=VALUE"),
         (["replay", "conf=/nowhere"], "command line: conf: /nowhere: no such directory"),
     ],

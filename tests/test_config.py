@@ -324,7 +324,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ("  - _self_\n", "  - delivery_robot\n", "defaults[3]: 'delivery_robot': is this file itself"),
         ("weight: 2", "weight: '${'", "cameras.front.weight: no viable alternative at input '${'"),
         ("cameras:\n", "cameras: [1]\nx:\n", "a key is a list here and a mapping in a file that this builds on"),
-        ("weight: 2", "weight: &a [*a]", "line 15: an alias, *a, stands inside what it refers to"),
+        ("weight: 2", "weight: &a [*a]", "line 15: an alias, *a, is part of the value it refers to"),
         (
             ": compact_480p",
             ": ${oc.env:HOME}",

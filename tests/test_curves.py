@@ -195,7 +195,7 @@ def test_what_a_person_should_know_is_said():
     assert unreached.b_full == 4000
     assert unreached.warnings[-1].startswith("b_full: mssim 0.9999 is not reached, 0.9")
     short = choose(grid(frames=10), CRITERIA)
-    assert "only 10 frames were scored; a longer sequence would say more" in short.warnings
+    assert "only 10 frames were scored; use a longer sequence" in short.warnings
     one = choose(grid([Fraction(1, 2)]), CRITERIA)
     assert "the curves never cross between 50 and 4000 kbit/s: factor 0.5 is the best" in one.warnings
 

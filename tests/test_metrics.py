@@ -358,7 +358,8 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
     assert (
-        str(raised.value) == f"TOD_FFMPEG={exe} is no ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
+        str(raised.value)
+        == f"TOD_FFMPEG={exe} is not an ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
     )
     monkeypatch.delenv("TOD_FFMPEG")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", exe)

@@ -171,9 +171,9 @@ def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
         return str(told.value).removeprefix(f"{tmp_path}/")
 
     write_drive(tmp_path / "empty", seconds=5, change=lambda _side, _lines: [])
-    assert problem("empty") == "empty: has no length: nothing was logged but its beginning"
+    assert problem("empty") == "empty: is empty: only the first line was logged"
     write_drive(tmp_path / "undecided", seconds=5, change=without(log="decision"), sides=["vehicle"])
-    assert problem("undecided") == "undecided: has no decision yet: there is nothing to report"
+    assert problem("undecided") == "undecided: contains no decision"
     write_drive(tmp_path / "foreign", seconds=5, change=lambda _side, lines: [*lines, {"t": 1, "log": "decision"}])
     assert problem("foreign").startswith("foreign/drive.jsonl: line 187: cause: missing: must be given; mode: missing")
     assert problem("nowhere") == "nowhere: no such directory"

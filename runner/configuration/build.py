@@ -243,7 +243,7 @@ class Builder:
         cameras = self.vehicle.cameras.values() if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling:
-            rule = f"joins sides over RTSP, the graph of {dialling[0]} brings its own line"
+            rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport"
             self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
 
     def _check_inputs(self, camera: Camera) -> None:

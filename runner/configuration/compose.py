@@ -115,7 +115,7 @@ def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iter
         return
     group, _, package = override.key.lstrip("/").partition("@")
     if group == "experiment":
-        raise ValueError("an experiment is a configuration of its own: name what of it is to change")
+        raise ValueError("an experiment is a whole configuration: override single keys instead")
     if group == "vehicle":
         document = compose([f"{group}={override.value}"], user).document
         yield from ((key, document[key]) for key in ("name", "cameras"))

@@ -178,7 +178,7 @@ def bitrates(drives: Drives) -> Rows | str:
     """Actual bitrate of each camera (paper, Fig. 6)."""
     kinds = {drive.series.measured for drive in drives} - {""}
     if not kinds:
-        return "neither what was sent nor what was received was logged"
+        return "neither sent nor received video was logged"
 
     def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
         for dash, names in enumerate(coinciding(drive.series, panel, _allocated)):

@@ -81,13 +81,13 @@ def _body(
     if notes := _notes(drives, left_out):
         yield f"<section>{notes}</section>"
     if several:
-        yield _section("Drives beside each other", _table("One row for each drive", drive_rows(drives)))
+        yield _section("Drives compared", _table("One row for each drive", drive_rows(drives)))
     for drive in drives:
         held = checks.get(drive.series.label)
         if held:
             rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
-            heading = f"What the paper reports and what came out{_of(drive, several)}"
-            yield _section(heading, _table("Claims", (("claim", "came out", "holds"), rows)))
+            heading = f"Claims of the paper and results{_of(drive, several)}"
+            yield _section(heading, _table("Claims", (("claim", "result", "holds"), rows)))
     yield f'<div class="figures{"" if several else " single"}">'
     yield from (_figure(figure) for figure in _shown(figures))
     yield "</div>"
@@ -105,11 +105,11 @@ def _shown(figures: Sequence[Figure]) -> list[Figure]:
 
 
 def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
-    """What to know of the drives, each note once."""
+    """Notes of the drives, each note once."""
     noted = _once((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
     told = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
     items = "".join(f"<li>{escape(each)}</li>" for each in (*told, *left_out))
-    return f'<ul class="warnings" aria-label="What to know">{items}</ul>' if items else ""
+    return f'<ul class="warnings" aria-label="Notes">{items}</ul>' if items else ""
 
 
 def _once(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

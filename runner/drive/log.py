@@ -33,7 +33,7 @@ from runner.records import (
 from runner.redact import redacted
 
 FORMAT = 1
-WITHOUT_LOG = "the drive goes on without its log"
+WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 # Records of numbers and of the rules' own words; looking through a decision takes twenty times as long as making it.
@@ -235,7 +235,7 @@ class _Writer:
         while self._file.append(data):
             if self._closing.wait(RETRY_S):
                 return False
-        self._report(f"the log is written again: {self._file.path.name}")
+        self._report(f"the log continues: {self._file.path.name}")
         return True
 
 

@@ -271,7 +271,7 @@ def _pictures(
                 last = max(first + unit.after_ns + offset, last + 1)
                 yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
-            warn(f"{error}; the export goes on without {'the rest of it' if last >= first else 'it'}")
+            warn(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
 
 
 def _captures(side: Side, camera: str) -> list[int]:

@@ -72,7 +72,7 @@ def read_drive(directory: Path) -> Drive:
     files = {side: directory / name for side, name in FILES.items()}
     sides = {side: _side(side, path, warnings) for side, path in files.items() if path.is_file()}
     if not sides.keys() & {"vehicle", "operator"}:
-        raise UserError(where, "", None, f"holds no drive: neither {FILES['vehicle']} nor {FILES['operator']}")
+        raise UserError(where, "", None, f"contains no drive log: neither {FILES['vehicle']} nor {FILES['operator']}")
     return Drive(directory, sides, warnings)
 
 
@@ -103,7 +103,9 @@ def check_began(line: Json | None, name: str) -> Began:
     if line is None:
         raise UserError(name, "", None, "is empty: nothing was logged")
     if line.get("log") != "began":
-        raise UserError(f"{name}: line 1", "", None, "is no beginning of a drive: must be a file that log= wrote")
+        raise UserError(
+            f"{name}: line 1", "", None, "not the first line of a drive log: must be a file that log= wrote"
+        )
     if line["format"] != FORMAT:
         raise UserError(f"{name}: line 1", "format", str(line["format"]), f"this version reads format {FORMAT}")
     return from_json(Began, line)

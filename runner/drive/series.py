@@ -258,13 +258,13 @@ def _series(drive: Drive, label: str) -> Series:
     leading = drive.sides.get("vehicle") or drive.sides["operator"]
     began, end = leading.began.time, max((line.t for line in leading.lines), default=0.0)
     if end <= 0:
-        raise UserError(str(drive.path), "", None, "has no length: nothing was logged but its beginning")
+        raise UserError(str(drive.path), "", None, "is empty: only the first line was logged")
     sides = {name: _Shifted(side.lines, side.began.time - began) for name, side in drive.sides.items()}
     vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
     decisions: Sequence[tuple[float, DecisionMade | VehicleState]]
     decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
     if not decisions:
-        raise UserError(str(drive.path), "", None, "has no decision yet: there is nothing to report")
+        raise UserError(str(drive.path), "", None, "contains no decision")
     config = leading.began.config
     samples = [at for at in operator.of(Sample) if 0 <= at[0] <= end]
     telemetry = vehicle.of(Telemetry)

@@ -230,23 +230,23 @@ def _arrivals_logged(received: ReceivedSeries) -> bool:
 def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
     """What is missing, and what to know of the estimates of quality."""
     if not drive.measured:
-        yield "neither what was sent nor what was received was logged: only what was decided is known"
+        yield "neither sent nor received video was logged: only decisions are known"
     if drive.positions is None:
-        yield "no positions were logged: it is not on the map"
+        yield "no positions were logged: not drawn on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     frozen = ", ".join(f"{name} {_part(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
     if frozen:
-        rule = "a picture that stands still counts as what it was, whatever moves meanwhile: at most as good as told"
+        rule = "a frozen picture counts as its last frame, whatever moves meanwhile: an upper bound"
         yield f"estimated quality: {rule}; frozen {frozen} of the time"
     clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
-        yield f"estimated quality: bitrates not measured, where the nearest one stands in: {clamped} of the time"
+        yield f"estimated quality: bitrates outside the measured range, the nearest one used: {clamped} of the time"
     for name, quality in estimated.items():
         if quality.unknown:
             factors = ", ".join(f"{factor:g}" for factor in quality.unknown)
             yield f"{name}: its rate-quality model was not measured at the factors {factors}, no estimate for them"
     if len({quality.metric for quality in estimated.values()}) > 1:
-        yield "the rate-quality models of the cameras are of different metrics, there is no quality of the whole drive"
+        yield "the rate-quality models of the cameras use different metrics: no quality of the whole drive"
 
 
 def _part(share: float) -> str:

@@ -108,7 +108,7 @@ class Receiver:
         received = replace(self._count(), arrivals=self._arrived())
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
-            self._report(self._name, "packets that do not come from the vehicle are dropped")
+            self._report(self._name, "packets from other hosts than the vehicle are dropped")
         now = time.monotonic()
         if not self.should_send:
             self._silent = now
@@ -170,7 +170,7 @@ class Receiver:
                 self._filter = SenderFilter(Gst.Uri.from_string(location).get_host())
             self._filter.attach(taken.get_fd())
         except OSError as error:
-            self._report(self._name, f"packets of others than the vehicle are not dropped: {error}")
+            self._report(self._name, f"packets from other hosts than the vehicle are not dropped: {error}")
 
     def _close_filter(self) -> None:
         if self._filter:

@@ -170,7 +170,7 @@ class Recorder:
             return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
             return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else None
-        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else None
+        return f"no frame for {SILENT_S:g} s" if still_s > SILENT_S else None
 
     def _count_down(self) -> None:
         """Look at every frame from now on, to cut at the right one."""

@@ -113,7 +113,7 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
             if rule:
                 yield ModelError(f"{path}.property", repr(key), rule)
             elif not _may_change(element, key) and (name, key) not in camera.graph.mutable:
-                rule = f"{factory} does not say that {key} may change while playing; if it may, list it under mutable"
+                rule = f"{factory} does not declare {key} as mutable while playing; if it is, list it under mutable"
                 yield ModelError(f"{path}.property", repr(key), rule)
 
 

@@ -185,7 +185,7 @@ class CameraServer:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
-        self._on_report(camera.name, "pipeline gone")
+        self._on_report(camera.name, "pipeline stopped")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
@@ -367,7 +367,7 @@ class CameraServer:
 
     def _close(self, connection: RtspConnection, why: str) -> None:
         for camera in sorted(connection.cameras):
-            self._on_report(camera, f"closed the viewer at {connection}: {why}")
+            self._on_report(camera, f"disconnected the viewer at {connection}: {why}")
         connection.close()
 
     def _watch_connections(self) -> bool:

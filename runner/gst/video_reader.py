@@ -81,4 +81,4 @@ def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
         if buffer.pts == Gst.CLOCK_TIME_NONE:
             continue  # a unit that is damaged at its head
         yield Unit(buffer.pts - first, codec, buffer.extract_dup(0, buffer.get_size()))
-    raise RunError(f"{path}: is damaged" if codec else f"{path}: holds no video that can be read")
+    raise RunError(f"{path}: is damaged" if codec else f"{path}: contains no readable video")

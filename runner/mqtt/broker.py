@@ -77,7 +77,7 @@ class Broker:
                     return
             time.sleep(0.02)
         said = self._last_line() if self._process.poll() is not None else "it does not answer"
-        raise RunError(f"mosquitto does not come up on {self._where}: {said}; choose another control.port")
+        raise RunError(f"mosquitto does not start on {self._where}: {said}; choose another control.port")
 
     def end(self) -> None:
         self._process.terminate()

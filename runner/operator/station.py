@@ -188,9 +188,9 @@ class Station:
         after = self.clocks.ahead_ms
         if before is None and after is not None:
             rule = "synchronise both clocks (NTP, PTP)"
-            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: ages of pictures are unknown; {rule}")
+            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: picture ages are unknown; {rule}")
         elif before is not None and after is None:
-            self.note("the vehicle's clock is no longer ahead: ages of pictures are known")
+            self.note("the vehicle's clock is no longer ahead: picture ages are known")
         return samples
 
     def _sample(self) -> Sample:

@@ -130,7 +130,7 @@ def read_model(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise wrong((error.strerror or str(error)).lower()) from None
     except ValueError as error:
-        raise wrong(f"is no model file: {error}") from None
+        raise wrong(f"is not a model file: {error}") from None
     if isinstance(document, dict) and document.get("version", VERSION) != VERSION:
         raise wrong(f"is of version {document['version']}, this tod-runner reads {VERSION}")
     found = schema.findings(document, SCHEMA)

@@ -42,7 +42,7 @@ class Cache:
             self._warn(f"{path}: cannot be read ({error}), measured again")
             return None
         if not isinstance(document, dict):
-            self._warn(f"{path}: is no cache file, measured again")
+            self._warn(f"{path}: is not a cache file, measured again")
             return None
         return document
 

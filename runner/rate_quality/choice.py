@@ -162,7 +162,7 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria:
     score = mean_score(criteria.metric, criteria.sign)
     scored = len(points[0].scores[criteria.metric])
     if scored < FEW_FRAMES:
-        yield f"only {scored} frames were scored; a longer sequence would say more"
+        yield f"only {scored} frames were scored; use a longer sequence"
     if len(ladder.scaling) == 1:
         low, high = curves.kbps[0], curves.kbps[-1]
         yield f"the curves never cross between {low:.0f} and {high:.0f} kbit/s: {_shown(ladder.scaling[0])} is the best"
@@ -180,7 +180,7 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria:
         if over:
             top = max(over, key=lambda point: point.target_kbps)
             comes = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
-            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it comes to {comes}; left out there"
+            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it reaches {comes}; excluded there"
 
 
 def _shown(factor: Fraction) -> str:

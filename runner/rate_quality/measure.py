@@ -74,7 +74,7 @@ def _check_output(output: Path, models: Iterable[str]) -> None:
         raise UserError("command line", "output", repr(str(output)), rule) from None
     for path in (output / f"{model}.yaml" for model in models):
         if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
-            rule = "is there and was not written by tod-runner model; choose another directory"
+            rule = "exists and was not written by tod-runner model; choose another directory"
             raise UserError("command line", "output", repr(str(path)), rule)
 
 
@@ -142,7 +142,7 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
         raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the sequence is")
     mask: Mask = picture > 127
     if not mask.any():
-        raise UserError("command line", where, repr(str(path)), "is all black: nothing would count")
+        raise UserError("command line", where, repr(str(path)), "is all black: no pixel would count")
     return mask
 
 

@@ -117,11 +117,11 @@ class _Watch:
                 for number in filter(NUMBERS.__contains__, os.read(wakeup, 64)):
                     self._take(number)
             if self._deadline is not None and time.monotonic() >= self._deadline:
-                self._end("no orderly end in time: ending at once")
+                self._end("shutdown timed out: ending now")
 
     def _take(self, number: int) -> None:
         if self._deadline is not None or (self.stop and self.stop.is_set()):
-            self._end("a second signal: ending at once")
+            self._end("second signal: ending now")
         self.number = self.number or number
         self.ask()
 

@@ -216,7 +216,7 @@ class _VehicleControl:
         own = run == self._settings.run
         if self._alone.is_set() and not message.retained and not own and run not in self._others:
             self._others.add(run)
-            self._report(f"another vehicle named {self._name} has come to the broker: operators see both")
+            self._report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
 @contextmanager
@@ -228,7 +228,7 @@ def live_vehicle(
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
 ) -> Iterator[LiveVehicle]:
-    """Everything that the vehicle's side needs, stopped and said goodbye for at the end.
+    """Everything that the vehicle's side needs, stopped and disconnected at the end.
 
     log       directory that the drive is recorded to
     say       called, from a thread of its own, with one line on what happens

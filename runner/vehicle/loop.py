@@ -111,7 +111,7 @@ class ControlLoop:
         if dropped is request:
             self.refuse(request, f"too many: {WAITING} requests of this sender are waiting")
         elif dropped:
-            self.refuse(dropped, "superseded: a newer one came before this was taken")
+            self.refuse(dropped, "superseded by a newer measurement")
 
     def overrun(self, sender: str) -> bool:
         """Whether a sender floods the vehicle, so that its message is counted and not even read. From any thread."""
@@ -231,7 +231,7 @@ class ControlLoop:
             self._operators.disconnected(sender)
         else:
             self._operators.message_received(sender, t)
-        self._presence_changed(before, t, "said goodbye")
+        self._presence_changed(before, t, "disconnected")
 
     def _watch_operators(self, t: float) -> None:
         before = self._operators.present

@@ -130,9 +130,7 @@ def _prepared(
         config = configuration(own.overrides, own.conf, runnable=False)
         _, link = config.experiment()
     if link and directory is None:
-        raise UserError(
-            "command line", "link", link.kind, "what it does is to be looked at: give log=DIR or output=OUT"
-        )
+        raise UserError("command line", "link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     config = config.drivable(apply.check_plan)
     config.pqos()
     vehicle = config.vehicle()

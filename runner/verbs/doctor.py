@@ -52,7 +52,7 @@ def run(arguments: Arguments) -> int:
     for fine, what in findings:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
     if not findings:
-        print(f"ok      {verb} needs nothing besides this package")
+        print(f"ok      {verb} needs only this package")
     return 0 if all(fine for fine, _ in findings) else 1
 
 
@@ -149,4 +149,4 @@ def _cores(vehicle: Vehicle) -> Diagnosis:
     load_mpx = sum(float(camera.fps) * camera.width * camera.height for camera in vehicle.cameras.values()) / 1e6
     cores = os.cpu_count() or 1
     need = load_mpx / CORE_MPX_S
-    return Diagnosis(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving comes on top")
+    return Diagnosis(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving needs more")

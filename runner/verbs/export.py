@@ -44,7 +44,7 @@ def run(arguments: Arguments) -> int:
     directory = Path(arguments.words[0])
     output = arguments.path("output") or directory / "drive.mcap"
     if os.path.lexists(output):
-        rule = "is there already; remove it, or name another file by output="
+        rule = "already exists; remove it, or name another file by output="
         raise UserError("command line", "output", repr(str(output)), rule)
     if arguments.overrides:
         raise UserError("command line", "", arguments.overrides[0], "an export has no configuration, only output=")

@@ -38,7 +38,7 @@ def run(arguments: Arguments) -> int:
         samples += limited_samples(drive)
         seen += len(drive.actual.t)
     if not samples:
-        rule = "nothing was lost and nothing late: what came says what was sent, not what the link carries"
+        rule = "no packet was lost and no frame was late: the received bitrate does not show the link's capacity"
         told = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
         raise RunError(f"no map: {'; '.join([*without, *told])}")
     squares = cells(samples, percentile, cell_m)

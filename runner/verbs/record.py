@@ -107,7 +107,7 @@ class _Session:
         self._ended[name] = recorded
         unfinished = recordings.part(self._directory, name)
         if recorded.stage.value == "failed":
-            before = f"; what came before is in {unfinished}" if unfinished.stat().st_size else ""
+            before = f"; the part before is in {unfinished}" if unfinished.stat().st_size else ""
             self._fail(f"{name}: {recorded.failure}{before}")
             return
         try:

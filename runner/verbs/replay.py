@@ -191,7 +191,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
 def _keep(path: Path, output: Path | None) -> None:
     """raises UserError where what is read would be written over"""
     if output and output.is_file() and path.exists() and output.samefile(path):
-        raise UserError("command line", "output", repr(str(output)), "is what is read, choose another file")
+        raise UserError("command line", "output", repr(str(output)), "is the input, choose another file")
 
 
 @contextmanager

@@ -28,9 +28,7 @@ def show(
         console.print(_table("all drives", *drive_rows(drives)))
     for label, held in checks.items():
         rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
-        console.print(
-            _table(f"{label}: what the paper reports and what came out", ("claim", "came out", "holds"), rows)
-        )
+        console.print(_table(f"{label}: claims of the paper and results", ("claim", "result", "holds"), rows))
     for told in left_out:
         console.print(told, markup=False, highlight=False)
 

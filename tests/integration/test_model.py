@@ -410,7 +410,7 @@ def test_a_camera_of_the_users_own_is_not_overwritten(tod, clip, tmp_path):
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}")
     assert status == 2
     assert err == (
-        f"command line: output: '{own}': is there and was not written by tod-runner model; choose another directory\n"
+        f"command line: output: '{own}': exists and was not written by tod-runner model; choose another directory\n"
     )
     assert own.read_text() == "width_px: 1920\n"
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", "output=/proc/models")

@@ -131,7 +131,7 @@ def test_a_vehicle_whose_clock_is_ahead_is_warned_of_where_its_ages_stood(both):
     assert station.headline() == f"{warning}latencies are unknown"
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert heard.said[-1][1].clock_ahead_ms == 500.4
-    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: ages of pictures are unknown; ")
+    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: picture ages are unknown; ")
 
 
 def test_a_decision_is_one_note_however_many_cameras_it_changes(both):

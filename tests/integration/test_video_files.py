@@ -89,7 +89,7 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
             before = operator.sample({})
             until(lambda b=before: all(c.frames > b[n].frames + 20 for n, c in operator.sample({}).items()))
         came, sent = operator.sample({}), sides.sending.sent()
-    until(lambda: "front: pipeline gone" in sides.reported or sides.plans[0].server is None)
+    until(lambda: "front: pipeline stopped" in sides.reported or sides.plans[0].server is None)
     sides.stop()
     for name in CAMERAS:
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
@@ -122,7 +122,7 @@ def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path
     for number in range(2):
         with watching(sides.plans[0]) as client:
             until(lambda c=client: len(c.sizes) > 20)
-        until(lambda n=number: sides.reported.count("front: pipeline gone") == n + 1)
+        until(lambda n=number: sides.reported.count("front: pipeline stopped") == n + 1)
     assert [file for _, file, _ in sides.told] == ["video/front.vehicle.0.ts", "video/front.vehicle.1.ts"]
     for number in range(2):
         assert decoded(tmp_path / f"video/front.vehicle.{number}.ts")[1] >= 20
@@ -277,7 +277,7 @@ def test_h265_is_kept_as_it_is(tmp_path):
     sides = Sides(tmp_path, "graph=h265", conf=conf, cameras=("front",))
     with sides.receiving() as operator:
         until(lambda: operator.sample({})["front"].frames > 40)
-    until(lambda: "front: pipeline gone" in sides.reported)
+    until(lambda: "front: pipeline stopped" in sides.reported)
     sides.stop()
     for side in ("vehicle", "operator"):
         sizes, count = decoded(tmp_path / f"video/front.{side}.0.ts", whole=side == "vehicle")

@@ -81,7 +81,7 @@ def find_tool() -> Tool:
         exe = os.path.abspath(shutil.which(name) or name)  # it will run in another directory
         if version := _version(exe):
             return Tool(exe, version)
-    what = f"TOD_FFMPEG={named} is no ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
+    what = f"TOD_FFMPEG={named} is not an ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
     raise RunError(f"{what}: install the extra vmaf, see docs/install.md")
 
 
