@@ -374,7 +374,7 @@ def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
     [
         (["{"], "drive.jsonl: line 1: not JSON: "),
         ([json.dumps(began("vehicle")), "garbage", "{}"], "drive.jsonl: line 2: not JSON: "),
-        ([json.dumps({"t": 0, "event": "clock_advanced"})], "drive.jsonl: line 1: is no beginning of a drive"),
+        ([json.dumps({"t": 0, "event": "clock_advanced"})], "drive.jsonl: line 1: not the first line of a drive log"),
         ([json.dumps(began("vehicle") | {"format": 9})], "drive.jsonl: line 1: format: 9: "),
         ([], "drive.jsonl: is empty"),
     ],

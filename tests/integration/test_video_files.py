@@ -193,7 +193,7 @@ def goes_on(sides, camera="front"):
         assert {c.rebuilt for c in came.values()} == {0}
         sides.resize(160, 90)
         until(lambda: operator.sample({})[camera].width == 160)
-    others = [line for line in sides.reported if "no video is kept" not in line and "gone" not in line]
+    others = [line for line in sides.reported if "no video is kept" not in line and "pipeline stopped" not in line]
     assert sorted(others) == [f"{name}: pipeline built" for name in CAMERAS]
 
 
