@@ -65,7 +65,7 @@ STOP_S = 2.0  # how long the end waits for pipelines to stop
 def check_machine(plans: Sequence[Plan]) -> None:
     """Whether every plugin is installed and every source opens: files, devices.
 
-    raises  RunError that says what to do, for all cameras at once
+    raises  RunError with the remedy, for all cameras at once
     """
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
     if missing:
@@ -78,7 +78,7 @@ def check_machine(plans: Sequence[Plan]) -> None:
 def check_recorders(plans: Sequence[Plan]) -> None:
     """Whether every plugin that recording needs is installed.
 
-    raises  RunError that says what to install, for all cameras at once
+    raises  RunError with the packages to install, for all cameras at once
     """
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_recorders(plan))
     if missing:
@@ -144,7 +144,7 @@ class _Glib:
 def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
     """The plans as they are built: with a file each, where video is kept.
 
-    raises  RunError that says what to install
+    raises  RunError with the packages to install
     """
     if video is None:
         return plans

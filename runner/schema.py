@@ -40,7 +40,7 @@ _PATTERNS = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What breaks a rule, and where in the document; `found` is None where the path says it already."""
+    """What breaks a rule, and where in the document; `found` is None where the path already shows it."""
 
     path: Path
     found: str | None

@@ -54,7 +54,7 @@ PlanCheck = Callable[[Plan], Iterable[ModelError]]
 class Builder:
     """Builds model objects from plain data and gathers what is wrong with it; None stands for what could not be built.
 
-    Parts that the schema refuses are not built, so that one mistake is told once.
+    Parts that the schema refuses are not built, so that one mistake is reported once.
     """
 
     composed: Composed
@@ -160,7 +160,7 @@ class Builder:
     def _attribute_problems(self) -> None:
         """Tell a rule that joins several values of the file or override whose word broke it.
 
-        The value that the rule names may stand in a file that is right by itself: leave out one by one what was said
+        The value that the rule names may stand in a file that is right by itself: leave out one by one the parts stated
         after it, and see without which the rule holds.
         """
         for where, problem in list(self.broken.items()):
@@ -174,7 +174,7 @@ class Builder:
                     break
 
     def _without(self, part: Part) -> Builder | None:
-        """What would be built if a part said nothing."""
+        """The builder of the configuration without a part."""
         if id(part) not in self.others:
             composed = without(self.composed, part)
             other = Builder(composed, self.runnable, self.check) if composed else None

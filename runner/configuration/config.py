@@ -48,7 +48,7 @@ class Configuration:
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
 
     def drivable(self, check: PlanCheck) -> Configuration:
-        """The same, checked for all that a run needs."""
+        """The same, also checked for what a run needs."""
         return Configuration(self._composed, self._user, check=check)
 
     @property

@@ -37,7 +37,7 @@ class Composed:
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
 
     def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
-        """A problem of the whole, told of the file or override that it came from, by the path in there."""
+        """A problem of the whole, attributed to its file or override, by the path in there."""
         path = self.written(path)
         part = self._origin(path)
         return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
@@ -120,7 +120,7 @@ def _locality(part: Part) -> int:
 
 
 def _held(part: Part, path: schema.Path) -> Any:
-    """What a part says at a path of the whole document; None: nothing."""
+    """The value of a part at a path of the whole document; None: it has none."""
     inside = path[: len(part.package)] == part.package
     return _value(part.content, path[len(part.package) :]) if inside else None
 

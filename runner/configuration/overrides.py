@@ -81,7 +81,7 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
 
 
 def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
-    """A choice of a file that is not there, or a value for a key that belongs to the whole document."""
+    """A choice of a missing file, or a value for a key that belongs to the whole document."""
     if not override.choice or override.value is None or override.is_none:
         return
     group = override.key.split("@")[0].lstrip("/")

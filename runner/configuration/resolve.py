@@ -40,7 +40,7 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
 
 
 def without(composed: Composed, part: Part) -> Composed | None:
-    """What there would be if a part said nothing; None where that cannot be told from the parts."""
+    """The configuration without a part; None where the parts do not determine it."""
     from omegaconf import OmegaConf
 
     others = [other for other in composed.parts if other is not part]

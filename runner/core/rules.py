@@ -111,7 +111,7 @@ def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Me
 
 @rule(gives=["total"], reads=[])
 def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
-    """The total is what the file says, whatever is predicted: for comparison."""
+    """The total is a constant, independent of the prediction: for comparison."""
     return draft.replaced(total=kbps), memory
 
 

@@ -54,7 +54,8 @@ def start(vehicle: Vehicle) -> Run:
 def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
     """Take one event: advance the state, decide if an input of the rules changed, command the difference.
 
-    Where a rule fails, the last decision stays in force and `fault` says why. A mode whose rules fail is not entered.
+    Where a rule fails, the last decision stays in force and `fault` gives the reason. A mode whose rules fail is not
+    entered.
     """
     refused: str | None = None
     fault = run.fault

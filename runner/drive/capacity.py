@@ -44,7 +44,7 @@ def capacity_problem(drive: Series) -> str | None:
 
 
 def limited_samples(drive: Series) -> list[CapacitySample]:
-    """The samples of a drive in which the link was the limit; none where it cannot tell."""
+    """The samples of a drive in which the link was the limit; none where they cannot be determined."""
     if capacity_problem(drive) or drive.positions is None:
         return []
     received = [camera.received for camera in drive.cameras.values() if camera.received]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class ClaimCheck(NamedTuple):
-    """One claim. holds: None where the drive does not tell."""
+    """One claim. holds: None where the drive does not show it."""
 
     claim: str
     outcome: str

@@ -44,7 +44,7 @@ class Curve:
     """A quantity, in the units of the axes.
 
     colour     place of a camera in the palette, or the name of a colour of the style sheet
-    dash       which of the dashes; they tell curves apart without colour
+    dash       index of the dash pattern, which distinguishes curves without colour
     around     lowest and highest of the cameras that the curve is the mean of
     steps      each value holds until the next
     filled     down to 0, without a line
@@ -72,7 +72,7 @@ class Bars(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Rows of bars below a chart, on its axis of time; and what is said where there are none."""
+    """Rows of bars below a chart, on its axis of time; and the text shown where there are none."""
 
     bars: tuple[Bars, ...]
     none: str
@@ -348,7 +348,7 @@ def _by_panel(
 
 
 def _label(drives: Drives, at: int) -> str:
-    """What tells a drive from others."""
+    """The label that distinguishes a drive from others."""
     return drives[at].series.label if len(drives) > 1 else ""
 
 

@@ -1,4 +1,4 @@
-"""What one side of a drive says, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
+"""The log of one side of a drive, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ def write_mcap(
 
     file        takes the bytes
     read_video  gives the pictures of a file
-    warn        told what is left out
-    progress    told now and then which share is done
+    warn        called with a line on what is left out
+    progress    called now and then with the share that is done
     returns     number of messages
     raises      RunError where the file cannot be written
     """
@@ -254,7 +254,7 @@ def _pictures(
 ) -> Iterator[McapMessage]:
     """The frames of one camera on one side, at the times of their capture.
 
-    known  capture times that the log tells, ns since 1970, rising
+    known  capture times from the log, ns since 1970, rising
     """
     topic = topic.format(camera=camera)
     last = -1

@@ -118,7 +118,7 @@ def read_lines(
 
     events  give events only, and the beginning; what else a side wrote is not looked at
 
-    In a drive, a last line without an end, which a killed process left, is left out and told.
+    In a drive, a last line without an end, which a killed process left, is left out with a warning.
 
     raises  UserError with the number of the first line that is wrong
     """
@@ -150,5 +150,5 @@ def read_line(text: str) -> tuple[Json, str | None]:
 
 
 def is_log(line: Any) -> bool:
-    """Whether a line tells what a side did or saw, and is no event."""
+    """Whether a line is a record of a side, not an event."""
     return isinstance(line, dict) and "log" in line and "event" not in line

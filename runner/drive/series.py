@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
 DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
-PANEL_CAMERAS = 4  # as many curves are told apart in one panel; more are split where the mounting gives no groups
+PANEL_CAMERAS = 4  # as many curves can be distinguished in one panel; more are split where the mounting gives no groups
 
 
 class TimeSeries(NamedTuple):
@@ -340,7 +340,7 @@ def _link(lines: Sequence[Any]) -> LinkSeries | None:
 
 
 def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
-    """As the vehicle was told them, or else as the operator saw them; None where there are none.
+    """As the vehicle received them, or else as the operator received them; None where there are none.
 
     Metres by equirectangular projection around the first place, right for some km.
     """
@@ -419,7 +419,7 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
-    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame that was told before
+    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame already counted
     return ReceivedSeries(
         t=t,
         kbps=_settled(t, column("kbps"), frames),

@@ -68,7 +68,7 @@ class RateCurve(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What a rate-quality model says of quality: a curve by factor, in units of the metric."""
+    """Quality by a rate-quality model: a curve by factor, in units of the metric."""
 
     metric: str
     curves: Mapping[float, RateCurve]

@@ -15,7 +15,7 @@ MEANING = (
     " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
     " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
 )
-SIZES = 3  # as many sizes of pictures are told, those seen longest
+SIZES = 3  # as many picture sizes are listed, those received longest
 
 
 def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:

@@ -1,6 +1,6 @@
 """Everything that touches GStreamer, behind the one door `runner/apply.py`.
 
-raises  MissingBindings on import, with all that does not load
+raises  MissingBindings on import, with every part that does not load
 """
 
 import ctypes

@@ -58,11 +58,11 @@ def run_lanes(
 ) -> list[Encoded]:
     """Run a sequence through all lanes, as fast as it goes.
 
-    on_frame     told each frame of the sequence before any lane has it, from one thread
-    on_picture   told each decoded picture, lane by lane from a thread of its own; it may take its time
-    on_progress  told the number of frames so far, a few times a second
+    on_frame     called with each frame of the sequence before any lane has it, from one thread
+    on_picture   called with each decoded picture, from one thread per lane; it may block
+    on_progress  called with the number of frames so far, a few times a second
     returns      by lane
-    raises       RunError with what GStreamer says; what the callbacks raise
+    raises       RunError with GStreamer's message; exceptions of the callbacks
     """
     pipeline = _parsed(lanes.line)
     run = _Run(lanes.fps)

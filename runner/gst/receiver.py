@@ -61,8 +61,8 @@ PICTURES = (
 class Receiver:
     """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream.
 
-    on_unit     told each access unit from the streaming thread
-    on_picture  told each decoded picture from the streaming thread
+    on_unit     called with each access unit, from the streaming thread
+    on_picture  called with each decoded picture, from the streaming thread
     arrivals    keep when each access unit came
     video       where what comes is kept; the plan has `video` then
     Without these no Python runs per frame.

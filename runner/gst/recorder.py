@@ -33,7 +33,7 @@ class Recorded:
 
     frames     frames kept
     seconds    from the first to the end of the last one, by their own time
-    missing    frames that this time has room for and that are not there
+    missing    frames expected in this time that are absent
     overruns   frames that found the queue before the encoder full, also beyond the end
     repeated   frames that the source sent twice to keep its rate, those of a clip not counted
     left_out   frames that the source left out to keep its rate, likewise
@@ -56,7 +56,7 @@ class Recorded:
 
 
 class Recorder:
-    """Records one camera. Everything happens in the thread of GLib's main loop, where not said otherwise.
+    """Records one camera. Everything happens in the thread of GLib's main loop, unless stated otherwise.
 
     path        file that is written; closed and complete as soon as the stage is FINISHED
     duration_s  length of the recording, s; None: until `finish`

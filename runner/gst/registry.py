@@ -118,7 +118,7 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
 
 
 def _may_change(element: Gst.Element, key: str) -> bool:
-    """Whether an element says of a property that it may change while PLAYING."""
+    """Whether an element declares a property as mutable while PLAYING."""
     return bool(int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING)
 
 
@@ -136,7 +136,7 @@ def _check_links(plan: Plan) -> list[ModelError]:
 
 @cache
 def _unlinkable(line: str) -> str | None:
-    """What GStreamer says of a line whose neighbours cannot be linked."""
+    """GStreamer's message on a line whose neighbours cannot be linked."""
     try:
         Gst.parse_launch(line)
     except GLib.Error as error:

@@ -12,7 +12,7 @@ from runner.errors import UserError
 from runner.system.files import file_problem
 
 TIMEOUT_S = 20
-# Caps of codecs that keep every sample, as far as they are told from their caps alone.
+# Caps of codecs that keep every sample, as far as their caps alone show it.
 LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", "video/x-utvideo", "image/png")
 
 

@@ -25,8 +25,8 @@ from runner.system.ports import check_port_free
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 
-OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for who asks again
-HELD_S = 5.0  # how long one that is open waits for who asks again
+OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for a later request
+HELD_S = 5.0  # how long an open one waits for a later request
 GONE_S = 5.0  # how long one that is opened again waits for the end of the pipeline before
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag by at any bitrate
 LAG_S = 1.0  # a TCP viewer that is behind by more is closed
@@ -99,7 +99,7 @@ class CameraServer:
         self._media, self._build, self._on_report = media, build, on_report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
-        self._changed = threading.Condition()  # a camera's stage; also guards all that clients' threads share
+        self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
         self._left: set[str] = set()  # cameras that a viewer has left lately
@@ -155,7 +155,7 @@ class CameraServer:
         pipeline = element.get_parent()
         pipeline.connect("deep-element-added", _on_element)
         bus = pipeline.get_bus()
-        bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
+        bus.enable_sync_message_emission()  # the library watches the bus itself and reports nothing
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
         with self._changed:

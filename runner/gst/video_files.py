@@ -24,7 +24,7 @@ class VideoFiles:
     """Where the video of the cameras is kept.
 
     directory  that of the drive; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counting the pipelines with a frame
-    on_video   told when the first frame of a file is there, from another thread: camera, name of the file from the
+    on_video   called when a file has its first frame, from another thread: camera, name of the file from the
                directory on, capture time of that frame in s since 1970
     """
 
@@ -40,7 +40,7 @@ class VideoFile:
 
     side      vehicle or operator
     captured  when a frame was captured; asked between queue and parser
-    report    told: camera, what failed
+    report    called with camera and what failed
     """
 
     def __init__(

@@ -53,7 +53,7 @@ def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     """The file's stream is found: put what its codec needs in front of the end. Nothing runs per frame here."""
     codec = pad.get_current_caps().get_structure(0).get_name().removeprefix("video/x-")
     if codec not in _PARSED or out.get_static_pad("sink").is_linked():
-        return  # whoever waits for units hears that there are none
+        return  # the waiting consumer gets no units
     parse = Gst.parse_bin_from_description(_PARSED[codec], True)
     out.get_parent().add(parse)
     parse.link(out)

@@ -20,7 +20,7 @@ class StreamViewer(NamedTuple):
 
     address   IP address that its requests come from
     operator  id of the operator that it belongs to, "" where it states none
-    since     monotonic time at which it connected, s; tells viewers from one address apart
+    since     monotonic time at which it connected, s; distinguishes viewers from one address
     """
 
     address: str

@@ -26,9 +26,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     asynchronous state changes stay in here. The frames are counted in C in front of the gate, so that a camera which is
     paused or off counts as fine.
 
-    Until the first frame nothing is replaced: errors fail the whole pipeline, and who asked for it is told.
+    Until the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
-    report  told what happened
+    report  called with what happened
     """
 
     def __init__(self, plan: Plan, report: Callable[[str], None]) -> None:

@@ -35,7 +35,7 @@ OnLinkSample = Callable[[LinkSample], None]
 
 
 class LimitedLink:
-    """A link that exists. Its rate is that of the start until `start` says when the drive begins.
+    """A link that exists. Its rate is the initial one until `start` sets the beginning of the drive.
 
     on_sample  called with each sample from a thread of the link
 
@@ -72,12 +72,12 @@ class LimitedLink:
         """Write the last line of the log; the rate stays."""
         self._stopped.set()
         if self._thread:
-            self._thread.join(STOP_S)  # who waits for an answer that never comes ends with who should give it
+            self._thread.join(STOP_S)  # a thread that waits for an answer ends with the child that should give it
 
     def _run(self, zero: float) -> None:
         try:
             self._follow(zero)
-        except Exception as error:  # kept for who checks
+        except Exception as error:  # kept for `check`
             self._failure = error
 
     def _follow(self, zero: float) -> None:

@@ -14,7 +14,7 @@ T = TypeVar("T")
 class Bucket(Generic[T]):
     """Packets wait until the bucket holds as many tokens (bytes) as they are long.
 
-    Departures are reckoned, not observed: who looks late finds every packet with the time at which it left, and a
+    Departures are reckoned, not observed: a late caller finds every packet with the time at which it left, and a
     scheduler that is late costs no rate. Times are seconds of any clock that does not go back.
     """
 

@@ -142,7 +142,7 @@ def _join(one: _End, other: _End) -> None:
 
 
 def _remove(ip: str, name: str) -> None:
-    """Remove a link and whatever still runs in it; what is not there need not be removed."""
+    """Remove a link and whatever still runs in it; missing parts are skipped."""
     _output_of(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
     for namespace in (name, _router(name)):
         try:
@@ -221,7 +221,7 @@ def _check_allowed() -> None:
 
 
 def _run(*command: str) -> str:
-    """Standard output of a command. raises RunError with what it says where it fails"""
+    """Standard output of a command. raises RunError with its error output where it fails"""
     done = _done(command)
     if done.returncode:
         said = " ".join(done.stderr.split()) or f"status {done.returncode}"

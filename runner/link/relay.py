@@ -148,7 +148,7 @@ class RelayedConnection:
             self._loop.bucket.put(size, partial(self._send, other, unit), now, keep=True)
 
     def _end(self, sock: socket.socket) -> None:
-        """One end has said its last: whatever it said still passes."""
+        """One end has closed: data that it sent before still passes."""
         if sock is not self._limited:
             self.close()
             return

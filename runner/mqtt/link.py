@@ -93,7 +93,7 @@ class ControlLink:
             self._send(topic, message)
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
-        """Disconnect; with messages to send before, as the will would have said it."""
+        """Disconnect; with messages to send before, as the last will would state them."""
         self._closing.set()
         for topic, message in goodbye if self._listening.is_set() else ():
             with suppress(ValueError, RuntimeError):  # the connection is lost just now

@@ -9,8 +9,8 @@ Topics of a vehicle, below tod/<vehicle>/:
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
-Last wills say that a side is gone: the vehicle's state says {"online": false}, the operator's request says
-operator_disconnected. schemas/control.schema.json has what the vehicle sends.
+Last wills announce that a side is offline: the vehicle's state is {"online": false}, the operator's request is
+operator_disconnected. schemas/control.schema.json describes the vehicle's messages.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class MqttMessage(NamedTuple):
 
 
 def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, Any]:
-    """A mapping, as JSON from somebody who may send anything.
+    """A mapping, from untrusted JSON.
 
-    raises  ValueError that says what is wrong
+    raises  ValueError with the problem
     """
     if len(payload) > limit:
         raise ValueError(f"{len(payload)} bytes: must be at most {limit}")
@@ -72,7 +72,7 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
 
 
 def read_state(payload: bytes) -> VehicleState | None:
-    """A vehicle's state; None: it is offline. Like the three below, raises ValueError that says what is wrong."""
+    """A vehicle's state; None: it is offline. Like the three below, raises ValueError with the problem."""
     document = _checked("state", payload)
     return from_json(VehicleState, document) if document["online"] else None
 

@@ -84,7 +84,7 @@ def live_frames(
 
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
-    report     told camera and what happened to it
+    report     called with camera and what happened to it
     raises     ConfigError, UserError for an unknown camera
     """
     from runner import apply

@@ -1,4 +1,4 @@
-"""What the operator's side knows: what the vehicle says and what comes of each camera. Feeds table and page."""
+"""The state of the operator's side: the vehicle's messages and the reception of each camera. Feeds table and page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Listener:
 
 
 class CameraRow(NamedTuple):
-    """One camera: its rates and counters, and what the vehicle says of it, if anything."""
+    """One camera: its rates and counters, and the vehicle's state of it, if known."""
 
     name: str
     rates: MeasuredRates

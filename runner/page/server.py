@@ -32,7 +32,7 @@ from runner.system.ports import check_port_free
 
 STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that stands for so long is marked within 150 ms
-NOTES = 50  # told to a page that opens
+NOTES = 50  # sent to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
 SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here and not megabytes later
 START_S = 10.0  # the port is known to be free: only a machine that stands still takes longer
@@ -49,7 +49,7 @@ POLICY = (
 
 
 class PageServer(Listener):
-    """The page and everybody who looks at it.
+    """The page and its viewers.
 
     A listener of the station; it and `show` may be called from any thread, everything else happens in the page's own.
 
@@ -191,7 +191,7 @@ class PageServer(Listener):
         return ws
 
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer) -> None:
-        """What a viewer says, until it leaves.
+        """The messages of a viewer, until it disconnects.
 
         raises  TimeoutError for one that makes no progress: pings go the way of the video, and answers come back
         """
@@ -289,12 +289,12 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
             else:
                 await ws.send_bytes(message)
     except ConnectionError:
-        pass  # who reads the socket ends it
+        pass  # the reader of the socket ends it
 
 
 async def _ping(ws: web.WebSocketResponse) -> None:
     """Ask a viewer to say something now and then."""
-    with suppress(ConnectionError):  # who reads the socket ends it
+    with suppress(ConnectionError):  # the reader of the socket ends it
         while True:
             await asyncio.sleep(PING_S)
             await ws.ping()

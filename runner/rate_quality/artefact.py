@@ -118,7 +118,7 @@ def to_yaml(measured: Measured) -> str:
 def read_model(path: Path) -> dict[str, Any]:
     """A model file.
 
-    raises  UserError that says what is wrong with it
+    raises  UserError with its first problem
     """
     from runner import schema
 

@@ -206,7 +206,7 @@ def _points(
 
 
 def _rising(on_progress: Callable[[float], None], begun: float, part: float) -> Callable[[float], None]:
-    """Tells how much of the whole is done, from how much of a part is; the end is told by who knows that it is."""
+    """A callback that converts progress of a part to progress of the whole; the caller reports the end."""
     return lambda share: on_progress(min(0.99, begun + part * share))
 
 

@@ -64,7 +64,7 @@ def decoding(path: str, fps: Fraction) -> str:
 def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
     """Look a clip through.
 
-    say     told, in a line, that this takes a while
+    say     called with a line: this takes a while
     raises  UserError where it cannot be used
     """
     from runner.apply import discover

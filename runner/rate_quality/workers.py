@@ -17,7 +17,7 @@ from runner.system.bound import die_with
 P = ParamSpec("P")
 T = TypeVar("T")
 
-SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is not there
+SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is offline
 
 
 def parallel_tasks(wanted: int | None) -> int:
@@ -41,7 +41,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
     if workers == "threads":
         pool = ThreadPoolExecutor(parallel)
     else:
-        # Idle workers wait for ever for a process that was killed.
+        # Idle workers would wait forever for a process that was killed.
         pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
     try:
         yield pool
@@ -104,7 +104,7 @@ def without_cycle_collection(function: Callable[P, T], /, *args: P.args, **kwarg
 
     A Dask worker looks at the frames of its threads every few milliseconds. Where cycles are collected just then and a
     thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them, wait
-    for themselves for ever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
+    for themselves forever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
     as few cycles, however many frames they see.
     """
     with _collector:

@@ -1,6 +1,6 @@
 """The street of the synthetic drive: its course, its textures, and the upright faces along it.
 
-The course is one lap of a street that goes on for ever, each lap shifted by `period_m` in x: that closes the loop
+The course is one lap of an endless street, each lap shifted by `period_m` in x: that closes the loop
 without the full turn of a ring road, where every camera would pan most of the time and a forward one would see nearly
 as much motion as one that looks aside.
 Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.

@@ -61,7 +61,7 @@ class VerbProcess:
 
     name    for people
     before  comes before its command line
-    said    file that takes its standard error; None: it goes where this process's goes
+    stderr  file that takes its standard error; None: it goes where this process's goes
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class VerbProcess:
         return self.process.poll()
 
     def check(self) -> None:
-        """raises RunError where it has ended, with what it has said"""
+        """raises RunError where it has ended, with its error output"""
         status = self.poll()
         if status is None:
             return

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 STUCK_S = 2.0  # a loop that finishes nothing for so long is stuck
 WATCH_S = 0.25  # how often that is looked at
 END_S = 5.0  # a loop that does not end within this is left behind
-NAME_CHECK_S = 0.5  # a vehicle sends telemetry five times a second; who hears none of this name by then has it
+NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none of this name came by then, the name is free
 CONSOLE_LINES = 1000
 TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
 

@@ -1,6 +1,6 @@
 """Which operators are present, and whether a request is too old to be carried out. Pure: time is given.
 
-An operator is whoever sends requests under an id of its own, which is part of the topic. It is present from its
+An operator is a client that sends requests under an id of its own, which is part of the topic. It is present from its
 `operator_connected` on. It leaves by its own silence or its own `operator_disconnected`; any later message of its own
 brings it back.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
 
-SILENT_S = 1.0  # an operator who sends nothing for so long has left; a present one sends four messages a second
+SILENT_S = 1.0  # an operator that sends nothing for so long is offline; a present one sends four messages a second
 AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks that drift apart
 DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
 MOST = 64  # operators remembered; the one that has been silent longest is forgotten for a new one
@@ -43,7 +43,7 @@ class Operators:
 
     @property
     def in_control(self) -> str:
-        """The operator who has been present longest without a break, "" for none."""
+        """The operator that has been present longest without a break, "" for none."""
         present = {name: operator.since for name, operator in self._known.items() if operator.present}
         return min(present, key=lambda name: present[name], default="")
 
@@ -63,7 +63,7 @@ class Operators:
         return returns
 
     def disconnected(self, name: str) -> bool:
-        """An operator says goodbye, or its last will does; returns whether it was present."""
+        """An operator disconnects, itself or by its last will; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
@@ -71,7 +71,7 @@ class Operators:
         return was_present
 
     def silent(self, t: float) -> list[str]:
-        """Operators who have been silent for too long since the last call; they count as away now."""
+        """Operators that have been silent for too long since the last call; they count as offline now."""
         gone = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
         for name in gone:
             self._known[name].present = False

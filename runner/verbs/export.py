@@ -1,7 +1,7 @@
 """usage: tod-runner export DRIVE [output=FILE.mcap]
 
 A drive as MCAP, for Foxglove and every other reader of MCAP. DRIVE is a directory that log=DIR wrote; whatever of it is
-there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= says otherwise.
+there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= names another file.
 
   /position               foxglove.LocationFix
   /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)

@@ -1,8 +1,8 @@
 """usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
-standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json says what an
-event is. A line that is no event ends the run with its number; what was put out before stays. An event that cannot be
+standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
+events. An invalid line ends the run with its number; earlier output stays. An event that cannot be
 accepted is answered with "accepted": false and the reason, and the run goes on.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with the configuration that it was driven with:
@@ -155,7 +155,7 @@ class _Answers:
 
 
 def events(lines: Iterable[str], name: str) -> Iterator[InputEvent]:
-    """Events of a JSON Lines text, each with the JSON it came from. What else a drive's file says is passed over.
+    """Events of a JSON Lines text, each with the JSON it came from. Other lines of a drive log are skipped.
 
     raises  UserError with the number of the line
     """

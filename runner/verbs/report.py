@@ -138,7 +138,7 @@ def _measured(
 
 
 def labels(drives: Sequence[Drive]) -> list[str]:
-    """Short names that tell drives apart: the directory's, more of its path where two are called the same."""
+    """Short names that distinguish drives: the directory's, more of its path where two are called the same."""
     paths = [drive.path.resolve() for drive in drives]
     found: list[str] = []
     for number, path in enumerate(paths):

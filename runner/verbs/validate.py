@@ -64,7 +64,7 @@ class ExperimentRun(NamedTuple):
     words: tuple[str, ...]
 
     def attributed(self, problem: Problem) -> Problem:
-        """A problem of the command line, told of the run if that has the word."""
+        """A problem of the command line, attributed to the run if that has the word."""
         word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
         if problem.file != COMMAND_LINE or word is None:
             return problem
@@ -171,7 +171,7 @@ def _is_yaml(name: str) -> bool:
 
 
 def check_file(path: Path, relative: Path) -> Iterator[Problem]:
-    """Problems of one file. The folder says which schema it follows."""
+    """Problems of one file. The folder determines its schema."""
     name, group = label(path), "/".join(relative.parts[:-1])
     if rule := _misplaced(group, relative):
         yield Problem(name, "", None, rule)

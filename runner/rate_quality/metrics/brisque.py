@@ -58,7 +58,7 @@ def metric(model: Path | None, ranges: Path | None) -> Metric:
 
 
 def meter(regression: Regression, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
-    """Meter of one lane. There is never a mask: the metric says so."""
+    """Meter of one lane. It supports no mask, as the metric states."""
     return FrameMeter(size, lambda _, picture: score(picture, regression))
 
 

@@ -1,4 +1,4 @@
-"""What a metric of picture quality is, and who scores the pictures of a lane."""
+"""What a metric of picture quality is, and the meter that scores the pictures of a lane."""
 
 from __future__ import annotations
 

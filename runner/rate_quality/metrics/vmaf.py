@@ -64,7 +64,7 @@ def metric(model: str) -> Metric:
 
 
 def meter(tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
-    """Meter of one lane. There is never a mask: the metric says so."""
+    """Meter of one lane. It supports no mask, as the metric states."""
     return VmafMeter(tool, model, size, fps, stride)
 
 
@@ -189,7 +189,7 @@ def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format:
 class VmafMeter:
     """Pictures to a process, scores from its log.
 
-    No call waits for ever: whichever pipe has room is written to, the end of the process is seen at once, and one
+    No call waits forever: whichever pipe has room is written to, the end of the process is seen at once, and one
     that stands still is given up after `PATIENCE_S`.
     """
 
@@ -269,7 +269,7 @@ class VmafMeter:
 
     def close(self) -> dict[int, float]:
         if self._scores is None:
-            self._scores = {}  # a failure is told once
+            self._scores = {}  # a failure is raised once
             try:
                 if self._frames and self._sound:
                     self._scores = self._finish()
@@ -287,7 +287,7 @@ class VmafMeter:
         return {self._frames[number]: score for number, score in scores.by_picture.items()}
 
     def _wait(self) -> int:
-        """Exit status of the process, which has been told to end or is about to."""
+        """Exit status of the process, which was asked to end or is about to."""
         try:
             return self._process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
