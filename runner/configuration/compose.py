@@ -142,7 +142,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
 
     from runner.configuration.hydra_files import search
 
-    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
+    # OmegaConf's own resolver for environment variables is not part of this language: a file alone defines its values.
     OmegaConf.clear_resolver("oc.env")
     search(directories)
     root = find_file(directories, "", "config")
@@ -221,7 +221,7 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
     """The files behind a composition, in the order in which Hydra merged them."""
     root = find_file(directories, "", "config")
     yield Part(label(root), (), load_file(root), root)
-    # Mounted files first: a vehicle file says last what belongs to the place. An experiment has the last word.
+    # Mounted files first: a vehicle file comes last for values of the place. An experiment overrides all others.
     for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
         group, _, package = key.partition("@")
         if group.startswith("hydra") or group not in GROUPS or name == "None":

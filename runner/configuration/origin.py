@@ -74,7 +74,7 @@ class Composed:
         return self.parts.index(self._origin(path))
 
     def _origin(self, path: schema.Path) -> Part:
-        """The part that has the value; for what is missing, the one that says most about its surroundings."""
+        """The part that has the value; for what is missing, the one that states most of its surroundings."""
         inside = [part for part in self._visible(path) if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
             makers = [part for part in inside if len(part.package) == length]

@@ -176,7 +176,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["total"], gives=["total"], reads=["prediction"])
 def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """The total is at most what the prediction says the bitrate will hardly fall below, where it says so."""
+    """The total is at most the lower bound of the prediction, where it states one."""
     lower = None if state.prediction is None else state.prediction.lower_kbps
     assert draft.total is not None
     if lower is None or lower >= draft.total:

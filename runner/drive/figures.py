@@ -29,7 +29,7 @@ Drives = Sequence[DriveStatistics]
 
 
 class Axis(NamedTuple):
-    """marks: the values that are numbered; none leaves the choice to whoever draws."""
+    """marks: the values that are numbered; none leaves the choice to the renderer."""
 
     title: str
     low: float
@@ -230,7 +230,7 @@ def latency(drives: Drives) -> Rows | str:
 
 
 def quality(drives: Drives) -> Rows | str:
-    """Quality of each camera as its rate-quality model says."""
+    """Quality of each camera by its rate-quality model."""
     metrics = sorted({each.quality.metric for drive in drives for each in drive.cameras.values() if each.quality})
     if not metrics:
         return "no rate-quality models were found"

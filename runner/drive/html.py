@@ -113,7 +113,7 @@ def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
 
 
 def _once(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Each text once, with the labels of what it is said of."""
+    """Each text once, with the labels of its drives."""
     found: dict[str, list[str]] = {}
     for text, label in notes:
         found.setdefault(text, []).append(label)

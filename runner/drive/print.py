@@ -233,7 +233,7 @@ def _wrapped(label: str, columns: int) -> str:
 
 
 def _legend(axes: Axes, curves: Iterable[Curve], columns: int) -> None:
-    """One legend under a column of charts, for all that is drawn in it."""
+    """One legend under a column of charts, for all its curves."""
     handles = [_handle(curve, _wrapped(curve.label, columns)) for curve in curves]
     assert axes.figure is not None
     down = axes.transAxes + ScaledTranslation(0, -LEGEND_IN, axes.figure.dpi_scale_trans)

@@ -223,7 +223,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
 
 
 def _arrivals_logged(received: ReceivedSeries) -> bool:
-    """An operator who logged frames but no arrivals kept none of them."""
+    """An operator that logged frames but no arrivals kept none of them."""
     return bool(received.arrival_t.size) or not received.frames[-1]
 
 

@@ -158,7 +158,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     sample = sink.emit("pull-sample")
     buffer = sample.get_buffer()
     running_ns = sample.get_segment().to_running_time(Gst.Format.TIME, buffer.pts)
-    # An encoder may leave out frames; which one this is, its time says.
+    # An encoder may leave out frames; its time identifies it.
     number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
     result.frames += 1
     run.moved = time.monotonic()

@@ -31,7 +31,7 @@ class _Loop:
 
     def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
         self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
-        self._begins = True  # the next segment is a round, and not one that is told again with another offset
+        self._begins = True  # the next segment is a round, and not one repeated with another offset
         self._round: tuple[int, int] | None = None  # where this round began: running time in ns, frames before it
         self._sought = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
@@ -70,7 +70,7 @@ class _Loop:
         identity = self._identity()
         if identity is None:
             return
-        base -= self._pad.get_offset()  # as the demuxer says it
+        base -= self._pad.get_offset()  # as the demuxer states it
         frames = identity.get_property("stats").get_value("num-buffers")
         if self._round:
             began, before = self._round

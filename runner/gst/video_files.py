@@ -126,7 +126,7 @@ def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
 
 
 def _new_file(directory: Path, camera: str, side: str) -> Path:
-    """An empty file that was not there before.
+    """An empty file that did not exist before.
 
     raises  OSError
     """
@@ -149,7 +149,7 @@ def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     """
     query = info.get_query()
     if query.type == Gst.QueryType.CAPS:
-        return Gst.PadProbeReturn.DROP  # who hears no answer takes it that anything goes
+        return Gst.PadProbeReturn.DROP  # without an answer the element assumes no limit
     if query.type == Gst.QueryType.LATENCY:
         query.set_latency(False, 0, Gst.CLOCK_TIME_NONE)
         return Gst.PadProbeReturn.HANDLED

@@ -2,7 +2,7 @@
 
 A viewer on the vehicle itself (loopback) costs no uplink; it is always let in and never counted. The controller, the
 operator in control, is always let in. RTSP carries no operator of its own, so an operator's RTSP client states it as
-its User-Agent (RFC 2326, 12.41), which survives address translation and tells operators on one machine apart. It is a
+its User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
 name and no proof; nothing on either link is authenticated yet.
 """
 

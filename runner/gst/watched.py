@@ -1,4 +1,4 @@
-"""A camera's source that is watched: where it freezes or fails, it is replaced while all that follows it goes on."""
+"""A camera's watched source: where it freezes or fails, it is replaced while the rest of the pipeline continues."""
 
 from __future__ import annotations
 

@@ -324,7 +324,7 @@ def serve_control(loop: EventLoop, broker: SocketAddress, near: socket.socket, _
 
 
 def _connected(address: SocketAddress) -> socket.socket | None:
-    """None where nobody listens: whoever wants that sees its own connection end, and tries again."""
+    """None where nobody listens: the client then sees its own connection end, and tries again."""
     sock = socket.socket()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
     sock.settimeout(WAIT_S)

@@ -23,7 +23,7 @@ from runner.rate_quality.curves import (
     reaches,
 )
 
-FEW_FRAMES = 40  # scored ones, below which a mean says little
+FEW_FRAMES = 40  # scored ones, below which a mean is uncertain
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,7 +226,7 @@ def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
 
 
 def _write(measured: Measured, output: Path, sweeps: Sequence[Sweep]) -> str:
-    """Write all files of a model; the line that says so."""
+    """Write all files of a model; returns the line that reports them."""
     from runner.rate_quality.plots import plot
 
     write_whole(output / f"{measured.name}.model.json", dumps(to_json(measured)))
