@@ -162,6 +162,6 @@ def to_json(event: Event) -> dict[str, Any]:
 
 def describe(event: Event) -> str:
     """An event in one line: its name, keys and values."""
-    said = to_json(event)
-    words = (f"{key} {value}" for key, value in said.items() if key not in ("t", "event"))
-    return " ".join((said["event"], *words))
+    document = to_json(event)
+    words = (f"{key} {value}" for key, value in document.items() if key not in ("t", "event"))
+    return " ".join((document["event"], *words))

@@ -107,8 +107,8 @@ def _shown(figures: Sequence[Figure]) -> list[Figure]:
 def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
     """Notes of the drives, each note once."""
     noted = _once((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
-    told = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
-    items = "".join(f"<li>{escape(each)}</li>" for each in (*told, *left_out))
+    notes = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
+    items = "".join(f"<li>{escape(each)}</li>" for each in (*notes, *left_out))
     return f'<ul class="warnings" aria-label="Notes">{items}</ul>' if items else ""
 
 
@@ -197,8 +197,8 @@ def _reasons(drive: DriveStatistics, of: str) -> str:
     """The last changes and why; and what was noted."""
     last = drive.series.reasons[-LAST_REASONS:]
     rows = [(f"{each.t:.1f}", each.camera, each.reason, each.cause) for each in reversed(last)]
-    told = f"the last {len(rows)} of {len(drive.series.reasons)} changes of factor or sending, newest first"
-    parts = [f'<p class="muted">{told}</p>', _table("Decisions", (("s", "camera", "why", "after"), rows), " tall")]
+    caption = f"the last {len(rows)} of {len(drive.series.reasons)} changes of factor or sending, newest first"
+    parts = [f'<p class="muted">{caption}</p>', _table("Decisions", (("s", "camera", "why", "after"), rows), " tall")]
     if drive.series.notes:
         notes = [(f"{t:.1f}", text) for t, text in reversed(drive.series.notes[-LAST_REASONS:])]
         parts.append(_table("Notes", (("s", "note"), notes), " tall"))

@@ -94,8 +94,8 @@ class _Tbf:
             tbf = f"tbf rate {round(1000 * kbps)}bit burst {size} limit {most}"
             lines.insert(0, f"qdisc {verb} dev {OUT} {self._parent} handle 2: {tbf}")
             self._kbps = kbps
-        said = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
-        return LinkCounters(8 * said["backlog"] / kbps, said["bytes"], said["packets"], said["drops"])
+        counts = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
+        return LinkCounters(8 * counts["backlog"] / kbps, counts["bytes"], counts["packets"], counts["drops"])
 
 
 def _delay(tc: str, name: str, delay_ms: float) -> None:
@@ -224,8 +224,8 @@ def _run(*command: str) -> str:
     """Standard output of a command. raises RunError with its error output where it fails"""
     done = _done(command)
     if done.returncode:
-        said = " ".join(done.stderr.split()) or f"status {done.returncode}"
-        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {said}; {OTHERWISE[3:]}")
+        message = " ".join(done.stderr.split()) or f"status {done.returncode}"
+        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {message}; {OTHERWISE[3:]}")
     return done.stdout
 
 

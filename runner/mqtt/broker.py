@@ -63,8 +63,8 @@ class Broker:
         """raises RunError where the broker has ended"""
         status = self._process.poll()
         if status is not None:
-            said = "; ".join(filter(None, (children.ending(status), self._last_line())))
-            raise RunError(f"the MQTT broker on {self._where} ended: {said}")
+            message = "; ".join(filter(None, (children.ending(status), self._last_line())))
+            raise RunError(f"the MQTT broker on {self._where} ended: {message}")
 
     def wait_until_it_answers(self) -> None:
         """raises RunError where it does not within `START_S`"""
@@ -76,8 +76,8 @@ class Broker:
                 if probe.connect_ex(self._address) == 0 and self._process.poll() is None:
                     return
             time.sleep(0.02)
-        said = self._last_line() if self._process.poll() is not None else "it does not answer"
-        raise RunError(f"mosquitto does not start on {self._where}: {said}; choose another control.port")
+        message = self._last_line() if self._process.poll() is not None else "it does not answer"
+        raise RunError(f"mosquitto does not start on {self._where}: {message}; choose another control.port")
 
     def end(self) -> None:
         self._process.terminate()

@@ -39,8 +39,8 @@ def run(arguments: Arguments) -> int:
         seen += len(drive.actual.t)
     if not samples:
         rule = "no packet was lost and no frame was late: the received bitrate does not show the link's capacity"
-        told = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
-        raise RunError(f"no map: {'; '.join([*without, *told])}")
+        reasons = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
+        raise RunError(f"no map: {'; '.join([*without, *reasons])}")
     squares = cells(samples, percentile, cell_m)
     _write(output, squares)
     left_out = f"; left out: {'; '.join(without)}" if without else ""

@@ -65,8 +65,8 @@ def report(
         held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
         made, left_out = figures(drives)
         write_figures(made, output, progress)
-        told = document.to_json(drives, held, [figure.name for figure in made], left_out)
-        write_whole(output / DOCUMENT, dumps(told))
+        summary = document.to_json(drives, held, [figure.name for figure in made], left_out)
+        write_whole(output / DOCUMENT, dumps(summary))
         index = output / "index.html"
         write_whole(index, page(drives, held, made, left_out).encode())
     show(drives, held, left_out)

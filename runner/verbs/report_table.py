@@ -22,15 +22,15 @@ def show(
     console = Console(width=None if sys.stdout.isatty() else 190)
     for drive in drives:
         console.print(_table(drive.series.label, *camera_rows(drive)))
-        for told in (*drive.series.warnings, *drive.notes):
-            console.print(f"{drive.series.label}: {told}", markup=False, highlight=False)
+        for note in (*drive.series.warnings, *drive.notes):
+            console.print(f"{drive.series.label}: {note}", markup=False, highlight=False)
     if len(drives) > 1:
         console.print(_table("all drives", *drive_rows(drives)))
     for label, held in checks.items():
         rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
         console.print(_table(f"{label}: claims of the paper and results", ("claim", "result", "holds"), rows))
-    for told in left_out:
-        console.print(told, markup=False, highlight=False)
+    for note in left_out:
+        console.print(note, markup=False, highlight=False)
 
 
 def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

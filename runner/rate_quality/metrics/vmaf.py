@@ -163,8 +163,8 @@ def read_log(directory: Path, status: int) -> Scores:
 
 def complaint(directory: Path, status: int) -> RunError:
     """An end of ffmpeg that should not be, with its first words: the last ones name no cause."""
-    said = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
-    why = re.sub(r"^\[[^]]*\] ", "", said[0]) if said else f"status {status}"
+    lines = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
+    why = re.sub(r"^\[[^]]*\] ", "", lines[0]) if lines else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
 
 
