@@ -12,8 +12,8 @@ import time
 
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
-from runner.mqtt.link import Link
-from runner.mqtt.messages import OFFLINE, OPERATOR_GONE, Message, topic
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import OFFLINE, OPERATOR_GONE, MqttMessage, topic
 from runner.operator.meter import middle, percentile
 
 ROUNDS = 1000
@@ -27,11 +27,11 @@ def main() -> None:
     with private_broker(broker):
         state, request, reply = (topic("bench", *parts) for parts in (("state",), ("request", "op"), ("reply", "op")))
 
-        def answer(asked: Message) -> None:
+        def answer(asked: MqttMessage) -> None:
             vehicle.publish(reply, {"id": json.loads(asked.payload)["id"], "result": "applied", "reason": ""})
 
-        vehicle = Link(broker, (state, OFFLINE), {request: answer}, lambda here: None, print)
-        operator = Link(
+        vehicle = ControlLink(broker, (state, OFFLINE), {request: answer}, lambda here: None, print)
+        operator = ControlLink(
             broker, (request, OPERATOR_GONE), {reply: lambda m: answers.put(m.payload)}, lambda here: None, print
         )
         for link in (vehicle, operator):

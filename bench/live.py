@@ -183,19 +183,19 @@ def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
 def _recorded() -> Iterator[list[float]]:
     """Times at which knobs were set, from now on."""
     times: list[float] = []
-    plain = knobs.Knobs._set_waiting
+    plain = knobs.KnobPanel._set_waiting
 
-    def timed(self: knobs.Knobs) -> None:
+    def timed(self: knobs.KnobPanel) -> None:
         waiting = bool(self._waiting)
         plain(self)
         if waiting:
             times.append(time.perf_counter())
 
-    knobs.Knobs._set_waiting = timed
+    knobs.KnobPanel._set_waiting = timed
     try:
         yield times
     finally:
-        knobs.Knobs._set_waiting = plain
+        knobs.KnobPanel._set_waiting = plain
 
 
 def _until(done: Any, seconds: float = 10) -> None:

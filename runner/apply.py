@@ -18,12 +18,12 @@ from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.aside import settle
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.receiver import OnPicture, OnUnit, Received, Receiver
+from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
-from runner.gst.server import CameraServer
+from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
-from runner.gst.video_files import VideoFile, VideoFiles, born
+from runner.gst.video_files import VideoFile, VideoFiles, captured_at
 from runner.gst.watched import WatchedSource
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ __all__ = [
     "TYPELIBS",
     "OnUnit",
     "OperatorSide",
-    "Received",
+    "Reception",
     "Recorded",
     "RecordingSide",
     "Stage",
@@ -58,7 +58,6 @@ __all__ = [
     "write_clip",
 ]
 
-Report = Callable[[str, str], None]  # camera, what happened to it
 CALL_S = 10.0  # what GLib's thread is asked to do takes milliseconds; after so long it hangs
 STOP_S = 2.0  # how long the end waits for pipelines to stop
 
@@ -66,12 +65,12 @@ STOP_S = 2.0  # how long the end waits for pipelines to stop
 def check_machine(plans: Sequence[Plan]) -> None:
     """Whether every plugin is installed and every source opens: files, devices.
 
-    raises  RunError that says what to do, for all cameras at once
+    raises  RunError with the remedy, for all cameras at once
     """
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
     if missing:
         raise RunError("\n".join(missing))
-    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _opening_fails(plan))]
+    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _source_problem(plan))]
     if refused:
         raise RunError("\n".join(refused))
 
@@ -79,19 +78,19 @@ def check_machine(plans: Sequence[Plan]) -> None:
 def check_recorders(plans: Sequence[Plan]) -> None:
     """Whether every plugin that recording needs is installed.
 
-    raises  RunError that says what to install, for all cameras at once
+    raises  RunError with the packages to install, for all cameras at once
     """
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_recorders(plan))
     if missing:
         raise RunError("\n".join(missing))
 
 
-def _opening_fails(plan: Plan) -> str:
-    """What GStreamer says when the source is opened, or "". Devices are opened on the way to READY."""
+def _source_problem(plan: Plan) -> str | None:
+    """GStreamer's error when the source is opened; None if it opens. Devices are opened on the way to READY."""
     pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
     try:
         if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
-            return ""
+            return None
         message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
         return str(message.parse_error()[0].message) if message else "its source does not start"
     finally:
@@ -145,7 +144,7 @@ class _Glib:
 def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
     """The plans as they are built: with a file each, where video is kept.
 
-    raises  RunError that says what to install
+    raises  RunError with the packages to install
     """
     if video is None:
         return plans
@@ -158,27 +157,29 @@ def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
 class VehicleSide:
     """All cameras of the vehicle, streaming. Keeps where each knob is wanted, and writes it all again after a rebuild.
 
-    report  told, from another thread, when a camera's pipeline comes, goes or fails
+    on_report  called, from another thread, when a camera's pipeline starts, stops or fails
     video   where what is sent is kept; None: nowhere
     raises  RunError where the port is in use, or what `video` needs is not installed
 
     `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, report: Report, video: VideoFiles | None = None) -> None:
-        self._report, self._video = report, video
+    def __init__(
+        self, plans: Sequence[Plan], media: Media, on_report: OnReport, video: VideoFiles | None = None
+    ) -> None:
+        self._on_report, self._video = on_report, video
         plans = _kept(plans, video)
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
         self._server: CameraServer | None = None
-        self._callers = {p.camera.name: CameraCaller(p, self._build, report) for p in plans if not p.serves}
+        self._callers = {p.camera.name: CameraCaller(p, self._build, on_report) for p in plans if not p.serves}
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, report)
+                self._server = CameraServer(served, media, self._build, on_report)
             for caller in self._callers.values():
                 caller.start()
 
@@ -204,7 +205,7 @@ class VehicleSide:
     def push(self, camera: str, frame: Any) -> bool:
         """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle`."""
         if camera not in self._wanted:
-            raise ValueError(f"camera {camera!r}: no such camera, {suggest(camera, self._wanted)}")
+            raise ValueError(f"camera {camera!r}: no such camera{suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 
@@ -218,13 +219,13 @@ class VehicleSide:
 
     def faults(self) -> list[str]:
         """What elements refused since the last call; each is a defect or a wrong graph."""
-        told = []
+        faults = []
         for name in self._wanted:
             pipeline = self._pipeline(name)
             if pipeline:
-                told += pipeline.knobs.faults
+                faults += pipeline.knobs.faults
                 pipeline.knobs.faults.clear()
-        return told
+        return faults
 
     def sources(self) -> dict[str, str]:
         """By camera, what is wrong with a source that has failed and is being replaced; the others are left out."""
@@ -245,10 +246,10 @@ class VehicleSide:
         name = plan.camera.name
         source = None
         if plan.frozen_s is not None:
-            source = WatchedSource(plan, lambda what: self._report(name, what))
+            source = WatchedSource(plan, lambda what: self._on_report(name, what))
             source.take_place(pipeline, plan)
         if self._video:
-            VideoFile(self._video, name, "vehicle", born, self._report).follow(pipeline)
+            VideoFile(self._video, name, "vehicle", captured_at, self._on_report).follow(pipeline)
         return CameraPipeline(pipeline, plan, self._wanted_of(name), self._turned, source)
 
     def _turned(self) -> None:
@@ -267,9 +268,9 @@ class VehicleSide:
 class OperatorSide:
     """All cameras of the vehicle, received and decoded.
 
-    report      told, from another thread, what happens to which cameras
-    on_unit     told, from the camera's streaming thread, each access unit that comes
-    on_picture  told, from the camera's streaming thread, each decoded picture
+    on_report   called, from another thread, with cameras and what happened to them
+    on_unit     called, from the camera's streaming thread, with each access unit received
+    on_picture  called, from the camera's streaming thread, with each decoded picture
     arrivals    keep when each access unit came, for the samples
     video       where what is received is kept; None: nowhere
     operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
@@ -280,7 +281,7 @@ class OperatorSide:
     def __init__(
         self,
         plans: Sequence[Plan],
-        report: Report,
+        on_report: OnReport,
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
@@ -289,7 +290,7 @@ class OperatorSide:
     ) -> None:
         plans = _kept(plans, video)
         self._glib = _Glib()
-        self._gathered = gathered = Gathered(report)
+        self._gathered = gathered = Gathered(on_report)
         self._receivers = {
             plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator) for plan in plans
         }
@@ -300,14 +301,14 @@ class OperatorSide:
 
         self._glib.call("starting the receivers", start)
 
-    def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
+    def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
         """What has come of each camera; to be called a few times a second.
 
         sending  which cameras should send; one that should and is silent is built anew. Those of which nobody knows are
                  left out
         raises   RunError where GStreamer hangs
         """
-        samples: dict[str, Received] = {}
+        samples: dict[str, Reception] = {}
 
         def sample() -> None:
             for name, receiver in self._receivers.items():

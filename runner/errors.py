@@ -12,7 +12,7 @@ from runner.redact import redacted
 class Problem:
     """One mistake of the user: where, what was found, which rule it breaks.
 
-    found  None where the path says it already
+    found  None where the path already shows it
     """
 
     file: str
@@ -42,7 +42,7 @@ class ConfigError(UserError):
 
 
 class RunError(Exception):
-    """A run failed on this machine: exit status 1. The text says what to do."""
+    """A run failed on this machine: exit status 1. The text gives the remedy."""
 
     def __init__(self, text: str) -> None:
         super().__init__(redacted(text))

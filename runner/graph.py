@@ -333,7 +333,7 @@ def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
         return value
     for name in PLACEHOLDER.findall(value):
         if name not in values:
-            raise ModelError(where, repr(value), f"nothing fills {{{name}}}, {suggest(name, values)}")
+            raise ModelError(where, repr(value), f"nothing fills {{{name}}}{suggest(name, values)}")
     whole = PLACEHOLDER.fullmatch(value)
     if whole:
         return values[whole[1]]  # keeps its type

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from runner.core.commands import Command, Knobs
+from runner.core.commands import Command, KnobValues
 from runner.core.decision import Decision, Setting
 from runner.core.events import PositionReported
 from runner.core.model import Mode, Roi, plain
@@ -178,7 +178,7 @@ class Reply(Outcome):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the configurations of both sides must agree on, by path; `run` tells vehicles of one name apart."""
+    """What the configurations of both sides must agree on, by path; `run` distinguishes vehicles of one name."""
 
     run: str
     settings: Mapping[str, Any]
@@ -219,7 +219,7 @@ class Sample:
     """What the operator's side measures a few times a second.
 
     dropped         messages of the control link that were none
-    clock_ahead_ms  by how much the vehicle's clock is ahead at least; None: nothing tells so
+    clock_ahead_ms  by how much the vehicle's clock is ahead at least; None: not detected
     """
 
     t: float
@@ -306,7 +306,7 @@ Record = (
     | LinesDropped
     | Ended
 )
-KINDS: dict[type[Any], str] = {  # what a line's key `log` says
+KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     Began: "began",
     DecisionMade: "decision",
     Telemetry: "telemetry",
@@ -359,7 +359,7 @@ def line_from_json(document: Mapping[str, Any]) -> Record:
 _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if kind is not Offline}
 
 
-def applied_to_json(camera: str, knobs: Knobs) -> Applied:
+def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
     """Where a camera's knobs are, by name."""
     return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
 

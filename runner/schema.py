@@ -40,7 +40,7 @@ _PATTERNS = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What breaks a rule, and where in the document; `found` is None where the path says it already."""
+    """What breaks a rule, and where in the document; `found` is None where the path already shows it."""
 
     path: Path
     found: str | None
@@ -58,7 +58,7 @@ def findings(document: Any, schema: str) -> list[Finding]:
 
     schema  name of a file in schemas/ without its ending
     """
-    odd = list(_oddities(document, ()))
+    odd = list(_unrepresentable(document, ()))
     seen = {f.path for f in odd}
     errors = sorted(validator(schema).iter_errors(document), key=lambda e: [str(part) for part in e.absolute_path])
     found = [f for f in _explained(errors) if not any(f.path[: len(path)] == path for path in seen)]
@@ -163,7 +163,7 @@ def _depth(document: Any) -> int:
 
 
 def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 def _finite(text: str) -> float:
@@ -179,8 +179,8 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def event_problem(document: Any) -> str:
-    """What is wrong with the JSON of an event, in one line; "" if nothing is."""
+def event_problem(document: Any) -> str | None:
+    """The problems of an event in JSON, in one line; None if it is valid."""
     if not isinstance(document, dict):
         return f"{shown(document)}: must be a mapping with t and event"
     name = document.get("event")
@@ -188,21 +188,21 @@ def event_problem(document: Any) -> str:
         return "event: missing: must be given"
     check = event_validator(name) if isinstance(name, str) else None
     if check is None:
-        return f"event: {shown(name)}: unknown event, {suggest(str(name), event_names())}"
+        return f"event: {shown(name)}: unknown event{suggest(str(name), event_names())}"
     return _in_one_line(check, document)
 
 
-def log_problem(document: Mapping[str, Any]) -> str:
-    """What is wrong with a line of a drive's file that is no event, in one line; "" if nothing is."""
+def log_problem(document: Mapping[str, Any]) -> str | None:
+    """The problems of a line of a drive log that is not an event, in one line; None if it is valid."""
     kind = document["log"]
     check = log_validator(kind) if isinstance(kind, str) else None
     if check is None:
-        return f"log: {shown(kind)}: unknown kind of line, {suggest(str(kind), log_kinds())}"
+        return f"log: {shown(kind)}: unknown kind of line{suggest(str(kind), log_kinds())}"
     return _in_one_line(check, document)
 
 
-def message_problem(kind: str, document: Any) -> str:
-    """What is wrong with a message of the vehicle, in one line; "" if nothing is."""
+def message_problem(kind: str, document: Any) -> str | None:
+    """The problems of a message of the vehicle, in one line; None if it is valid."""
     return _in_one_line(message_validator(kind), document)
 
 
@@ -240,27 +240,27 @@ def _registry() -> Any:
     return Registry().with_resources((f"{name}.schema.json", resource(name)) for name in schema_names())
 
 
-def _oddities(value: Any, path: Path) -> Iterator[Finding]:
+def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
     """What YAML can say and JSON Schema cannot speak of: keys that are no text, numbers that are none."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if isinstance(key, str):
-                yield from _oddities(inner, (*path, key))
+                yield from _unrepresentable(inner, (*path, key))
             else:
                 yield Finding((*path, key), None, "a key must be text, quote it")
     elif isinstance(value, list):
         for index, inner in enumerate(value):
-            yield from _oddities(inner, (*path, index))
+            yield from _unrepresentable(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
     elif isinstance(value, int) and abs(value) >= 10**LONGEST_WHOLE:
         yield Finding(path, None, f"must have at most {LONGEST_WHOLE} digits")
 
 
-def _in_one_line(check: Draft202012Validator, document: Any) -> str:
-    """All that is wrong with a document; "" if nothing is."""
+def _in_one_line(check: Draft202012Validator, document: Any) -> str | None:
+    """All problems of a document; None if it is valid."""
     if check.is_valid(document):  # much cheaper than to look for all errors
-        return ""
+        return None
     found = _explained(check.iter_errors(document))
     return "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 
@@ -280,7 +280,7 @@ def _explain(error: Any) -> Iterator[Finding]:
             known = parent.get("properties", {})
             for key in value:
                 if key not in known:
-                    yield Finding((*path, key), None, f"unknown key, {suggest(str(key), known)}")
+                    yield Finding((*path, key), None, f"unknown key{suggest(str(key), known)}")
         case "required":
             for key in limit:
                 if key not in value:
@@ -311,7 +311,7 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "enum":
             options = ["null" if option is None else str(option) for option in limit]
             hint = suggest(value, options) if isinstance(value, str) else ""
-            return f"must be one of {', '.join(options)}" + (f", {hint}" if "mean" in hint else "")
+            return f"must be one of {', '.join(options)}" + (hint if "did you mean" in hint else "")
         case "const":
             return f"must be {shown(limit)}"
         case "minItems" | "minLength" | "minProperties":

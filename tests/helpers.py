@@ -40,7 +40,7 @@ class Drive:
 
     def accept(self, event: str, **keys: Any) -> Run:
         run = self.tell(event, **keys)
-        assert run.refused == ""
+        assert run.refused is None
         return run
 
     @property

@@ -11,14 +11,14 @@ import pytest
 from drives import Lines, write_drive
 from helpers import Command
 
-from runner.drive.capacity import Sample, cells, limited_samples
+from runner.drive.capacity import CapacitySample, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
 
 
 def test_a_square_holds_the_percentile_of_its_samples() -> None:
-    here = [Sample(52.0, 11.0, kbps) for kbps in range(1000, 1100)]
-    there = [Sample(52.0, 11.001, 5000.0)]  # 68 m further east
+    here = [CapacitySample(52.0, 11.0, kbps) for kbps in range(1000, 1100)]
+    there = [CapacitySample(52.0, 11.001, 5000.0)]  # 68 m further east
     first, second = cells([*here, *there], 10, 10)
     assert (first.kbps, first.samples) == (1009, 100)
     assert (second.kbps, second.samples) == (5000, 1)
@@ -30,7 +30,9 @@ def test_a_square_holds_the_percentile_of_its_samples() -> None:
 def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() -> None:
     for lat in (0.0, 60.0, -75.0):
         east = np.degrees(100 / 6378137.0) / np.cos(np.radians(lat))
-        row = [Sample(lat, float(np.remainder(179.9995 + 180 + n * east / 10, 360) - 180), 1.0) for n in range(31)]
+        row = [
+            CapacitySample(lat, float(np.remainder(179.9995 + 180 + n * east / 10, 360) - 180), 1.0) for n in range(31)
+        ]
         assert 3 <= len(cells(row, 50, 100)) <= 4
 
 

@@ -43,8 +43,8 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
     "words, told",
     [
         (["prnt"], "command line: prnt: unknown verb, did you mean print?"),
-        (["fly"], f"command line: fly: unknown verb, there is {', '.join(VERBS)}"),
-        (["print", "--total", "3"], "command line: --total: there are no flags; write NAME=VALUE, or --help"),
+        (["fly"], f"command line: fly: unknown verb; expected one of {', '.join(VERBS)}"),
+        (["print", "--total", "3"], "command line: --total: flags are not supported; write NAME=VALUE, or --help"),
         (["print", "total_kbps"], "command line: total_kbps: must be NAME=VALUE"),
         (["replay", "conf=/nowhere"], "command line: conf: /nowhere: no such directory"),
     ],
@@ -62,7 +62,10 @@ def test_words_that_are_no_command(tod: Command, words: list[str], told: str) ->
         (["print", "totl_kbps=3"], "totl_kbps: unknown name, did you mean total_kbps?"),
         (["print", "~experment"], "experment: unknown name, did you mean experiment?"),
         (["model", "metrc=psnr"], "metrc: unknown name, did you mean metric?"),
-        (["print", "vehicle=mine"], "vehicle: mine: no such file in conf/vehicle/, there is delivery_robot, tum_q7; "),
+        (
+            ["print", "vehicle=mine"],
+            "vehicle: mine: no such file in conf/vehicle/; expected one of delivery_robot, tum_q7; ",
+        ),
     ],
 )
 def test_names_and_choices_that_are_not_there_get_a_suggestion(tod: Command, words: list[str], told: str) -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 pytest.importorskip("scipy")
 
 from runner.rate_quality import plans
-from runner.rate_quality.choice import Wishes, choose, pooled
+from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import (
     Point,
     best_ladder,
@@ -31,7 +31,7 @@ from runner.rate_quality.curves import (
 RATES = [round(x) for x in np.geomspace(50, 4000, 20)]
 EIGHTHS = [Fraction(n, 8) for n in range(1, 9)]
 SCORE = mean_score("mssim")
-WISHES = Wishes("mssim", 1, tolerance=5e-4, narrowest=1.25, good=0.95, cores=None, fps=Fraction(25))
+CRITERIA = ChoiceCriteria("mssim", 1, tolerance=5e-4, narrowest=1.25, good=0.95, cores=None, fps=Fraction(25))
 
 
 def quality(factor, kbps, hard=1.0):
@@ -167,7 +167,7 @@ def test_falling_curves_are_found():
 def test_the_choice_is_a_valid_rate_quality_model():
     from runner.core.model import RateQualityModel
 
-    choice = choose(grid(), WISHES)
+    choice = choose(grid(), CRITERIA)
     model = RateQualityModel(choice.scaling, tuple(map(Fraction, choice.b_min)), Fraction(choice.b_full))
     assert model.b_full > model.b_min[-1]
     assert set(choice.dropped) | set(choice.scaling) == set(EIGHTHS)
@@ -175,7 +175,7 @@ def test_the_choice_is_a_valid_rate_quality_model():
 
 
 def test_a_harder_scene_gets_higher_bounds_and_more_bitrate():
-    easy, hard = (choose(grid(hard=hard), WISHES) for hard in (1.0, 2.0))
+    easy, hard = (choose(grid(hard=hard), CRITERIA) for hard in (1.0, 2.0))
     assert hard.b_full > easy.b_full
     for crossing in easy.crossings:
         same = [c for c in hard.crossings if (c.lower, c.upper) == (crossing.lower, crossing.upper)]
@@ -183,27 +183,27 @@ def test_a_harder_scene_gets_higher_bounds_and_more_bitrate():
 
 
 def test_a_budget_of_the_processor_drops_large_factors():
-    choice = choose(grid(), replace(WISHES, cores=0.1))
+    choice = choose(grid(), replace(CRITERIA, cores=0.1))
     assert max(choice.scaling) <= Fraction(5, 8)  # 10 ms * s^2 * 25 Hz <= 0.1
     assert choice.dropped[Fraction(1)] == "needs 0.25 of a core, allowed 0.1"
     with pytest.raises(ValueError, match=r"no factor's encoder needs at most 0\.001 of a core"):
-        choose(grid(), replace(WISHES, cores=0.001))
+        choose(grid(), replace(CRITERIA, cores=0.001))
 
 
 def test_what_a_person_should_know_is_said():
-    unreached = choose(grid(), replace(WISHES, good=0.9999))
+    unreached = choose(grid(), replace(CRITERIA, good=0.9999))
     assert unreached.b_full == 4000
     assert unreached.warnings[-1].startswith("b_full: mssim 0.9999 is not reached, 0.9")
-    short = choose(grid(frames=10), WISHES)
-    assert "only 10 frames were scored; a longer sequence would say more" in short.warnings
-    one = choose(grid([Fraction(1, 2)]), WISHES)
+    short = choose(grid(frames=10), CRITERIA)
+    assert "only 10 frames were scored; use a longer sequence" in short.warnings
+    one = choose(grid([Fraction(1, 2)]), CRITERIA)
     assert "the curves never cross between 50 and 4000 kbit/s: factor 0.5 is the best" in one.warnings
 
 
 def test_lower_is_better_turns_everything_round():
     points = [replace(p, scores={"brisque": tuple(100 * (1 - s) for s in p.scores["mssim"])}) for p in grid()]
-    turned = choose(points, Wishes("brisque", -1, 0.05, 1.25, 5.0, None, Fraction(25)))
-    straight = choose(grid(), WISHES)
+    turned = choose(points, ChoiceCriteria("brisque", -1, 0.05, 1.25, 5.0, None, Fraction(25)))
+    straight = choose(grid(), CRITERIA)
     assert (turned.scaling, turned.b_min, turned.b_full) == (straight.scaling, straight.b_min, straight.b_full)
 
 

@@ -97,7 +97,7 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
     with child(tmp_path, "100", limit) as process:
         told, _ = process.communicate(timeout=60)
     assert process.returncode == 0
-    first = "the drive goes on without its log: drive.jsonl: no space left on device"
+    first = "the drive continues without its log: drive.jsonl: no space left on device"
     assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", told)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
@@ -118,8 +118,8 @@ def test_a_log_goes_on_when_the_disk_has_room_again(tmp_path: Path) -> None:
     )
     done = run(code, tmp_path)
     assert done.stdout.splitlines() == [
-        "the drive goes on without its log: drive.jsonl: no space left on device",
-        "the log is written again: drive.jsonl",
+        "the drive continues without its log: drive.jsonl: no space left on device",
+        "the log continues: drive.jsonl",
     ], done.stderr
     drive = read_drive(tmp_path)
     assert drive.warnings == []
@@ -229,7 +229,7 @@ def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
     "change, told",
     [
         (lambda lines: [], "{file}: is empty: nothing was logged"),
-        (lambda lines: lines[1:], "{file}: line 1: is no beginning of a drive: must be a file that log= wrote"),
+        (lambda lines: lines[1:], "{file}: line 1: not the first line of a drive log: must be a file that log= wrote"),
         (lambda lines: ['{"a": 1}\n'], "{file}: line 1: event: missing: must be given"),
         (lambda lines: ["PK\x03\x04 no text\n"], "{file}: line 1: not JSON: Expecting value (column 1)"),
         (lambda lines: [*lines[:2], "{\n", *lines[2:]], "{file}: line 3: not JSON: "),
@@ -260,7 +260,7 @@ def test_what_is_no_drive_is_told_with_its_line(tmp_path: Path, change: Any, tol
 
 def test_a_directory_without_a_drive_is_told(tmp_path: Path) -> None:
     for path, rule in (
-        (tmp_path, "holds no drive: neither drive.jsonl nor operator.jsonl"),
+        (tmp_path, "contains no drive log: neither drive.jsonl nor operator.jsonl"),
         (tmp_path / "nowhere", "no such directory"),
         (Path(__file__), "must be a directory that log= wrote"),
     ):

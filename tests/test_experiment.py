@@ -126,14 +126,14 @@ def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> Non
 def test_a_link_joins_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2
-    rule = "joins sides over RTSP, the graph of front_left brings its own line"
+    rule = "joins sides over RTSP, the graph of front_left uses its own transport"
     assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
 
 
 def test_what_a_link_does_is_to_be_looked_at(tod: Command) -> None:
     result = tod("demo", "link=relay", "source=test")
     assert result.status == 2
-    rule = "what it does is to be looked at: give log=DIR or output=OUT"
+    rule = "needs a log to show its effect: give log=DIR or output=OUT"
     assert result.err == f"command line: link: relay: {rule}\n"
 
 

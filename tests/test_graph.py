@@ -11,7 +11,7 @@ import pytest
 from helpers import CONF, vehicle
 
 from runner.core.commands import KnobValue
-from runner.core.model import Camera, Element, Endpoint, Graph, ModelError, Roi, Source, Turn
+from runner.core.model import Camera, Element, Endpoint, Graph, KnobTarget, ModelError, Roi, Source
 from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
 
 MEDIA = Endpoint("127.0.0.1", 8554)
@@ -267,7 +267,7 @@ def test_the_url_of_a_camera() -> None:
             "operator[1].name: 'sink': is already the name of another element",
         ),
         (
-            {"knobs": {"bitrate": (Turn("pay0", "x", "kbps"), Turn("pay1", "x", "kbps"))}},
+            {"knobs": {"bitrate": (KnobTarget("pay0", "x", "kbps"), KnobTarget("pay1", "x", "kbps"))}},
             "knobs.bitrate[1].element: 'pay1': no such element, did you mean pay0?",
         ),
     ],
@@ -279,7 +279,7 @@ def test_a_graph_is_valid_once_built(changes: dict[str, Any], message: str) -> N
 
 
 def test_a_knob_that_cannot_offer_what_is_asked_of_it() -> None:
-    wrong = replace(graph(), knobs={"bitrate": (Turn("pay0", "x", "left"),)})
+    wrong = replace(graph(), knobs={"bitrate": (KnobTarget("pay0", "x", "left"),)})
     with pytest.raises(ModelError) as refused:
         assignments(replace(LEFT, graph=wrong), "bitrate", 1)
     assert str(refused.value) == "graph.knobs.bitrate: 'left': bitrate offers kbps, bps"

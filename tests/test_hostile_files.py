@@ -36,7 +36,7 @@ def _interpolations(path: Path) -> None:
     [
         (_aliases, "line 5: must hold at most 10000 values, aliases written out"),
         (_merges, "line 5: must hold at most 10000 values, aliases written out"),
-        (_interpolations, "interpolations, ${...}, refer to each other too deeply or come to more than 50000 values"),
+        (_interpolations, "interpolations, ${...}, are nested too deeply or expand to more than 50000 values"),
         (
             lambda path: path.write_text("a: " + "[" * 3000 + "]" * 3000),
             "line 1: must be nested at most 32 levels deep",

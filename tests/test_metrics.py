@@ -69,7 +69,7 @@ PSNR, MSSIM = find_metric("psnr"), find_metric("mssim")
     "name, message",
     [
         ("vmav", "metric: 'vmav': unknown metric, did you mean vmaf?"),
-        ("sharp", "metric: 'sharp': unknown metric, there is psnr, mssim, vmaf, brisque"),
+        ("sharp", "metric: 'sharp': unknown metric; expected one of psnr, mssim, vmaf, brisque"),
     ],
 )
 def test_unknown_name(name: str, message: str) -> None:
@@ -358,7 +358,8 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
     assert (
-        str(raised.value) == f"TOD_FFMPEG={exe} is no ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
+        str(raised.value)
+        == f"TOD_FFMPEG={exe} is not an ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
     )
     monkeypatch.delenv("TOD_FFMPEG")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", exe)

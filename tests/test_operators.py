@@ -25,16 +25,16 @@ def test_any_message_of_its_own_brings_an_operator_back() -> None:
     operators = Operators(1.0)
     operators.connected("a", 0.0)
     operators.silent(5.0)
-    assert not operators.heard("b", 6.0)
+    assert not operators.message_received("b", 6.0)
     assert operators.present == frozenset()
-    assert operators.heard("a", 6.0)
-    assert not operators.heard("a", 6.1)
+    assert operators.message_received("a", 6.0)
+    assert not operators.message_received("a", 6.1)
     assert operators.present == {"a"}
 
 
 def test_who_never_announced_itself_is_no_operator() -> None:
     operators = Operators(1.0)
-    assert not operators.heard("predictor", 0.0)
+    assert not operators.message_received("predictor", 0.0)
     assert operators.present == frozenset()
 
 
@@ -43,12 +43,12 @@ def test_the_operator_who_has_been_present_longest_is_in_control() -> None:
     assert operators.in_control == ""
     operators.connected("b", 0.0)
     operators.connected("a", 0.5)
-    operators.heard("b", 1.2)
+    operators.message_received("b", 1.2)
     assert operators.in_control == "b"
     operators.silent(2.0)  # a
-    operators.heard("a", 2.1)
+    operators.message_received("a", 2.1)
     operators.disconnected("b")
-    operators.heard("b", 2.2)
+    operators.message_received("b", 2.2)
     assert operators.in_control == "a"
 
 
@@ -56,24 +56,24 @@ def test_the_longest_absent_is_forgotten_first() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     for number in range(10 * MOST):
-        operators.heard(f"stranger{number}", float(number))
+        operators.message_received(f"stranger{number}", float(number))
     assert operators.present == {"driver"}
 
 
 @pytest.mark.parametrize(
     "delays, delay, expired",
     [
-        ([], 0.99, ""),
+        ([], 0.99, None),
         ([], 1.01, "1.01 s old, limit 1.00 s"),
-        ([0.2, 0.3], 1.19, ""),  # beyond the round trip, the least delay there was
+        ([0.2, 0.3], 1.19, None),  # beyond the round trip, the least delay there was
         ([0.2, 0.3], 1.21, "1.21 s old, limit 1.20 s"),
         ([6.0, 6.0], 6.0, f"6.00 s old, limit {1 + MAX_ROUND_TRIP_S:.2f} s"),
-        ([0.01] + [0.4] * DELAYS, 1.39, ""),  # the path has become longer
-        ([], -0.05, ""),
+        ([0.01] + [0.4] * DELAYS, 1.39, None),  # the path has become longer
+        ([], -0.05, None),
         ([], -0.2, "as_of 100.2 is ahead of the vehicle's time, 100"),
     ],
 )
-def test_a_request_expires(delays: list[float], delay: float, expired: str) -> None:
+def test_a_request_expires(delays: list[float], delay: float, expired: str | None) -> None:
     operators = Operators(1.0)
     for earlier in delays:
         operators.expired("a", 50.0, 50.0 - earlier)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.gst  # the package runner.gst loads it
 def test_each_reason_is_told_once_and_the_end_with_its_length():
     told = []
     outage = Outage(told.append)
-    assert outage.reason == ""
+    assert outage.reason is None
     outage.failed("no frame for 1 s", 10.0)
     for second in range(12, 30):
         outage.failed("refused" if second % 2 else "no frame for 1 s", float(second))
@@ -20,7 +20,7 @@ def test_each_reason_is_told_once_and_the_end_with_its_length():
     assert told == ["no frame for 1 s", "refused"]
     outage.over(30.2)
     assert told[2:] == ["works again after 20 s"]
-    assert outage.reason == ""
+    assert outage.reason is None
 
 
 def test_what_fails_again_is_told_again():

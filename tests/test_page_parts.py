@@ -16,8 +16,8 @@ from runner.h264.access_unit import AccessUnit
 pytest.importorskip("aiohttp")
 from runner.page.control import KEPT_S, Control
 from runner.page.history import KEPT, History
-from runner.page.server import Page
-from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, Viewer
+from runner.page.server import PageServer
+from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, PageViewer
 from runner.records import CameraSample, Position, Sample
 
 FULL = b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n"
@@ -45,7 +45,7 @@ def served():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    page = Page(vehicle(f"page.port={port}"), SimpleNamespace(state={}, note=print))
+    page = PageServer(vehicle(f"page.port={port}"), SimpleNamespace(state={}, note=print))
     page.start()
     try:
         yield port
@@ -85,7 +85,7 @@ def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
-    viewer = Viewer("me", 1, lambda camera: [unit(0, key=True), unit(7), unit(8)])
+    viewer = PageViewer("me", 1, lambda camera: [unit(0, key=True), unit(7), unit(8)])
     viewer.show(0, unit(8))  # part of the burst already
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, CATCH_UP, 7), (0, 0, 8)]
     viewer.show(0, unit(9))
@@ -95,21 +95,21 @@ def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
 
 def test_a_burst_of_one_is_drawn_and_none_is_waited_for():
     come = []
-    viewer = Viewer("me", 1, lambda camera: come)
+    viewer = PageViewer("me", 1, lambda camera: come)
     assert sent(viewer) == []
     come.append(unit(0, key=True))
     assert sent(viewer) == [(0, KEY | RESTART, 0)]
 
 
 def test_texts_go_first_and_cameras_take_turns():
-    viewer = Viewer("me", 2, lambda camera: [unit(0, key=True), unit(1)])
+    viewer = PageViewer("me", 2, lambda camera: [unit(0, key=True), unit(1)])
     viewer.tell("state", {})
     assert [m if isinstance(m, str) else m[0] for m in sent(viewer)] == ["state", 0, 1, 0, 1]
 
 
 def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
     newest = []
-    viewer = Viewer("me", 1, lambda camera: [unit(0, key=True), *newest])
+    viewer = PageViewer("me", 1, lambda camera: [unit(0, key=True), *newest])
     sent(viewer)
     for number in range(1, 201):
         newest[:] = [unit(number)]
@@ -119,16 +119,16 @@ def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
 
 
 def test_texts_are_bounded_too():
-    viewer = Viewer("me", 0, lambda camera: [])
+    viewer = PageViewer("me", 0, lambda camera: [])
     for _ in range(10_000):
         viewer.tell("sample", {})
     assert len(sent(viewer)) == 500
 
 
 def test_the_header_states_times_in_ms_and_an_unknown_capture_as_nan():
-    viewer = Viewer("me", 1, lambda camera: [unit(5, key=True, captured=0.25)])
+    viewer = PageViewer("me", 1, lambda camera: [unit(5, key=True, captured=0.25)])
     assert HEADER.unpack_from(viewer.pop()) == (0, KEY | RESTART, 0, 1, 250.0, 500.0)
-    viewer = Viewer("me", 1, lambda camera: [unit(5, key=True)])
+    viewer = PageViewer("me", 1, lambda camera: [unit(5, key=True)])
     assert math.isnan(HEADER.unpack_from(viewer.pop())[4])
 
 

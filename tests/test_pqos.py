@@ -222,7 +222,7 @@ def test_swapped_map_is_told_once() -> None:
         assert kbps(pqos, at(t)) == 700
     assert pqos.warnings == (
         "position lat 48.0, lon 11.0 is off the map, but lat 11.0, lon 48.0 is on it: "
-        "lon and lat look swapped in the map or in the positions; predicting 700 kbit/s",
+        "lon and lat appear swapped in the map or in the positions; predicting 700 kbit/s",
     )
 
 
@@ -307,7 +307,7 @@ def test_one_row_is_no_trace(tmp_path: Path) -> None:
     path.write_text("t_s,kbps\n0,5000\n")
     with pytest.raises(ModelError) as raised:
         build_pqos(TRACE, [tmp_path])
-    assert str(raised.value) == f"file: {path}: must have two rows or more, else nothing says how long a rate holds"
+    assert str(raised.value) == f"file: {path}: must have at least two rows, else the duration of a rate is unknown"
 
 
 # --- the packaged configuration and its schema ------------------------------------------------------------------------

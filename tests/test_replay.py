@@ -122,7 +122,9 @@ def test_standard_input_and_output() -> None:
     story = lines([predicted(0, 3000), {"t": 1, "event": "camera_switched", "camera": "ü", "on": True}])
     result = process("replay", *PAPER, stdin=story)
     assert (result.status, result.err) == (0, "")
-    assert json.loads(result.out.splitlines()[1])["reason"].startswith("unknown camera 'ü', there is front_left,")
+    assert json.loads(result.out.splitlines()[1])["reason"].startswith(
+        "unknown camera 'ü'; expected one of front_left,"
+    )
     assert process("replay", *PAPER, stdin="") == (0, "", "")
 
 
@@ -137,10 +139,10 @@ def test_standard_input_and_output() -> None:
         ("[]", "[]: must be a mapping with t and event"),
         ('{"t": 0, "event": "clock_advanced"}', "t: 0: must not fall, the event before was at 0.5"),
         ('{"t": 1, "event": "clock"}', None),
-        ('{"t": 1, "event": "bitrate_predicted", "kbps": NaN}', "not JSON: NaN is no number"),
+        ('{"t": 1, "event": "bitrate_predicted", "kbps": NaN}', "not JSON: NaN is not a number"),
         ('{"t": 1, "event": "bitrate_predicted", "kbps": -1}', "kbps: -1: must be at least 0"),
         ('{"t": 1, "event": "bitrate_predicted", "kbp": 1}', "kbp: unknown key, did you mean kbps?"),
-        ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key, there is t, event"),
+        ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key; expected one of t, event"),
     ],
 )
 def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, told: str | None) -> None:
@@ -395,7 +397,7 @@ def test_what_is_read_is_not_written_over(tod: Command, drive: Path) -> None:
     for word in (drive, path):
         result = tod("replay", f"input={word}", f"output={path}")
         assert (result.status, path.read_bytes()) == (2, before)
-        assert result.err == f"command line: output: '{path}': is what is read, choose another file\n"
+        assert result.err == f"command line: output: '{path}': is the input, choose another file\n"
 
 
 def test_an_answer_that_does_not_come_to_its_end_leaves_no_drive(

@@ -16,7 +16,7 @@ from helpers import CONF, Command, process
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
-from runner.drive.checks import Check
+from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.figures import Figure, figures
 from runner.drive.read import read_drive
@@ -132,7 +132,7 @@ def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
     check_figures(tmp_path / "out", FIGURES)
     told = document(tmp_path / "out")["drives"]
     assert [one["label"] for one in told] == [f"{drive.parent.name}/test_drive", "other/test_drive"]
-    assert told[1]["notes"][0] == "no positions were logged: it is not on the map"
+    assert told[1]["notes"][0] == "no positions were logged: not drawn on the map"
     assert "all drives" in out
     taller, single = (image.open(tmp_path / "out" / f"{name}.png").height for name in ("totals", "bitrate_on_track"))
     assert taller > single
@@ -185,7 +185,11 @@ def test_claims_are_held_against_the_drive(
     from runner.drive import claims as module
     from runner.verbs.report import report
 
-    claims = [Check("the total varies", "3000 to 7310 kbit/s", True), Check("<b>", "&", False), Check("c", "d", None)]
+    claims = [
+        ClaimCheck("the total varies", "3000 to 7310 kbit/s", True),
+        ClaimCheck("<b>", "&", False),
+        ClaimCheck("c", "d", None),
+    ]
     monkeypatch.setattr(module, "claims", lambda series: claims)
     report([drive], tmp_path / "out")
     (one,) = document(tmp_path / "out")["drives"]
@@ -316,9 +320,12 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
             f"command line: output: '{file}/deep': must be a directory, {file} is a file",
         ),
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
-        ([str(drive), out, "vehicle=x"], "command line: vehicle=x: unknown argument, there is output, models, conf"),
-        ([str(drive), "--output"], "command line: --output: there are no flags; write NAME=VALUE, or --help"),
-        ([str(tmp_path), out], f"{tmp_path}: holds no drive: neither drive.jsonl nor operator.jsonl"),
+        (
+            [str(drive), out, "vehicle=x"],
+            "command line: vehicle=x: unknown argument; expected one of output, models, conf",
+        ),
+        ([str(drive), "--output"], "command line: --output: flags are not supported; write NAME=VALUE, or --help"),
+        ([str(tmp_path), out], f"{tmp_path}: contains no drive log: neither drive.jsonl nor operator.jsonl"),
     ]
     for words, told in wrong:
         status, printed, err = tod("report", *words)
@@ -330,7 +337,7 @@ def test_a_model_that_is_none(tod: Command, drive: Path, tmp_path: Path) -> None
     (tmp_path / "front_left.model.json").write_text("{")
     status, _, err = tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={tmp_path}")
     assert status == 2
-    assert err.splitlines()[-1].startswith(f"{tmp_path}/front_left.model.json: is no model file: ")
+    assert err.splitlines()[-1].startswith(f"{tmp_path}/front_left.model.json: is not a model file: ")
 
 
 def test_a_path_may_hold_an_equals_sign(tod: Command, tmp_path: Path) -> None:

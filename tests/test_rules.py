@@ -308,7 +308,7 @@ def test_a_rule_that_states_nothing_hears_everything(monkeypatch: pytest.MonkeyP
 
     @rules.rule(needs=["total"], gives=["total"])
     def below_at_night(vehicle: Vehicle, state: State, draft: Any, memory: Any) -> Any:
-        return draft.but(total=min(draft.total, 111) if state.t > 10 else draft.total), memory
+        return draft.replaced(total=min(draft.total, 111) if state.t > 10 else draft.total), memory
 
     first, *others = TUM.modes[Mode.AUTOMATIC]
     call = rules.RuleCall(rules.RULES["below_at_night"])
@@ -378,7 +378,7 @@ def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest
     def load(_: EntryPoint) -> None:
         @rules.rule(needs=["total"], gives=["total"])
         def keep_below(vehicle: Vehicle, state: State, draft: Any, memory: Any, *, most_kbps: Fraction) -> Any:
-            return draft.but(total=min(draft.total, most_kbps)), memory
+            return draft.replaced(total=min(draft.total, most_kbps)), memory
 
     entry = EntryPoint("keep_below", "my.rules:keep_below", "tod_runner.rules")
     monkeypatch.setattr(EntryPoint, "load", load)

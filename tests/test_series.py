@@ -14,15 +14,15 @@ from helpers import vehicle
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
 from runner.drive.read import read_drive
-from runner.drive.series import Line, counted, held, mean_held, panels, rate, sending_spans, series, spans
+from runner.drive.series import TimeSeries, counted, held, mean_held, panels, rate, sending_spans, series, spans
 from runner.errors import UserError
 
 NAN = float("nan")
 
 
-def line(*points: tuple[float, float]) -> Line:
+def line(*points: tuple[float, float]) -> TimeSeries:
     t, y = np.array(points, dtype=float).reshape(-1, 2).T
-    return Line(t, y)
+    return TimeSeries(t, y)
 
 
 def test_what_holds_until_the_next() -> None:
@@ -83,7 +83,7 @@ def test_sides_are_joined_by_the_time_they_began(tmp_path: Path) -> None:
     assert np.isnan(received.kbps[received.t < OPERATOR_LATER_S + 1.9]).all()
     assert np.isfinite(received.kbps[received.t > OPERATOR_LATER_S + 2.5]).all()
     decided = drive.cameras["front_left"].decided
-    at_5 = held(Line(decided.t, decided.kbps), np.array([5.0]))
+    at_5 = held(TimeSeries(decided.t, decided.kbps), np.array([5.0]))
     assert np.interp(5.0, *drive.cameras["front_left"].actual) == pytest.approx(at_5[0], rel=0.2)
 
 
@@ -171,9 +171,9 @@ def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
         return str(told.value).removeprefix(f"{tmp_path}/")
 
     write_drive(tmp_path / "empty", seconds=5, change=lambda _side, _lines: [])
-    assert problem("empty") == "empty: has no length: nothing was logged but its beginning"
+    assert problem("empty") == "empty: is empty: only the first line was logged"
     write_drive(tmp_path / "undecided", seconds=5, change=without(log="decision"), sides=["vehicle"])
-    assert problem("undecided") == "undecided: has no decision yet: there is nothing to report"
+    assert problem("undecided") == "undecided: contains no decision"
     write_drive(tmp_path / "foreign", seconds=5, change=lambda _side, lines: [*lines, {"t": 1, "log": "decision"}])
     assert problem("foreign").startswith("foreign/drive.jsonl: line 187: cause: missing: must be given; mode: missing")
     assert problem("nowhere") == "nowhere: no such directory"

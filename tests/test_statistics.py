@@ -11,7 +11,7 @@ import pytest
 from drives import write_drive, write_model
 
 from runner.drive.read import read_drive
-from runner.drive.series import CameraSeries, Decided, Received, Sent, series
+from runner.drive.series import CameraSeries, DecidedSeries, ReceivedSeries, Sent, series
 from runner.drive.statistics import (
     CameraStatistics,
     Freeze,
@@ -167,7 +167,7 @@ def camera(kbps: float, scaling: float, *, sending: bool = True, share: float = 
         return np.array([value], dtype=float)
 
     flag, t = np.array([sending]), np.array([1.0])
-    decided = Decided(column(0), flag, column(kbps), column(scaling), column(2), column(2), column(share), ("",))
+    decided = DecidedSeries(column(0), flag, column(kbps), column(scaling), column(2), column(2), column(share), ("",))
     return CameraSeries("one", decided, None, Sent(t, column(1), column(1), column(kbps)))
 
 
@@ -197,7 +197,9 @@ def stood_still(begin: float, end: float, kbps: float = 400, seconds: float = 25
     frames = np.searchsorted(came, t, "right").astype(float)
     rates = np.where(t < 1, NAN, (frames - np.searchsorted(came, t - 1, "right")) * kbps / 10)
     zero, size, latency = np.zeros(t.shape), np.full(t.shape, 2.0), np.full(came.shape, 50.0)
-    received = Received(t, rates, size, size, size, frames, frames * kbps * 12.5, zero, zero, came, latency, latency)
+    received = ReceivedSeries(
+        t, rates, size, size, size, frames, frames * kbps * 12.5, zero, zero, came, latency, latency
+    )
     decided = camera(kbps, 0.5).decided
     return CameraSeries("one", decided, received, None)
 

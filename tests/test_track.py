@@ -206,7 +206,7 @@ def test_one_row_is_no_track(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("t_s,lat,lon\n0,48,11\n")
     with pytest.raises(ModelError) as raised:
         build_track({"position": {"kind": "track", "file": "t.csv"}}, [tmp_path])
-    assert str(raised.value) == f"position.file: {tmp_path}/t.csv: must have two rows or more"
+    assert str(raised.value) == f"position.file: {tmp_path}/t.csv: must have at least two rows"
 
 
 @pytest.mark.parametrize("section", [{"kind": "live"}, {"kind": "map", "position": {"kind": "live", "speed_mps": 3}}])

@@ -137,7 +137,7 @@ def test_maps_are_no_configuration(tod: Command, conf: UserConf) -> None:
 @pytest.mark.parametrize(
     "rows, told",
     [
-        ("lon,lat,kbps\n", "must have rows, there is none"),
+        ("lon,lat,kbps\n", "must have rows"),
         ("lon,lat\n1,2\n", None),
         (None, "no such file"),
     ],

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from runner.gst.viewers import Viewer, admit, operator_of, over_uplink, user_agent
+from runner.gst.viewers import StreamViewer, admit, operator_of, over_uplink, user_agent
 
 LOCAL, ANNA, BERT, ANYONE = (
-    Viewer("127.0.0.1"),
-    Viewer("192.0.2.7", "anna"),
-    Viewer("192.0.2.8", "bert"),
-    Viewer("192.0.2.9"),
+    StreamViewer("127.0.0.1"),
+    StreamViewer("192.0.2.7", "anna"),
+    StreamViewer("192.0.2.8", "bert"),
+    StreamViewer("192.0.2.9"),
 )
 
 
@@ -45,7 +45,7 @@ def test_only_loopback_costs_no_uplink(address, leaves):
         ([ANNA], BERT, 1, "anna", None),
         ([ANNA, BERT], ANNA, 2, "anna", [BERT]),
         ([ANNA], ANNA, 1, "anna", [ANNA]),  # whose address changed
-        ([ANYONE], Viewer("192.0.2.9"), 1, "", None),  # no operator is not the controller where there is none
+        ([ANYONE], StreamViewer("192.0.2.9"), 1, "", None),  # no operator is not the controller where there is none
         ([LOCAL, ANYONE], ANNA, 1, "anna", [ANYONE]),
         ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, "anna", [ANYONE._replace(since=1)]),
     ],

@@ -12,22 +12,22 @@ SECTIONS = ("name", "fps_max", "cameras", "graph")
 OWN = ("source", "device", "address", "clip", "place", "pose", "fov_deg", "lens")
 NAMED = 3  # differences that a message names
 
-Settings = Mapping[str, Any]
+SettingsByPath = Mapping[str, Any]
 
 
-def settings(document: Mapping[str, Any]) -> Settings:
+def settings(document: Mapping[str, Any]) -> SettingsByPath:
     """Values by path, such as cameras.front.fps, of a composed configuration."""
     return dict(pair for key in SECTIONS for pair in _leaves(document.get(key), (key,)))
 
 
-def differences(here: Settings, vehicle: Settings) -> str:
-    """What the operator's configuration and the vehicle's differ in, in one line, or ""."""
+def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str | None:
+    """The differences of the operator's configuration and the vehicle's, in one line; None if they agree."""
     paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
-    told = [
+    parts = [
         f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]
     ]
     more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
-    return "; ".join([*told, *more])
+    return "; ".join([*parts, *more]) or None
 
 
 def _leaves(value: Any, path: Path) -> Iterator[tuple[str, Any]]:

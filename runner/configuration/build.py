@@ -19,17 +19,17 @@ from runner.core.model import (
     Element,
     Endpoint,
     Graph,
+    KnobTarget,
     Media,
     Mode,
     ModelError,
-    Page,
+    PageSettings,
     Place,
     Pose,
     RateQualityModel,
     Recording,
     Roi,
     Source,
-    Turn,
     Value,
     Vehicle,
     exact,
@@ -38,7 +38,7 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
@@ -47,19 +47,19 @@ GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "
 
 T = TypeVar("T")
 
-Check = Callable[[Plan], Iterable[ModelError]]
+PlanCheck = Callable[[Plan], Iterable[ModelError]]
 
 
 @dataclass
 class Builder:
     """Builds model objects from plain data and gathers what is wrong with it; None stands for what could not be built.
 
-    Parts that the schema refuses are not built, so that one mistake is told once.
+    Parts that the schema refuses are not built, so that one mistake is reported once.
     """
 
     composed: Composed
     runnable: bool
-    check: Check | None
+    check: PlanCheck | None
     fits: Collection[str] = ()  # sections that the schemas accept, as is known already
     problems: list[Problem] = field(default_factory=list)
     bad: set[schema.Path] = field(default_factory=set)
@@ -69,18 +69,18 @@ class Builder:
     others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
 
     @classmethod
-    def of(cls, composed: Composed, runnable: bool, check: Check | None, fits: Collection[str]) -> Builder:
+    def of(cls, composed: Composed, runnable: bool, check: PlanCheck | None, fits: Collection[str]) -> Builder:
         """The builder of a configuration, with its vehicle built."""
         builder = cls(composed, runnable, check, fits)
         builder.vehicle = builder._vehicle()
-        builder._blame()
+        builder._attribute_problems()
         return builder
 
     def _vehicle(self) -> Vehicle | None:
         document = self.composed.document
         unknown = {key: value for key, value in document.items() if key not in self.fits}
         found = schema.findings(unknown, "composed")
-        wrong = list(self._told_once([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
+        wrong = list(self._without_repeats([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
@@ -95,7 +95,7 @@ class Builder:
         built = {name: camera for name, camera in cameras.items() if camera}
         self.built = set(built)
         recording = self.part(("recording",), _recording)
-        page = Page(**document["page"])
+        page = PageSettings(**document["page"])
         listening = {"page.port": page.port} if page.serve else {}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
@@ -132,7 +132,7 @@ class Builder:
         """Whether the schema found nothing wrong at or below a path, nor with what it is a part of."""
         return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
 
-    def _told_once(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
+    def _without_repeats(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
         """A name below cameras that no kind is mounted under is one mistake, not many missing keys."""
         missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
         unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
@@ -140,8 +140,8 @@ class Builder:
             others = [name for name in self.composed.document["cameras"] if ("cameras", name) not in unmounted]
             hint = suggest(str(path[1]), others)
             if "did you mean" not in hint:
-                hint = f"its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
-            yield schema.Finding(path, None, f"no camera of that name is mounted, {hint}")
+                hint = f"; its kind is named in the defaults list: /cameras@cameras.{path[1]}: KIND"
+            yield schema.Finding(path, None, f"no camera of that name is mounted{hint}")
         yield from (f for f in wrong if f.path[:2] not in unmounted)
 
     def attempt(self, path: schema.Path, make: Callable[[], T]) -> T | None:
@@ -157,10 +157,10 @@ class Builder:
         self.broken[where] = self.composed.problem(where, found, error.rule)
         self.problems.append(self.broken[where])
 
-    def _blame(self) -> None:
+    def _attribute_problems(self) -> None:
         """Tell a rule that joins several values of the file or override whose word broke it.
 
-        The value that the rule names may stand in a file that is right by itself: leave out one by one what was said
+        The value that the rule names may stand in a file that is right by itself: leave out one by one the parts stated
         after it, and see without which the rule holds.
         """
         for where, problem in list(self.broken.items()):
@@ -174,7 +174,7 @@ class Builder:
                     break
 
     def _without(self, part: Part) -> Builder | None:
-        """What would be built if a part said nothing."""
+        """The builder of the configuration without a part."""
         if id(part) not in self.others:
             composed = without(self.composed, part)
             other = Builder(composed, self.runnable, self.check) if composed else None
@@ -243,7 +243,7 @@ class Builder:
         cameras = self.vehicle.cameras.values() if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling:
-            rule = f"joins sides over RTSP, the graph of {dialling[0]} brings its own line"
+            rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport"
             self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
 
     def _check_inputs(self, camera: Camera) -> None:
@@ -255,7 +255,7 @@ class Builder:
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
             elif key == "clip" and not Path(str(given)).is_file():
-                self._report(where, ModelError(key, repr(given), why_no_file(Path(str(given)))))
+                self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
     def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
         """Whether everything that source, graph and recording refer to is there."""
@@ -333,7 +333,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         operator=_elements(data["operator"]),
         wire_vehicle=_elements(wire.get("vehicle")),
         wire_operator=_elements(wire.get("operator")),
-        knobs={knob: tuple(Turn(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
+        knobs={knob: tuple(KnobTarget(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
         settings=settings,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **_given(data, ("verified",)),

@@ -101,7 +101,7 @@ class Combinations:
         packages = {pick: f"{PICKED}{index}" for index, pick in enumerate(picks)}
         words = [f"+{group}@{package}={option}" for (group, option), package in packages.items()]
         composed = compose([*self.overrides, *words], self._user)
-        further = {part.package[:1] for part in composed.parts if not self._keeps_to_itself(part)}
+        further = {part.package[:1] for part in composed.parts if not self._is_self_contained(part)}
         document = dict(composed.document)
         sections = {pick: document.pop(package) for pick, package in packages.items()}
         if further - {(package,) for package in packages.values()}:
@@ -109,7 +109,7 @@ class Combinations:
         self._sections |= {pick: section for pick, section in sections.items() if (packages[pick],) not in further}
         return document
 
-    def _keeps_to_itself(self, part: Part) -> bool:
+    def _is_self_contained(self, part: Part) -> bool:
         """Whether a file fills the section of its group only, and whatever else is chosen does not matter to it."""
         if not stays_inside(part.content):
             return False

@@ -115,7 +115,7 @@ def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iter
         return
     group, _, package = override.key.lstrip("/").partition("@")
     if group == "experiment":
-        raise ValueError("an experiment is a configuration of its own: name what of it is to change")
+        raise ValueError("an experiment is a whole configuration: override single keys instead")
     if group == "vehicle":
         document = compose([f"{group}={override.value}"], user).document
         yield from ((key, document[key]) for key in ("name", "cameras"))
@@ -142,7 +142,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
 
     from runner.configuration.hydra_files import search
 
-    # OmegaConf's own resolver for environment variables is no part of this language: a file says what it says.
+    # OmegaConf's own resolver for environment variables is not part of this language: a file alone defines its values.
     OmegaConf.clear_resolver("oc.env")
     search(directories)
     root = find_file(directories, "", "config")
@@ -168,10 +168,10 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         where, wanted = missing.groups()
         group, name = _place(wanted)
         known = options(group, directories)
-        hint = suggest(name, known) if known else f"groups are {', '.join(f'/{g}' for g in GROUPS)}"
+        hint = suggest(name, known) if known else f"; expected one of the groups {', '.join(f'/{g}' for g in GROUPS)}"
         overriding = _overriding(group, name, directories)
         file = overriding or label(find_file(directories, *_place(where)))
-        return Problem(file, "defaults", repr(wanted), f"no such file, {hint}")
+        return Problem(file, "defaults", repr(wanted), f"no such file{hint}")
     lines = [line.strip() for line in text.partition("Config search path:")[0].splitlines() if line.strip()]
     rule = "; ".join(lines)
     twice = re.search(r"Multiple values for ([\w/@.-]+?)\. ", text)
@@ -221,7 +221,7 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
     """The files behind a composition, in the order in which Hydra merged them."""
     root = find_file(directories, "", "config")
     yield Part(label(root), (), load_file(root), root)
-    # Mounted files first: a vehicle file says last what belongs to the place. An experiment has the last word.
+    # Mounted files first: a vehicle file comes last for values of the place. An experiment overrides all others.
     for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
         group, _, package = key.partition("@")
         if group.startswith("hydra") or group not in GROUPS or name == "None":

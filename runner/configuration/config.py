@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.configuration.build import Builder, Check
+from runner.configuration.build import Builder, PlanCheck
 from runner.configuration.compose import compose, recompose
 from runner.configuration.files import conf_directories
 from runner.core.model import Vehicle
@@ -41,14 +41,14 @@ class Configuration:
         user: Path | None = None,
         *,
         runnable: bool = True,
-        check: Check | None = None,
+        check: PlanCheck | None = None,
         fits: Collection[str] = (),
     ) -> None:
         self._composed, self._user, self._runnable, self._check, self._fits = composed, user, runnable, check, fits
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
 
-    def drivable(self, check: Check) -> Configuration:
-        """The same, checked for all that a run needs."""
+    def drivable(self, check: PlanCheck) -> Configuration:
+        """The same, also checked for what a run needs."""
         return Configuration(self._composed, self._user, check=check)
 
     @property
@@ -101,7 +101,7 @@ def configuration(
     *,
     base: Base | None = None,
     runnable: bool = True,
-    check: Check | None = None,
+    check: PlanCheck | None = None,
 ) -> Configuration:
     """Compose files and overrides.
 

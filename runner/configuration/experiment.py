@@ -14,7 +14,7 @@ from runner.pqos import Pqos, build_pqos, trace
 from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
 
-Rates = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
+RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
 STEP_S = 0.1  # at which the rate of a link follows a map
 
 
@@ -47,7 +47,7 @@ def read_experiment(data: Mapping[str, Any]) -> Experiment:
     return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs)
 
 
-def read_link(data: Mapping[str, Any], predicted: Rates, bases: Sequence[Path]) -> LinkSettings:
+def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> LinkSettings:
     """The link that the `link` section describes.
 
     predicted  the rates that it follows where it names no file, see `truth`
@@ -63,7 +63,7 @@ def read_link(data: Mapping[str, Any], predicted: Rates, bases: Sequence[Path]) 
     return LinkSettings(data["kind"], Limit(kbps_at, float(data["queue_ms"]), float(data["delay_ms"])))
 
 
-def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> Rates:
+def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
     """What the source of predictions in the `pqos` section states for each moment and place, not looking ahead.
 
     raises  ModelError with the key, what was found and what is right
@@ -71,7 +71,7 @@ def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> Rates:
     return _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
 
 
-def _known(source: Pqos, track: Track | None) -> Rates:
+def _known(source: Pqos, track: Track | None) -> RateAtTime:
     """What a source of predictions states for each moment of a drive; 0 where it states nothing."""
     rates: list[Kbps] = []
 

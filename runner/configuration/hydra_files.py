@@ -25,7 +25,7 @@ class CheckedFiles(FileConfigSource):
         return SCHEME
 
     def is_config(self, config_path: str) -> bool:
-        """Whether there is anything of that name; `load_config` says why it cannot be read."""
+        """Whether there is anything of that name; `load_config` reports why it cannot be read."""
         return (Path(self.path) / self._normalize_file_name(config_path)).exists()
 
     def load_config(self, config_path: str) -> ConfigResult:

@@ -94,7 +94,7 @@ def written_out(document: Any, most: int) -> bool:
 
 
 class _Sizes:
-    """Values below each path, counted once. A circle counts as nothing: OmegaConf tells it."""
+    """Values below each path, counted once. A cycle counts as nothing: OmegaConf reports it."""
 
     def __init__(self, document: Any) -> None:
         self._document = document

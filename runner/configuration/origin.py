@@ -37,7 +37,7 @@ class Composed:
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
 
     def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
-        """A problem of the whole, told of the file or override that it came from, by the path in there."""
+        """A problem of the whole, attributed to its file or override, by the path in there."""
         path = self.written(path)
         part = self._origin(path)
         return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
@@ -74,7 +74,7 @@ class Composed:
         return self.parts.index(self._origin(path))
 
     def _origin(self, path: schema.Path) -> Part:
-        """The part that has the value; for what is missing, the one that says most about its surroundings."""
+        """The part that has the value; for what is missing, the one that states most of its surroundings."""
         inside = [part for part in self._visible(path) if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
             makers = [part for part in inside if len(part.package) == length]
@@ -83,9 +83,9 @@ class Composed:
             if length < len(path):  # the key is missing: the part that wrote its surroundings, the most local first
                 writers = [part for part in holders if isinstance(_held(part, path[:length]), dict | list)]
                 holders = sorted(writers or holders, key=_locality)
-            asked = [*holders, *makers] if length == len(path) else [*makers, *holders]
-            if asked:
-                return asked[0]
+            candidates = [*holders, *makers] if length == len(path) else [*makers, *holders]
+            if candidates:
+                return candidates[0]
         vehicle = (part for part in self.parts if part.path and part.path.parent.name == "vehicle")
         return next(vehicle, self.parts[-1]) if path[:1] in (("name",), ("cameras",)) else self.parts[-1]
 
@@ -122,7 +122,7 @@ def _locality(part: Part) -> int:
 
 
 def _held(part: Part, path: schema.Path) -> Any:
-    """What a part says at a path of the whole document; None: nothing."""
+    """The value of a part at a path of the whole document; None: it has none."""
     inside = path[: len(part.package)] == part.package
     return _value(part.content, path[len(part.package) :]) if inside else None
 

@@ -81,14 +81,14 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
 
 
 def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
-    """A choice of a file that is not there, or a value for a key that belongs to the whole document."""
+    """A choice of a missing file, or a value for a key that belongs to the whole document."""
     if not override.choice or override.value is None or override.is_none:
         return
     group = override.key.split("@")[0].lstrip("/")
     known = options(group, directories)
     if str(override.value) not in known:
         folders = " or ".join(f"{label(directory / group)}/" for directory in reversed(directories))
-        rule = f"no such file in {folders}, {suggest(str(override.value), known)}"
+        rule = f"no such file in {folders}{suggest(str(override.value), known)}"
         if len(directories) == 1 and "did you mean" not in rule:
             rule += "; files of your own need conf=DIR"
         yield Problem(COMMAND_LINE, override.key, str(override.value), rule)

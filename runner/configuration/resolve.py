@@ -27,7 +27,7 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
     written = OmegaConf.to_container(config)
     if not written_out(written, MOST_RESOLVED):
         file = next(part.file for part in parts if "${" in str(part.content))
-        rule = f"interpolations, ${{...}}, refer to each other too deeply or come to more than {MOST_RESOLVED} values"
+        rule = f"interpolations, ${{...}}, are nested too deeply or expand to more than {MOST_RESOLVED} values"
         raise ConfigError([Problem(file, "", None, rule)])
     try:
         document = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -40,7 +40,7 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
 
 
 def without(composed: Composed, part: Part) -> Composed | None:
-    """What there would be if a part said nothing; None where that cannot be told from the parts."""
+    """The configuration without a part; None where the parts do not determine it."""
     from omegaconf import OmegaConf
 
     others = [other for other in composed.parts if other is not part]

@@ -29,7 +29,7 @@ def find_rule(name: str) -> Rule:
                 rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
                 raise ModelError("", repr(name), rule) from None
     if name not in rules.RULES:
-        raise ModelError("", repr(name), f"unknown rule, {suggest(name, rules.RULES)}")
+        raise ModelError("", repr(name), f"unknown rule{suggest(name, rules.RULES)}")
     return rules.RULES[name]
 
 
@@ -43,8 +43,8 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     known = found.parameters
     for key, value in parameters.items():
         if key not in known:
-            hint = suggest(key, known) if known else f"{name} takes none"
-            raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter, {hint}")
+            hint = suggest(key, known) if known else f"; {name} takes none"
+            raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter{hint}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
             raise ModelError(f"{name}.{key}", repr(value), "must be a number from 0")
         if "_every_" in key and value == 0:

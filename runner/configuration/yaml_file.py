@@ -169,7 +169,7 @@ def _loaders() -> tuple[Any, Any]:
             self._depth -= 1
             if isinstance(event, yaml.AliasEvent):
                 if id(node) not in self._sizes:
-                    raise _beyond(event, f"an alias, *{event.anchor}, stands inside what it refers to")
+                    raise _beyond(event, f"an alias, *{event.anchor}, is part of the value it refers to")
                 self._values += self._sizes[id(node)]
             else:
                 self._values += 1

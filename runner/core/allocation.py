@@ -19,7 +19,7 @@ def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
     b_full   kbit/s for the full image
     roi      px, what the operator has set
     full     px, the full image
-    returns  kbit/s; a camera that is off has p_set = 0, which the caller says by not asking
+    returns  kbit/s; a camera that is off has p_set = 0, for which the caller does not call this
     """
     return Fraction(roi.pixels * b_full, full.pixels) if roi is not full and roi != full else b_full
 

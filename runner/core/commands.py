@@ -35,17 +35,17 @@ class Command:
         return {"camera": self.camera, "knob": self.knob, "value": value}
 
 
-Knobs = Mapping[str, KnobValue]  # value by knob, of one camera
+KnobValues = Mapping[str, KnobValue]  # value by knob, of one camera
 
 
-def wanted(setting: Setting) -> Knobs:
+def wanted(setting: Setting) -> KnobValues:
     """Where a setting wants a camera's knobs. While nothing is sent the other knobs stay where they are."""
     if not setting.sending:
         return {"sending": False}
     return {"sending": True, "roi": setting.roi, "size": (setting.width, setting.height), "bitrate": setting.kbps}
 
 
-def difference(decision: Decision, commanded: Mapping[str, Knobs]) -> list[Command]:
+def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[Command]:
     """Commands that take every camera from where its knobs were commanded to, to where the decision wants them."""
     commands = []
     for name, setting in decision.settings.items():
@@ -58,7 +58,7 @@ def difference(decision: Decision, commanded: Mapping[str, Knobs]) -> list[Comma
     return commands
 
 
-def after(commanded: Mapping[str, Knobs], commands: list[Command]) -> Mapping[str, Knobs]:
+def after(commanded: Mapping[str, KnobValues], commands: list[Command]) -> Mapping[str, KnobValues]:
     """Where the knobs are commanded to once these commands are given."""
     if not commands:
         return commanded

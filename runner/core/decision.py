@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -46,7 +47,7 @@ class Decision:
     total: Kbps
     settings: Mapping[str, Setting]
 
-    def says_the_same(self, other: Decision) -> bool:
+    def equals_with_reasons(self, other: Decision) -> bool:
         """Whether it is equal and for the same reasons."""
         return self == other and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
 
@@ -71,9 +72,14 @@ class Draft(NamedTuple):
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
 
-    def but(self, **changes: Any) -> Draft:
+    def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""
         return self._replace(**changes)
+
+    def but(self, **changes: Any) -> Draft:
+        """Deprecated: use `replaced`."""
+        warnings.warn("Draft.but is deprecated, use Draft.replaced", DeprecationWarning, stacklevel=2)
+        return self.replaced(**changes)
 
     def noted(self, note: str, **changes: Any) -> Draft:
         """The draft with these parts replaced and the reason for it."""

@@ -70,7 +70,7 @@ class RoiSet(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfigured(Event):
-    """The operator's bitrate and scaling factor of one camera, mode single; None keeps what is."""
+    """The operator's bitrate and scaling factor of one camera, mode single; None: unchanged."""
 
     camera: str
     kbps: Kbps | None = None
@@ -161,7 +161,7 @@ def to_json(event: Event) -> dict[str, Any]:
 
 
 def describe(event: Event) -> str:
-    """An event in a few words: its name and what it says."""
-    said = to_json(event)
-    words = (f"{key} {value}" for key, value in said.items() if key not in ("t", "event"))
-    return " ".join((said["event"], *words))
+    """An event in one line: its name, keys and values."""
+    document = to_json(event)
+    words = (f"{key} {value}" for key, value in document.items() if key not in ("t", "event"))
+    return " ".join((document["event"], *words))

@@ -46,14 +46,16 @@ def plain(number: Fraction) -> int | float:
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """The rest of a sentence on an unknown word: what was probably meant, else what there is."""
+    """The end of a sentence on an unknown word, with its separator: the nearest known word, else all known words."""
     known = list(known)
     near = get_close_matches(word, known, 1)
     shown = [*known[:13], "..."] if len(known) > 13 else known
-    return f"did you mean {near[0]}?" if near else f"there is {', '.join(shown)}"
+    if near:
+        return f", did you mean {near[0]}?"
+    return f"; expected {'one of ' if len(shown) > 1 else ''}{', '.join(shown)}" if shown else ""
 
 
-class RuleCall(Protocol):
+class ModeRule(Protocol):
     """A rule with its parameters, as a mode lists it, see `runner.core.rules`.
 
     reads  fields of the state whose change makes the mode decide again
@@ -139,7 +141,7 @@ class Element:
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class KnobTarget:
     """One property that a knob sets, and with what: kbps, bps, left, right, top, bottom, on, off or a caps template."""
 
     element: str
@@ -164,7 +166,7 @@ class Graph:
     operator: tuple[Element, ...]
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
-    knobs: Mapping[str, tuple[Turn, ...]]
+    knobs: Mapping[str, tuple[KnobTarget, ...]]
     settings: Mapping[str, Value]
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
@@ -179,7 +181,7 @@ class Graph:
         for knob, turns in self.knobs.items():
             for index, turn in enumerate(turns):
                 if turn.element not in names:
-                    rule = f"no such element, {suggest(turn.element, names)}"
+                    rule = f"no such element{suggest(turn.element, names)}"
                     raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
         turned = {(turn.element, turn.property) for turns in self.knobs.values() for turn in turns}
         for index, pair in enumerate(self.mutable):
@@ -333,7 +335,7 @@ class Media(Endpoint):
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class PageSettings:
     """The operator's page, on 127.0.0.1.
 
     late_ms  age of a picture when it is drawn, above which it is marked as late
@@ -362,10 +364,10 @@ class Vehicle:
     name: str
     cameras: Mapping[str, Camera]
     mode: Mode
-    modes: Mapping[Mode, tuple[RuleCall, ...]]
+    modes: Mapping[Mode, tuple[ModeRule, ...]]
     media: Media
     control: Endpoint
-    page: Page
+    page: PageSettings
     pqos: Mapping[str, Any]
     recording: Recording
     expires_s: float

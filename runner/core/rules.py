@@ -106,19 +106,19 @@ def rule(
 @rule(gives=["total"], reads=["prediction"])
 def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one comes."""
-    return draft.but(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+    return draft.replaced(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
 
 
 @rule(gives=["total"], reads=["collective_total"])
 def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode C: the total is the operator's; `start_kbps` where a run starts in C and none was set yet."""
-    return draft.but(total=start_kbps if state.collective_total is None else state.collective_total), memory
+    return draft.replaced(total=start_kbps if state.collective_total is None else state.collective_total), memory
 
 
 @rule(gives=["total"], reads=[])
 def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
-    """The total is what the file says, whatever is predicted: for comparison."""
-    return draft.but(total=kbps), memory
+    """The total is a constant, independent of the prediction: for comparison."""
+    return draft.replaced(total=kbps), memory
 
 
 @rule(gives=["demand"], reads=["on", "rois"])
@@ -130,14 +130,14 @@ def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
         else allocation.ZERO
         for name, camera in vehicle.cameras.items()
     }
-    return draft.but(demand=demands), memory
+    return draft.replaced(demand=demands), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
     assert draft.total is not None
-    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
@@ -147,7 +147,7 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
     wanted = {name: demand for name, demand in draft.demand.items() if demand}
     weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
-    return draft.but(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
@@ -163,7 +163,7 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = "" if not kbps or roi is full or roi == full else f", as {_whole(bitrate)} for the full image"
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
-    return draft.but(scaling=factors, reasons=reasons), memory
+    return draft.replaced(scaling=factors, reasons=reasons), memory
 
 
 @rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
@@ -174,7 +174,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
     total = sum(bitrates.values(), allocation.ZERO)
-    return draft.but(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+    return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
 # --- answers to inputs that are stale or lost: modes=safe -------------------------------------------------------------
@@ -182,7 +182,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["total"], gives=["total"], reads=["prediction"])
 def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """The total is at most what the prediction says the bitrate will hardly fall below, where it says so."""
+    """The total is at most the lower bound of the prediction, where it states one."""
     lower = None if state.prediction is None else state.prediction.lower_kbps
     assert draft.total is not None
     if lower is None or lower >= draft.total:
@@ -254,7 +254,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
             now[name] = (held, since)
             factors[name] = held
             reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
-    return draft.but(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
+    return draft.replaced(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
 
 
 # --- running a list ---------------------------------------------------------------------------------------------------
@@ -278,8 +278,8 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
     return Decision(state.mode, draft.total, {name: _setting(state, draft, name) for name in vehicle.cameras}), memory
 
 
-def _draft_problem(state: State, before: Draft, draft: Any) -> str:
-    """Why the cameras cannot be sent with what a rule has changed in the draft, or ""."""
+def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
+    """Why the cameras cannot be sent with the parts of the draft that a rule has changed; None if they can."""
     if not isinstance(draft, Draft):
         return "it must return a Draft and the memory"
     if draft.total is not before.total and not _is_bitrate(draft.total):
@@ -293,7 +293,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str:
         for name, on in state.on.items():
             if on and not fits(values.get(name)):
                 return f"{part} of {name} {values.get(name)!r}: {rule}"
-    return ""
+    return None
 
 
 def _is_bitrate(value: Any) -> bool:

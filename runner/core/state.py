@@ -13,7 +13,7 @@ from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle
 
 
 class Refused(Exception):
-    """A well-formed event that cannot be accepted now; the text says why and what would be right."""
+    """A well-formed event that cannot be accepted now; the text gives the reason and the valid values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Manual:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Inputs of the rules. What no event has told yet is None.
+    """Inputs of the rules. A value that no event has set yet is None.
 
     t                 seconds, time of the last event
     manual            by camera: what mode single sends, or what a camera that is off sent last
@@ -133,7 +133,7 @@ def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
 def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
-    raise Refused(f"unknown camera {name!r}, {suggest(name, vehicle.cameras)}")
+    raise Refused(f"unknown camera {name!r}{suggest(name, vehicle.cameras)}")
 
 
 def _only_in(mode: Mode, state: State, event: ev.Event) -> None:

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from runner.core import rules
-from runner.core.commands import Command, Knobs, after, difference
+from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
 from runner.core.events import Event
 from runner.core.model import Mode, Vehicle
 from runner.core.rules import Memory
 from runner.core.state import Refused, State, advance, keep
 
-NOTHING: Mapping[str, Knobs] = MappingProxyType({})
+NOTHING: Mapping[str, KnobValues] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +23,17 @@ class Run:
 
     commanded  by camera and knob, what has been commanded so far
     commands   what this event made of it: the difference
-    refused    why the event was not accepted, or ""
-    fault      why the rules could not decide, so that an earlier decision stays in force, or ""
+    refused    why the event was not accepted; None if it was
+    fault      why the rules could not decide, so that an earlier decision stays in force; None if they could
     """
 
     state: State
     memory: Memory
     decision: Decision
-    commanded: Mapping[str, Knobs] = field(default_factory=lambda: NOTHING)
+    commanded: Mapping[str, KnobValues] = field(default_factory=lambda: NOTHING)
     commands: tuple[Command, ...] = ()
-    refused: str = ""
-    fault: str = ""
+    refused: str | None = None
+    fault: str | None = None
 
 
 def start(vehicle: Vehicle) -> Run:
@@ -54,9 +54,11 @@ def start(vehicle: Vehicle) -> Run:
 def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
     """Take one event: advance the state, decide if an input of the rules changed, command the difference.
 
-    Where a rule fails, the last decision stays in force and `fault` says why. A mode whose rules fail is not entered.
+    Where a rule fails, the last decision stays in force and `fault` gives the reason. A mode whose rules fail is not
+    entered.
     """
-    refused, fault = "", run.fault
+    refused: str | None = None
+    fault = run.fault
     state, memory, decision = run.state, run.memory, run.decision
     try:
         state = advance(vehicle, run.state, event, run.decision)
@@ -67,7 +69,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
     if any(_differ(getattr(state, name), getattr(run.state, name)) for name in inputs):
         try:
             decision, memory = rules.decide(vehicle, state, run.memory)
-            fault = ""
+            fault = None
         except rules.RuleFailed as failed:
             if state.mode is run.state.mode:
                 fault = str(failed)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.drive.series import Positions, Series, Values
+from runner.drive.series import FloatSeries, Positions, Series
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # that the rates of the samples are taken over
@@ -19,7 +19,7 @@ WAITED_MS = 50.0  # more than the least latency of the drive: the queue before t
 GAP_S = 2.0  # positions further apart say nothing of the time between
 
 
-class Sample(NamedTuple):
+class CapacitySample(NamedTuple):
     """What the link gave at a place: degrees, kbit/s of encoded video."""
 
     lat: float
@@ -36,16 +36,16 @@ class Cell(NamedTuple):
     samples: int
 
 
-def cannot_tell(drive: Series) -> str:
-    """Why a drive says nothing of the link, or ""."""
+def capacity_problem(drive: Series) -> str | None:
+    """Why a drive does not show the capacity of the link; None if it does."""
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
-    return "" if drive.positions else "has no positions"
+    return None if drive.positions else "has no positions"
 
 
-def limited_samples(drive: Series) -> list[Sample]:
-    """The samples of a drive in which the link was the limit; none where it cannot tell."""
-    if cannot_tell(drive) or drive.positions is None:
+def limited_samples(drive: Series) -> list[CapacitySample]:
+    """The samples of a drive in which the link was the limit; none where they cannot be determined."""
+    if capacity_problem(drive) or drive.positions is None:
         return []
     received = [camera.received for camera in drive.cameras.values() if camera.received]
     t, kbps = drive.actual
@@ -54,43 +54,45 @@ def limited_samples(drive: Series) -> list[Sample]:
         limited |= _lost(t, camera.t, camera.lost) | _waited(t, camera.arrival_t, camera.clocks_ms)
     lat, lon = _at(drive.positions, t)
     known = limited & np.isfinite(kbps) & np.isfinite(lat)
-    return [Sample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
+    return [CapacitySample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
 
 
-def cells(samples: Iterable[Sample], percentile: float, cell_m: float) -> list[Cell]:
+def cells(samples: Iterable[CapacitySample], percentile: float, cell_m: float) -> list[Cell]:
     """Squares of the ground, in the order in which they were first met.
 
     percentile  of the rates in a cell, 0 to 100: 10 is what the link gave in nine of ten samples
     cell_m      side of a square, m
     """
-    found: dict[tuple[int, int], list[Sample]] = {}
-    first: Sample | None = None
+    found: dict[tuple[int, int], list[CapacitySample]] = {}
+    first: CapacitySample | None = None
     for sample in samples:
         first = first or sample
         found.setdefault(_square(sample, first, cell_m), []).append(sample)
     return [_cell(inside, percentile) for inside in found.values()]
 
 
-def _cell(inside: list[Sample], percentile: float) -> Cell:
+def _cell(inside: list[CapacitySample], percentile: float) -> Cell:
     lat, lon, kbps = np.array(inside).T
     # The lower of two neighbours: between them nothing was measured.
     return Cell(lat.mean(), lon.mean(), float(np.percentile(kbps, percentile, method="lower")), len(inside))
 
 
-def _square(sample: Sample, origin: Sample, cell_m: float) -> tuple[int, int]:
+def _square(sample: CapacitySample, origin: CapacitySample, cell_m: float) -> tuple[int, int]:
     """Column and row, on the plane around the first sample."""
     east, north = offset(origin.lat, origin.lon, sample.lat, sample.lon)
     return int(np.floor(east / cell_m)), int(np.floor(north / cell_m))
 
 
-def _lost(at: Values, t: Values, lost: Values) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _lost(at: FloatSeries, t: FloatSeries, lost: FloatSeries) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Whether packets were lost in the second before each time."""
     before = np.interp(at - WINDOW_S, t, lost)
     more: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = np.interp(at, t, lost) > before
     return more
 
 
-def _waited(at: Values, t: Values, latency_ms: Values) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _waited(
+    at: FloatSeries, t: FloatSeries, latency_ms: FloatSeries
+) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Whether half of the frames that came in the second before each time had waited."""
     waited = np.zeros(at.shape, dtype=bool)
     if not np.isfinite(latency_ms).any():
@@ -103,7 +105,7 @@ def _waited(at: Values, t: Values, latency_ms: Values) -> np.ndarray[tuple[int, 
     return waited
 
 
-def _at(positions: Positions, t: Values) -> tuple[Values, Values]:
+def _at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:
     """Degrees in the middle of the second before each time; nan where no position is near."""
     middle = t - WINDOW_S / 2
     after = np.searchsorted(positions.t, middle).clip(1, max(1, len(positions.t) - 1))

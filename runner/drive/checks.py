@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Check(NamedTuple):
-    """One claim. holds: None where the drive does not tell."""
+class ClaimCheck(NamedTuple):
+    """One claim. holds: None where the drive does not show it."""
 
     claim: str
     outcome: str

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.drive.checks import Check
-from runner.drive.series import Line, Series, Values, held, spans
+from runner.drive.checks import ClaimCheck
+from runner.drive.series import FloatSeries, Series, TimeSeries, held, spans
 
 SHORTEST_S = 5.0  # in which there is something to look at
 STEP_S = 0.1  # at which quantities that hold are looked at
@@ -30,11 +30,11 @@ class Span(NamedTuple):
     end: float
 
 
-def driving_test(drive: Series) -> list[Check]:
+def driving_test(drive: Series) -> list[ClaimCheck]:
     """Section V-B of the paper: a drive of about 100 s in mode A, its bitrates and factors."""
     known = {name for name in (*SIDES, CENTER) if name in drive.cameras}
     if known != {*SIDES, CENTER} or len(drive.panels) < 2:
-        return [Check("The paper's vehicle is driven", f"cameras {', '.join(drive.cameras)}", False)]
+        return [ClaimCheck("The paper's vehicle is driven", f"cameras {', '.join(drive.cameras)}", False)]
     if drive.end < SHORTEST_S:
         return [_length(drive)]
     return [
@@ -49,74 +49,74 @@ def driving_test(drive: Series) -> list[Check]:
     ]
 
 
-CLAIMS: Mapping[str, Callable[[Series], list[Check]]] = {"driving_test": driving_test}
+CLAIMS: Mapping[str, Callable[[Series], list[ClaimCheck]]] = {"driving_test": driving_test}
 
 
-def claims(drive: Series) -> list[Check]:
+def claims(drive: Series) -> list[ClaimCheck]:
     """Those that the drive's experiment names; none where it names none."""
     named = str((drive.config.get("experiment") or {}).get("claims"))
     return CLAIMS[named](drive) if named in CLAIMS else []
 
 
-def _length(drive: Series) -> Check:
-    return Check("The test takes approximately 100 s", f"{drive.end:.0f} s", abs(drive.end - 100) <= 10)
+def _length(drive: Series) -> ClaimCheck:
+    return ClaimCheck("The test takes approximately 100 s", f"{drive.end:.0f} s", abs(drive.end - 100) <= 10)
 
 
-def _range(drive: Series, line: Line, what: str) -> Check:
+def _range(drive: Series, line: TimeSeries, what: str) -> ClaimCheck:
     claim = f"The total bitrate ranges from 3000 to 8000 kbit/s ({what})"
     known = line.y[np.isfinite(line.y) & (line.t > 1)]
     if not known.size:
-        return Check(claim, "not logged", None)
+        return ClaimCheck(claim, "not logged", None)
     low, high = float(known.min()), float(known.max())
     wide = low < RANGE_KBPS[0] * 1.2 and high > RANGE_KBPS[1] * 0.8
     inside = what != "predicted" or (low >= RANGE_KBPS[0] and high <= RANGE_KBPS[1])
-    return Check(claim, f"{low:.0f} to {high:.0f} kbit/s", wide and inside)
+    return ClaimCheck(claim, f"{low:.0f} to {high:.0f} kbit/s", wide and inside)
 
 
-def _sides_get_more(drive: Series) -> Check:
+def _sides_get_more(drive: Series) -> ClaimCheck:
     claim = "Front left and right are always allocated higher bitrates than the other cameras"
     others = [name for name in drive.cameras if name not in SIDES]
     ratios = [_kbps(drive, side) / np.maximum(_kbps(drive, other), 1) for side in SIDES for other in others]
     least = float(np.min(ratios))
-    return Check(claim, f"at least {least:.2f} times as much", least > 1)
+    return ClaimCheck(claim, f"at least {least:.2f} times as much", least > 1)
 
 
-def _tops_are_equal(drive: Series) -> Check:
+def _tops_are_equal(drive: Series) -> ClaimCheck:
     tops = drive.panels[1].cameras
     allocated = np.array([_kbps(drive, name) for name in tops])
     apart = float((allocated.max(axis=0) - allocated.min(axis=0)).max())
-    return Check(
+    return ClaimCheck(
         "The bitrates of the top views are controlled equally", f"at most {apart:.0f} kbit/s apart", apart <= 1
     )
 
 
-def _tops_get_less(drive: Series) -> Check:
+def _tops_get_less(drive: Series) -> ClaimCheck:
     along, tops = (np.array([_kbps(drive, name) for name in panel.cameras]) for panel in drive.panels)
     most = float((tops.max(axis=0) / np.maximum(along.min(axis=0), 1)).max())
     claim = "The top views get less than the front- and rear-mounted cameras"
-    return Check(claim, f"at most {most:.2f} times as much as the least of these", most < 1)
+    return ClaimCheck(claim, f"at most {most:.2f} times as much as the least of these", most < 1)
 
 
-def _dip(drive: Series, around: float) -> Check:
+def _dip(drive: Series, around: float) -> ClaimCheck:
     """Lower factors for several seconds, for all cameras except front center."""
     claim = f"Around {around:.0f} s lower resolutions are selected for all cameras except front center"
     if drive.end < around + NEAR_S:
-        return Check(claim, NOT_SO_LONG, None)
+        return ClaimCheck(claim, NOT_SO_LONG, None)
     low = [span for span in _below(drive, DEEP_KBPS) if abs((span.begin + span.end) / 2 - around) <= NEAR_S]
     if not low:
-        return Check(claim, f"the total stays above {DEEP_KBPS:.0f} kbit/s there", False)
+        return ClaimCheck(claim, f"the total stays above {DEEP_KBPS:.0f} kbit/s there", False)
     span = low[0]
     lower = [name for name in drive.cameras if _lowest(drive, name, span) < _before(drive, name, span)]
     same = [name for name in drive.cameras if name not in lower]
     outcome = f"from {span.begin:.1f} to {span.end:.1f} s for {len(lower)} cameras, not for {', '.join(same) or 'none'}"
-    return Check(claim, outcome, same == [CENTER] and span.end - span.begin >= SEVERAL_S)
+    return ClaimCheck(claim, outcome, same == [CENTER] and span.end - span.begin >= SEVERAL_S)
 
 
-def _shallow(drive: Series) -> Check:
+def _shallow(drive: Series) -> ClaimCheck:
     begin, end = SHALLOW_S
     claim = f"Between {begin:.0f} and {end:.0f} s less is predicted, and no resolution is changed"
     if drive.end < end - 2:
-        return Check(claim, NOT_SO_LONG, None)
+        return ClaimCheck(claim, NOT_SO_LONG, None)
     at = _times(Span(begin + 2, end - 2))
     inside, elsewhere = held(drive.predicted, at), held(drive.predicted, _times(Span(0, drive.end)))
     less = bool(np.nanmax(inside) < np.nanmedian(elsewhere))
@@ -124,22 +124,22 @@ def _shallow(drive: Series) -> Check:
     outcome = (
         f"{np.nanmin(inside):.0f} to {np.nanmax(inside):.0f} kbit/s, changes of {', '.join(changed) or 'no camera'}"
     )
-    return Check(claim, outcome, less and not changed)
+    return ClaimCheck(claim, outcome, less and not changed)
 
 
-def _times(span: Span) -> Values:
+def _times(span: Span) -> FloatSeries:
     return np.arange(span.begin, span.end, STEP_S)
 
 
-def _kbps(drive: Series, name: str) -> Values:
+def _kbps(drive: Series, name: str) -> FloatSeries:
     """What a camera was allocated, over the drive but for its first second, in which the first prediction comes."""
     decided = drive.cameras[name].decided
-    return held(Line(decided.t, decided.kbps), _times(Span(1, drive.end)))
+    return held(TimeSeries(decided.t, decided.kbps), _times(Span(1, drive.end)))
 
 
-def _factor(drive: Series, name: str, at: Values) -> Values:
+def _factor(drive: Series, name: str, at: FloatSeries) -> FloatSeries:
     decided = drive.cameras[name].decided
-    return held(Line(decided.t, decided.scaling), at)
+    return held(TimeSeries(decided.t, decided.scaling), at)
 
 
 def _lowest(drive: Series, name: str, span: Span) -> float:

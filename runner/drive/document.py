@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from runner.drive.checks import Check
-from runner.drive.series import Link, Series
-from runner.drive.statistics import CameraStatistics, Latency, Statistics
+from runner.drive.checks import ClaimCheck
+from runner.drive.series import LinkSeries, Series
+from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
 
 VERSION = 1
 
 
 def to_json(
-    drives: Sequence[Statistics],
-    checks: Mapping[str, Sequence[Check]],
+    drives: Sequence[DriveStatistics],
+    checks: Mapping[str, Sequence[ClaimCheck]],
     figures: Sequence[str],
     left_out: Sequence[str],
 ) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def rules(drive: Series) -> dict[str, list[str]]:
     return {mode: [name for rule in calls for name in rule] for mode, calls in modes.items()}
 
 
-def _drive(drive: Statistics, checks: Sequence[Check]) -> dict[str, Any]:
+def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, Any]:
     series = drive.series
     return {
         "label": series.label,
@@ -99,7 +99,7 @@ def _latency(latency: Latency) -> dict[str, float | None] | None:
     return {key: number(value, 2) for key, value in latency._asdict().items()}
 
 
-def _link(link: Link) -> dict[str, Any]:
+def _link(link: LinkSeries) -> dict[str, Any]:
     return {
         "min_kbps": number(float(link.kbps.min()), 1),
         "max_kbps": number(float(link.kbps.max()), 1),

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from runner.drive.series import CameraSeries, Line, Panel, Positions, Series, Values, held
-from runner.drive.statistics import Statistics, latencies, per_second, to_arrival
+from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Series, TimeSeries, held
+from runner.drive.statistics import DriveStatistics, latencies, per_second, to_arrival
 
 MINUTES_FROM_S = 900.0
-APART = 0.014  # of the largest factor, between steps that would lie on one another
+STEP_OFFSET = 0.014  # of the largest factor, between steps that would lie on one another
 WIDE = 8.0  # latencies that spread over more than this ratio have a logarithmic axis
 DECADES = 50.0  # over more than this ratio fewer of them are numbered
 QUANTILES = np.concatenate([np.linspace(0, 0.95, 96), np.linspace(0.951, 1, 50)])
@@ -25,11 +25,11 @@ FLATTEST = 0.4  # shorter side of a map over the longer
 SMALLEST_TRACK_M = 20.0  # around a vehicle that stands
 METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 
-Drives = Sequence[Statistics]
+Drives = Sequence[DriveStatistics]
 
 
 class Axis(NamedTuple):
-    """marks: the values that are numbered; none leaves the choice to whoever draws."""
+    """marks: the values that are numbered; none leaves the choice to the renderer."""
 
     title: str
     low: float
@@ -44,23 +44,23 @@ class Curve:
     """A quantity, in the units of the axes.
 
     colour     place of a camera in the palette, or the name of a colour of the style sheet
-    dash       which of the dashes; they tell curves apart without colour
+    dash       index of the dash pattern, which distinguishes curves without colour
     around     lowest and highest of the cameras that the curve is the mean of
     steps      each value holds until the next
     filled     down to 0, without a line
-    why        of each value, for whoever points at it
+    reasons    of each value, shown when it is hovered over
     """
 
     label: str
-    x: Values
-    y: Values
+    x: FloatSeries
+    y: FloatSeries
     colour: int | str
     dash: int = 0
     width: float = 1.0
-    around: tuple[Values, Values] | None = None
+    around: tuple[FloatSeries, FloatSeries] | None = None
     steps: bool = False
     filled: bool = False
-    why: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
 
 
 class Bars(NamedTuple):
@@ -72,20 +72,20 @@ class Bars(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Rows of bars below a chart, on its axis of time; and what is said where there are none."""
+    """Rows of bars below a chart, on its axis of time; and the text shown where there are none."""
 
     bars: tuple[Bars, ...]
     none: str
 
 
-class Track(NamedTuple):
+class MapTrack(NamedTuple):
     """Positions, m, the bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) on the way."""
 
-    way: tuple[Values, Values]
-    t: Values
-    east: Values
-    north: Values
-    kbps: Values
+    way: tuple[FloatSeries, FloatSeries]
+    t: FloatSeries
+    east: FloatSeries
+    north: FloatSeries
+    kbps: FloatSeries
     low: float
     high: float
     title: str
@@ -109,7 +109,7 @@ class Chart:
     part: int = 0
     unit_s: float = 1.0
     strip: Strip | None = None
-    track: Track | None = None
+    track: MapTrack | None = None
     hover: str = ""
 
 
@@ -152,7 +152,7 @@ def bitrate_on_track(drives: Drives) -> Rows | str:
         xlim, ylim = _limits(series.positions)
         title = f"total {series.measured or 'allocated'} in kbit/s"
         way = (series.positions.east, series.positions.north)
-        track = Track(way, t, east, north, kbps, low, high, title, tuple(_arrows(*way)))
+        track = MapTrack(way, t, east, north, kbps, low, high, title, tuple(_arrows(*way)))
         x, y = Axis("m east of the start", *xlim), Axis("m north", *ylim)
         rows.append([Chart(_label(drives, at), x, y, drive=at, track=track)])
     return rows
@@ -163,7 +163,7 @@ def totals(drives: Drives) -> Rows:
 
     def curves(series: Series) -> Iterable[Curve]:
         if series.link:
-            yield _steps("link's rate", Line(series.link.t, series.link.kbps), series, "link", filled=True)
+            yield _steps("link's rate", TimeSeries(series.link.t, series.link.kbps), series, "link", filled=True)
         yield _steps("allocated", series.allocated, series, "allocated", width=1.6)
         yield _steps("predicted", series.predicted, series, "predicted", dash=1)
         if series.measured:
@@ -178,9 +178,9 @@ def bitrates(drives: Drives) -> Rows | str:
     """Actual bitrate of each camera (paper, Fig. 6)."""
     kinds = {drive.series.measured for drive in drives} - {""}
     if not kinds:
-        return "neither what was sent nor what was received was logged"
+        return "neither sent nor received video was logged"
 
-    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+    def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
         for dash, names in enumerate(coinciding(drive.series, panel, _allocated)):
             lines = [drive.series.cameras[name].actual for name in names]
             yield _mean(_named(names, panel, ": mean and range"), lines, _place(drive, names), dash)
@@ -194,17 +194,17 @@ def scaling(drives: Drives) -> Rows:
     factors = [{f for panel in d.series.panels for f in _factors(d, panel)} for d in drives]
     reach = max(max(each, default=1.0) for each in factors)
 
-    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+    def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
         groups = coinciding(drive.series, panel, _factor)
         used = [set(_factor(drive.series.cameras[names[0]])[1].tolist()) for names in groups]
         meet = any(a & b for a, b in combinations(used, 2))
         for dash, names in enumerate(groups):
             camera = drive.series.cameras[names[0]]
-            offset = ((len(groups) - 1) / 2 - dash) * APART * reach * meet
+            offset = ((len(groups) - 1) / 2 - dash) * STEP_OFFSET * reach * meet
             label = _named(names, panel) + (f" (offset {offset:+.3f})" if offset else "")
-            curve = _steps(label, Line(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
-            why = tuple(_why(names, camera, drive.series.end))
-            yield replace(curve, y=curve.y + offset, why=why)
+            curve = _steps(label, TimeSeries(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
+            reasons = tuple(_step_reasons(names, camera, drive.series.end))
+            yield replace(curve, y=curve.y + offset, reasons=reasons)
 
     def axis(part: int, _: Sequence[Sequence[Curve]]) -> Axis:
         panels = [(drive, panel) for drive in drives for panel in drive.series.panels[part : part + 1]]
@@ -230,12 +230,12 @@ def latency(drives: Drives) -> Rows | str:
 
 
 def quality(drives: Drives) -> Rows | str:
-    """Quality of each camera as its rate-quality model says."""
+    """Quality of each camera by its rate-quality model."""
     metrics = sorted({each.quality.metric for drive in drives for each in drive.cameras.values() if each.quality})
     if not metrics:
         return "no rate-quality models were found"
 
-    def curves(drive: Statistics, panel: Panel) -> Iterable[Curve]:
+    def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
         for dash, name in enumerate(panel.cameras):
             estimate = drive.cameras[name].quality
             if estimate and estimate.metric == metrics[0]:
@@ -267,7 +267,7 @@ KBPS = "%{y:,.0f} kbit/s"
 
 
 def coinciding(
-    drive: Series, panel: Panel, key: Callable[[CameraSeries], tuple[Values, Values]]
+    drive: Series, panel: Panel, key: Callable[[CameraSeries], tuple[FloatSeries, FloatSeries]]
 ) -> list[tuple[str, ...]]:
     """The cameras of a panel in groups whose quantity is the same at all times."""
     groups: dict[tuple[bytes, bytes], list[str]] = {}
@@ -277,11 +277,11 @@ def coinciding(
     return [tuple(names) for names in groups.values()]
 
 
-def _allocated(camera: CameraSeries) -> tuple[Values, Values]:
+def _allocated(camera: CameraSeries) -> tuple[FloatSeries, FloatSeries]:
     return camera.decided.t, np.where(camera.decided.sending, camera.decided.kbps, np.nan)
 
 
-def _factor(camera: CameraSeries) -> tuple[Values, Values]:
+def _factor(camera: CameraSeries) -> tuple[FloatSeries, FloatSeries]:
     return camera.decided.t, np.where(camera.decided.sending, camera.decided.scaling, np.nan)
 
 
@@ -291,11 +291,11 @@ def _named(names: Sequence[str], panel: Panel, more: str = "") -> str:
     return (f"all {len(names)} cameras" if len(names) == len(panel.cameras) else ", ".join(names)) + more
 
 
-def _place(drive: Statistics, names: Sequence[str]) -> int:
+def _place(drive: DriveStatistics, names: Sequence[str]) -> int:
     return list(drive.series.cameras).index(names[0])
 
 
-def _mean(label: str, lines: Sequence[Line], colour: int, dash: int) -> Curve:
+def _mean(label: str, lines: Sequence[TimeSeries], colour: int, dash: int) -> Curve:
     """Mean of lines at the times of the first, with the lowest and the highest."""
     if len(lines) == 1 or not lines[0].t.size:
         return Curve(label, *lines[0], colour, dash)
@@ -304,7 +304,7 @@ def _mean(label: str, lines: Sequence[Line], colour: int, dash: int) -> Curve:
     return Curve(label, t, values.mean(axis=0), colour, dash, around=(values.min(axis=0), values.max(axis=0)))
 
 
-def _factors(drive: Statistics, panel: Panel) -> set[float]:
+def _factors(drive: DriveStatistics, panel: Panel) -> set[float]:
     """Those that the cameras of a panel may use, and those that were in force."""
     described = drive.series.config.get("cameras") or {}
     ladders = [(described.get(name) or {}).get("rate_quality", {}).get("scaling", ()) for name in panel.cameras]
@@ -312,19 +312,19 @@ def _factors(drive: Statistics, panel: Panel) -> set[float]:
     return {float(factor) for each in (*ladders, *used) for factor in each if factor} or {1.0}
 
 
-def _why(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
+def _step_reasons(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
     """Of each step of a factor, the time, the factor and the reason."""
     decided = camera.decided
-    told = [
+    reasons = [
         f"{', '.join(names)} from {t:.1f} s: {'off' if np.isnan(factor) else f'{factor:g}'}\n{reason}"
         for t, factor, reason in zip(*_factor(camera), decided.reason, strict=True)
     ]
-    return told + told[-1:] if told and decided.t[-1] < end else told
+    return reasons + reasons[-1:] if reasons and decided.t[-1] < end else reasons
 
 
 def _by_panel(
     drives: Drives,
-    curves: Callable[[Statistics, Panel], Iterable[Curve]],
+    curves: Callable[[DriveStatistics, Panel], Iterable[Curve]],
     axis: Callable[[int, Sequence[Sequence[Curve]]], Axis],
     hover: str,
     *,
@@ -348,7 +348,7 @@ def _by_panel(
 
 
 def _label(drives: Drives, at: int) -> str:
-    """What tells a drive from others."""
+    """The label that distinguishes a drive from others."""
     return drives[at].series.label if len(drives) > 1 else ""
 
 
@@ -371,7 +371,7 @@ def _over_time(
     return Chart(title, x, y, scaled, drive=at, unit_s=unit, strip=strip, **more)
 
 
-def _steps(label: str, line: Line, series: Series, colour: int | str, **more: Any) -> Curve:
+def _steps(label: str, line: TimeSeries, series: Series, colour: int | str, **more: Any) -> Curve:
     """A quantity whose values hold until the next, up to the end of the drive."""
     t, y = line
     if t.size and t[-1] < series.end:
@@ -389,7 +389,7 @@ def _top(found: Iterable[Iterable[Curve]]) -> float:
 # --- latency ----------------------------------------------------------------------------------------------------------
 
 
-def _spread(title: str, shown: Values) -> Axis:
+def _spread(title: str, shown: FloatSeries) -> Axis:
     """An axis that holds some latencies: logarithmic where they spread and none is below 0."""
     low, high = float(shown.min()), float(shown.max())
     if low <= 0 or high / low <= WIDE:
@@ -399,7 +399,7 @@ def _spread(title: str, shown: Values) -> Axis:
     return Axis(title, low * 0.95, high * 1.05, tuple(each for each in marks if low <= each <= high), log=True)
 
 
-def _freezes(drive: Statistics) -> Strip:
+def _freezes(drive: DriveStatistics) -> Strip:
     """A row for each camera that froze."""
     frozen = [(place, camera) for place, camera in enumerate(drive.cameras.values()) if camera.freezes]
     bars = (Bars(camera.name, place, tuple(camera.freezes or ())) for place, camera in frozen)
@@ -428,14 +428,14 @@ def _distribution(drives: Drives, known: Sequence[int]) -> Chart:
     return Chart(title, x, y, tuple(curves), drive=None, part=1, hover="%{x:.0f} ms or less: %{y:.1%} of the frames")
 
 
-def _shares(label: str, values: Values, colour: int | str, **more: Any) -> Curve:
+def _shares(label: str, values: FloatSeries, colour: int | str, **more: Any) -> Curve:
     return Curve(label, np.quantile(values, QUANTILES), QUANTILES, colour, **more)
 
 
 # --- the map ----------------------------------------------------------------------------------------------------------
 
 
-def on_track(drive: Series) -> tuple[Values, Values, Values, Values]:
+def on_track(drive: Series) -> tuple[FloatSeries, FloatSeries, FloatSeries, FloatSeries]:
     """Time, m east, m north and total bitrate, kbit/s: as measured, or as allocated where nothing was."""
     places = drive.positions
     assert places is not None
@@ -458,7 +458,7 @@ def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]
     return found[0], found[1]
 
 
-def _arrows(x: Values, y: Values) -> Iterable[tuple[float, float, float]]:
+def _arrows(x: FloatSeries, y: FloatSeries) -> Iterable[tuple[float, float, float]]:
     """Along the way, at even distances."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     for share in np.arange(1, ARROWS + 1) / (ARROWS + 1) if way[-1] > SMALLEST_TRACK_M else ():

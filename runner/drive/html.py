@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from runner.drive.checks import Check
+from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
-from runner.drive.figures import Chart, Curve, Figure, Track
-from runner.drive.series import Series, Values
-from runner.drive.statistics import Statistics
+from runner.drive.figures import Chart, Curve, Figure, MapTrack
+from runner.drive.series import FloatSeries, Series
+from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import MEANING, VERDICTS, camera_rows, drive_rows, shown
 from runner.system.files import plotly_script
 
@@ -25,12 +25,12 @@ STATIC = Path(__file__).parent / "static"
 MOST_POINTS = 2000  # of a curve; longer ones are thinned
 LAST_REASONS = 200
 ORDER = ("bitrate_on_track", "totals", "bitrates", "scaling", "latency", "quality")
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+HtmlTable = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
 def page(
-    drives: Sequence[Statistics],
-    checks: Mapping[str, Sequence[Check]],
+    drives: Sequence[DriveStatistics],
+    checks: Mapping[str, Sequence[ClaimCheck]],
     figures: Sequence[Figure],
     left_out: Sequence[str],
 ) -> str:
@@ -71,23 +71,23 @@ def _json(document: Any) -> str:
 
 
 def _body(
-    drives: Sequence[Statistics],
-    checks: Mapping[str, Sequence[Check]],
+    drives: Sequence[DriveStatistics],
+    checks: Mapping[str, Sequence[ClaimCheck]],
     figures: Sequence[Figure],
     left_out: Sequence[str],
 ) -> Iterable[str]:
     several = len(drives) > 1
-    yield from (_about(drive, several=several) for drive in drives)
+    yield from (_drive_section(drive, several=several) for drive in drives)
     if notes := _notes(drives, left_out):
         yield f"<section>{notes}</section>"
     if several:
-        yield _section("Drives beside each other", _table("One row for each drive", drive_rows(drives)))
+        yield _section("Drives compared", _table("One row for each drive", drive_rows(drives)))
     for drive in drives:
         held = checks.get(drive.series.label)
         if held:
             rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
-            heading = f"What the paper reports and what came out{_of(drive, several)}"
-            yield _section(heading, _table("Claims", (("claim", "came out", "holds"), rows)))
+            heading = f"Claims of the paper and results{_of(drive, several)}"
+            yield _section(heading, _table("Claims", (("claim", "result", "holds"), rows)))
     yield f'<div class="figures{"" if several else " single"}">'
     yield from (_figure(figure) for figure in _shown(figures))
     yield "</div>"
@@ -104,18 +104,18 @@ def _shown(figures: Sequence[Figure]) -> list[Figure]:
     return sorted(figures, key=lambda figure: ORDER.index(figure.name))
 
 
-def _notes(drives: Sequence[Statistics], left_out: Sequence[str]) -> str:
-    """What to know of the drives, each note once."""
+def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
+    """Notes of the drives, each note once."""
     noted = _once((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
-    told = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
-    items = "".join(f"<li>{escape(each)}</li>" for each in (*told, *left_out))
-    return f'<ul class="warnings" aria-label="What to know">{items}</ul>' if items else ""
+    notes = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
+    items = "".join(f"<li>{escape(each)}</li>" for each in (*notes, *left_out))
+    return f'<ul class="warnings" aria-label="Notes">{items}</ul>' if items else ""
 
 
-def _once(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Each text once, with the labels of what it is said of."""
+def _once(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Each text once, with the labels of its drives."""
     found: dict[str, list[str]] = {}
-    for text, label in said:
+    for text, label in notes:
         found.setdefault(text, []).append(label)
     return found
 
@@ -125,7 +125,7 @@ def _list(facts: Iterable[tuple[str, str]]) -> str:
     return f"<dl>{listed}</dl>"
 
 
-def _of(drive: Statistics, several: bool) -> str:
+def _of(drive: DriveStatistics, several: bool) -> str:
     return f": {drive.series.label}" if several else ""
 
 
@@ -133,7 +133,7 @@ def _section(heading: str, content: str) -> str:
     return f"<section><h2>{escape(heading)}</h2>{content}</section>"
 
 
-def _table(caption: str, table: Table, more: str = "") -> str:
+def _table(caption: str, table: HtmlTable, more: str = "") -> str:
     """A table that the keyboard can scroll."""
     headings, rows = table
     head = "".join(f'<th scope="col">{escape(each)}</th>' for each in headings)
@@ -148,7 +148,7 @@ def _table(caption: str, table: Table, more: str = "") -> str:
     )
 
 
-def _about(drive: Statistics, *, several: bool) -> str:
+def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
     """What was driven, when, with what, and how it ended."""
     series = drive.series
     ends = ", ".join(f"{side}: {'ended cleanly' if clean else 'cut off'}" for side, clean in series.ended.items())
@@ -176,7 +176,7 @@ def _rules(series: Series) -> str:
     return "; ".join(f"{mode}: {', '.join(known[mode])}" for mode in used if mode in known) or "-"
 
 
-def _versions(drive: Statistics) -> Iterable[tuple[str, str]]:
+def _versions(drive: DriveStatistics) -> Iterable[tuple[str, str]]:
     """By side, what it ran."""
     for side, versions in drive.series.versions.items():
         yield side, ", ".join(f"{name} {version}" for name, version in versions.items()) or "-"
@@ -193,12 +193,12 @@ def _figure(figure: Figure) -> str:
     return f'<section class="figure" id="{figure.name}">{heading}<div class="charts">{charts}</div></section>'
 
 
-def _reasons(drive: Statistics, of: str) -> str:
+def _reasons(drive: DriveStatistics, of: str) -> str:
     """The last changes and why; and what was noted."""
     last = drive.series.reasons[-LAST_REASONS:]
     rows = [(f"{each.t:.1f}", each.camera, each.reason, each.cause) for each in reversed(last)]
-    told = f"the last {len(rows)} of {len(drive.series.reasons)} changes of factor or sending, newest first"
-    parts = [f'<p class="muted">{told}</p>', _table("Decisions", (("s", "camera", "why", "after"), rows), " tall")]
+    caption = f"the last {len(rows)} of {len(drive.series.reasons)} changes of factor or sending, newest first"
+    parts = [f'<p class="muted">{caption}</p>', _table("Decisions", (("s", "camera", "why", "after"), rows), " tall")]
     if drive.series.notes:
         notes = [(f"{t:.1f}", text) for t, text in reversed(drive.series.notes[-LAST_REASONS:])]
         parts.append(_table("Notes", (("s", "note"), notes), " tall"))
@@ -234,20 +234,20 @@ def _curve(curve: Curve) -> dict[str, Any]:
     kept[:: 1 + len(x) // MOST_POINTS] = True
     if curve.steps and x.size:
         changed = np.append(True, ~np.isclose(y[1:], y[:-1], equal_nan=True))
-        kept = changed | (kept if curve.why else False)
+        kept = changed | (kept if curve.reasons else False)
         kept[-1] = True
     around = curve.around and [_rounded(side[kept]) for side in curve.around]
-    why = [curve.why[at] for at in np.flatnonzero(kept)] if curve.why else None
+    why = [curve.reasons[at] for at in np.flatnonzero(kept)] if curve.reasons else None
     points = {"x": _rounded(x[kept]), "y": _rounded(y[kept]), "around": around, "why": why}
     return {key: getattr(curve, key) for key in keys} | points
 
 
-def _track(track: Track) -> dict[str, Any]:
+def _track(track: MapTrack) -> dict[str, Any]:
     each, every = 1 + len(track.t) // MOST_POINTS, 1 + len(track.way[0]) // MOST_POINTS
     columns = {key: _rounded(getattr(track, key)[::each]) for key in ("t", "east", "north", "kbps")}
     way = [_rounded(side[::every]) for side in track.way]
     return columns | {"way": way, "low": track.low, "high": track.high, "title": track.title, "arrows": track.arrows}
 
 
-def _rounded(values: Values) -> list[float | None]:
+def _rounded(values: FloatSeries) -> list[float | None]:
     return [number(float(f"{value:.6g}"), 6) for value in values.tolist()]

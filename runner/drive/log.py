@@ -1,4 +1,4 @@
-"""What one side of a drive says, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
+"""The log of one side of a drive, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from runner.records import (
 from runner.redact import redacted
 
 FORMAT = 1
-WITHOUT_LOG = "the drive goes on without its log"
+WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 # Records of numbers and of the rules' own words; looking through a decision takes twenty times as long as making it.
@@ -165,12 +165,12 @@ class _File:
         self.path, self._fd = path, fd
         self._size = 0
 
-    def append(self, data: bytes) -> str:
-        """Write a line; returns why it was not written, or ""."""
+    def append(self, data: bytes) -> str | None:
+        """Write a line; returns why it was not written, None if it was."""
         try:
             if os.write(self._fd, data) == len(data):
                 self._size += len(data)
-                return ""
+                return None
             why = "no space left on device"
         except OSError as error:
             why = (error.strerror or str(error)).lower()
@@ -229,13 +229,13 @@ class _Writer:
     def _written(self, data: bytes) -> bool:
         """Write a line, however often that takes; False where the log is closed before it is written."""
         why = self._file.append(data)
-        if not why:
+        if why is None:
             return True
         self._report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
         while self._file.append(data):
             if self._closing.wait(RETRY_S):
                 return False
-        self._report(f"the log is written again: {self._file.path.name}")
+        self._report(f"the log continues: {self._file.path.name}")
         return True
 
 

@@ -39,7 +39,7 @@ VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_recei
 ReadVideo = Callable[[Path], Iterator["Unit"]]
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """What is to be written, and for when.
 
     ns  since 1970
@@ -60,8 +60,8 @@ def write_mcap(
 
     file        takes the bytes
     read_video  gives the pictures of a file
-    warn        told what is left out
-    progress    told now and then which share is done
+    warn        called with a line on what is left out
+    progress    called now and then with the share that is done
     returns     number of messages
     raises      RunError where the file cannot be written
     """
@@ -197,7 +197,7 @@ def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
 
 def _streams(
     drive: Drive, channels: _Channels, read_video: ReadVideo, warn: Callable[[str], None]
-) -> Iterator[Iterator[Message]]:
+) -> Iterator[Iterator[McapMessage]]:
     """Messages by where they come from, each in the order of time."""
     for name, side in drive.sides.items():
         # Where the vehicle did not log, the operator knows where it was.
@@ -207,12 +207,12 @@ def _streams(
             yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, warn)
 
 
-def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[Message]:
+def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
     began = round(side.began.time * SECOND_NS)
     for line in side.lines:
         ns = began + round(line.t * SECOND_NS)
         for write in _writers(name, line, channels, positions, ns):
-            yield Message(ns, write)
+            yield McapMessage(ns, write)
 
 
 def _writers(
@@ -251,10 +251,10 @@ def _pictures(
     channels: _Channels,
     read_video: ReadVideo,
     warn: Callable[[str], None],
-) -> Iterator[Message]:
+) -> Iterator[McapMessage]:
     """The frames of one camera on one side, at the times of their capture.
 
-    known  capture times that the log tells, ns since 1970, rising
+    known  capture times from the log, ns since 1970, rising
     """
     topic = topic.format(camera=camera)
     last = -1
@@ -269,9 +269,9 @@ def _pictures(
                 offset = follow(known, first + unit.after_ns, offset)
                 # A pipeline that was built anew begins after the one before has ended, but clocks may be set.
                 last = max(first + unit.after_ns + offset, last + 1)
-                yield Message(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
+                yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
-            warn(f"{error}; the export goes on without {'the rest of it' if last >= first else 'it'}")
+            warn(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
 
 
 def _captures(side: Side, camera: str) -> list[int]:

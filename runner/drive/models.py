@@ -53,5 +53,5 @@ def _read(path: Path) -> Model:
 
     model = rate_curves(read_model(path))
     if not model.curves:
-        raise UserError(str(path), "points", None, f"has none with the metric {model.metric}")
+        raise UserError(str(path), "points", None, f"has no point with the metric {model.metric}")
     return model

@@ -25,7 +25,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from matplotlib.transforms import ScaledTranslation
 
 from runner.drive.colours import DAY, NAMED
-from runner.drive.figures import Axis, Chart, Curve, Figure, Strip, Track
+from runner.drive.figures import Axis, Chart, Curve, Figure, MapTrack, Strip
 from runner.system.files import write_whole
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def _strip_height(strip: Strip) -> float:
     return 0.1 + 0.11 * max(len(strip.bars), 1)
 
 
-def _draw_track(axes: Axes, track: Track) -> None:
+def _draw_track(axes: Axes, track: MapTrack) -> None:
     """The way, where it begins and ends, arrows along it, and the bitrate by colour."""
     x, y = track.way
     viridis = ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.93, 256)))  # its lightest is not seen on white
@@ -233,7 +233,7 @@ def _wrapped(label: str, columns: int) -> str:
 
 
 def _legend(axes: Axes, curves: Iterable[Curve], columns: int) -> None:
-    """One legend under a column of charts, for all that is drawn in it."""
+    """One legend under a column of charts, for all its curves."""
     handles = [_handle(curve, _wrapped(curve.label, columns)) for curve in curves]
     assert axes.figure is not None
     down = axes.transAxes + ScaledTranslation(0, -LEGEND_IN, axes.figure.dpi_scale_trans)

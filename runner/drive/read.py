@@ -15,7 +15,7 @@ from runner.records import Began, Ended, Json, LinesDropped, Record, from_json, 
 from runner.schema import event_problem, log_problem, read_json
 
 T = TypeVar("T")
-PASSED_OVER = (
+SKIPPED_KINDS = (
     "decision",
     "telemetry",
     "note",
@@ -72,7 +72,7 @@ def read_drive(directory: Path) -> Drive:
     files = {side: directory / name for side, name in FILES.items()}
     sides = {side: _side(side, path, warnings) for side, path in files.items() if path.is_file()}
     if not sides.keys() & {"vehicle", "operator"}:
-        raise UserError(where, "", None, f"holds no drive: neither {FILES['vehicle']} nor {FILES['operator']}")
+        raise UserError(where, "", None, f"contains no drive log: neither {FILES['vehicle']} nor {FILES['operator']}")
     return Drive(directory, sides, warnings)
 
 
@@ -103,7 +103,9 @@ def check_began(line: Json | None, name: str) -> Began:
     if line is None:
         raise UserError(name, "", None, "is empty: nothing was logged")
     if line.get("log") != "began":
-        raise UserError(f"{name}: line 1", "", None, "is no beginning of a drive: must be a file that log= wrote")
+        raise UserError(
+            f"{name}: line 1", "", None, "not the first line of a drive log: must be a file that log= wrote"
+        )
     if line["format"] != FORMAT:
         raise UserError(f"{name}: line 1", "format", str(line["format"]), f"this version reads format {FORMAT}")
     return from_json(Began, line)
@@ -116,7 +118,7 @@ def read_lines(
 
     events  give events only, and the beginning; what else a side wrote is not looked at
 
-    In a drive, a last line without an end, which a killed process left, is left out and told.
+    In a drive, a last line without an end, which a killed process left, is left out with a warning.
 
     raises  UserError with the number of the first line that is wrong
     """
@@ -125,7 +127,7 @@ def read_lines(
         line, problem = read_line(text)
         if is_log(line):
             drive = True
-            if events and line["log"] in PASSED_OVER:
+            if events and line["log"] in SKIPPED_KINDS:
                 continue
             problem = problem or log_problem(line)
         if problem and drive and not text.endswith("\n"):
@@ -136,17 +138,17 @@ def read_lines(
         yield number, line
 
 
-def read_line(text: str) -> tuple[Json, str]:
-    """The JSON of a line, and what is wrong with it as JSON and as an event, or ""."""
+def read_line(text: str) -> tuple[Json, str | None]:
+    """The JSON of a line, and its problem as JSON or as an event; None if it is valid."""
     try:
         line = read_json(text.rstrip())
     except json.JSONDecodeError as error:
         return {}, f"not JSON: {error.msg} (column {error.pos + 1})"
     except ValueError as error:
         return {}, f"not JSON: {error}"
-    return line, "" if is_log(line) else event_problem(line)
+    return line, None if is_log(line) else event_problem(line)
 
 
 def is_log(line: Any) -> bool:
-    """Whether a line tells what a side did or saw, and is no event."""
+    """Whether a line is a record of a side, not an event."""
     return isinstance(line, dict) and "log" in line and "event" not in line

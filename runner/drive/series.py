@@ -34,42 +34,42 @@ from runner.records import (
 )
 from runner.system.clocks import CLOCKS_APART_MS, TRUSTED_AGAIN_S
 
-Values = NDArray[np.float64]
+FloatSeries = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
 DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
-PANEL_CAMERAS = 4  # as many curves are told apart in one panel; more are split where the mounting gives no groups
+PANEL_CAMERAS = 4  # as many curves can be distinguished in one panel; more are split where the mounting gives no groups
 
 
-class Line(NamedTuple):
+class TimeSeries(NamedTuple):
     """A quantity over time: t s, rising; y its values."""
 
-    t: Values
-    y: Values
+    t: FloatSeries
+    y: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
-class Decided:
+class DecidedSeries:
     """What was decided for one camera, each entry in force until the next.
 
     roi_share  pixels of the region of interest over those of the full image
     scaling    nan while the camera is off
     """
 
-    t: Values
+    t: FloatSeries
     sending: Flags
-    kbps: Values
-    scaling: Values
-    width: Values
-    height: Values
-    roi_share: Values
+    kbps: FloatSeries
+    scaling: FloatSeries
+    width: FloatSeries
+    height: FloatSeries
+    roi_share: FloatSeries
     reason: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class ReceivedSeries:
     """What the operator got of one camera. Counters run on where the log's own began again from 0.
 
     t                        s, of each sample
@@ -82,28 +82,28 @@ class Received:
     clocks_ms                time of arrival by the operator's clock less time of capture by the vehicle's
     """
 
-    t: Values
-    kbps: Values
-    width: Values
-    height: Values
-    latency_ms: Values
-    frames: Values
-    bytes: Values
-    lost: Values
-    rebuilt: Values
-    arrival_t: Values
-    arrival_ms: Values
-    clocks_ms: Values
+    t: FloatSeries
+    kbps: FloatSeries
+    width: FloatSeries
+    height: FloatSeries
+    latency_ms: FloatSeries
+    frames: FloatSeries
+    bytes: FloatSeries
+    lost: FloatSeries
+    rebuilt: FloatSeries
+    arrival_t: FloatSeries
+    arrival_ms: FloatSeries
+    clocks_ms: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
     """What the vehicle's encoder has put out: counters that run on, and the rate over the last second."""
 
-    t: Values
-    frames: Values
-    bytes: Values
-    kbps: Values
+    t: FloatSeries
+    frames: FloatSeries
+    bytes: FloatSeries
+    kbps: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,36 +111,36 @@ class CameraSeries:
     """One camera. received, sent: None where that side has no log."""
 
     name: str
-    decided: Decided
-    received: Received | None
+    decided: DecidedSeries
+    received: ReceivedSeries | None
     sent: Sent | None
 
     @property
-    def actual(self) -> Line:
+    def actual(self) -> TimeSeries:
         """The bitrate as received, or as sent where no operator logged."""
         source = self.received or self.sent
-        return Line(source.t, source.kbps) if source else EMPTY
+        return TimeSeries(source.t, source.kbps) if source else EMPTY
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
     """Where the vehicle was: degrees, and m east and north of its first place."""
 
-    t: Values
-    lat: Values
-    lon: Values
-    east: Values
-    north: Values
+    t: FloatSeries
+    lat: FloatSeries
+    lon: FloatSeries
+    east: FloatSeries
+    north: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkSeries:
     """The limited link of an experiment: rate in force, kbit/s; wait of a packet, ms; packets dropped so far."""
 
-    t: Values
-    kbps: Values
-    queue_ms: Values
-    dropped: Values
+    t: FloatSeries
+    kbps: FloatSeries
+    queue_ms: FloatSeries
+    dropped: FloatSeries
 
 
 class Reason(NamedTuple):
@@ -181,11 +181,11 @@ class Series:
     end: float
     cameras: Mapping[str, CameraSeries]
     panels: tuple[Panel, ...]
-    predicted: Line
-    allocated: Line
-    actual: Line
+    predicted: TimeSeries
+    allocated: TimeSeries
+    actual: TimeSeries
     measured: str
-    link: Link | None
+    link: LinkSeries | None
     positions: Positions | None
     modes: tuple[tuple[float, str], ...]
     reasons: tuple[Reason, ...]
@@ -197,7 +197,7 @@ class Series:
     config: Mapping[str, Any]
 
 
-EMPTY = Line(np.empty(0), np.empty(0))
+EMPTY = TimeSeries(np.empty(0), np.empty(0))
 
 
 def series(drive: Drive, label: str = "") -> Series:
@@ -209,26 +209,26 @@ def series(drive: Drive, label: str = "") -> Series:
     return _series(drive, label or drive.name)
 
 
-def held(line: Line, at: Values) -> Values:
+def held(line: TimeSeries, at: FloatSeries) -> FloatSeries:
     """What of a quantity whose values hold until the next is in force at some times; nan before the first."""
     index = np.searchsorted(line.t, at, "right") - 1
     return np.where(index >= 0, line.y[np.maximum(index, 0)], np.nan) if line.t.size else np.full(at.shape, np.nan)
 
 
-def spans(t: Values, begin: float, end: float) -> Values:
+def spans(t: FloatSeries, begin: float, end: float) -> FloatSeries:
     """How long each entry of something that holds until the next is in force within [begin, end], s."""
     edges = np.clip(np.append(t, end), begin, end)
     return np.asarray(np.diff(edges))
 
 
-def mean_held(line: Line, begin: float, end: float) -> float:
+def mean_held(line: TimeSeries, begin: float, end: float) -> float:
     """Mean over time of a quantity whose values hold until the next; nan where none is known."""
     weights = spans(line.t, begin, end)
     known = np.isfinite(line.y) & (weights > 0)
     return float(np.average(line.y[known], weights=weights[known])) if known.any() else float("nan")
 
 
-def sending_spans(decided: Decided, end: float) -> list[tuple[float, float]]:
+def sending_spans(decided: DecidedSeries, end: float) -> list[tuple[float, float]]:
     """When a camera was to be sent: [(from s, to s), ...]."""
     found: list[tuple[float, float]] = []
     for (start, until), sending in zip(pairwise([*decided.t, end]), decided.sending, strict=True):
@@ -258,13 +258,13 @@ def _series(drive: Drive, label: str) -> Series:
     leading = drive.sides.get("vehicle") or drive.sides["operator"]
     began, end = leading.began.time, max((line.t for line in leading.lines), default=0.0)
     if end <= 0:
-        raise UserError(str(drive.path), "", None, "has no length: nothing was logged but its beginning")
+        raise UserError(str(drive.path), "", None, "is empty: only the first line was logged")
     sides = {name: _Shifted(side.lines, side.began.time - began) for name, side in drive.sides.items()}
     vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
     decisions: Sequence[tuple[float, DecisionMade | VehicleState]]
     decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
     if not decisions:
-        raise UserError(str(drive.path), "", None, "has no decision yet: there is nothing to report")
+        raise UserError(str(drive.path), "", None, "contains no decision")
     config = leading.began.config
     samples = [at for at in operator.of(Sample) if 0 <= at[0] <= end]
     telemetry = vehicle.of(Telemetry)
@@ -301,20 +301,20 @@ def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mappin
         yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
     received = [camera.received for camera in cameras.values() if camera.received]
     lowest = min((float(np.nanmin(got.clocks_ms)) for got in received if np.isfinite(got.clocks_ms).any()), default=0.0)
-    told = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
-    ahead_ms = max(-lowest, told)
+    reported_ms = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
+    ahead_ms = max(-lowest, reported_ms)
     if ahead_ms > -CLOCKS_APART_MS:
         rule = f"latencies are unknown up to {TRUSTED_AGAIN_S:g} s before and after"
         yield f"the vehicle's clock was ahead of the operator's by at least {ahead_ms:.0f} ms: {rule}"
 
 
-def _line(points: Iterable[tuple[float, float | None]]) -> Line:
+def _line(points: Iterable[tuple[float, float | None]]) -> TimeSeries:
     found = [(t, np.nan if y is None else float(y)) for t, y in points]
     t, y = np.array(found, dtype=float).reshape(-1, 2).T
-    return Line(t, y)
+    return TimeSeries(t, y)
 
 
-def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> Line:
+def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> TimeSeries:
     """Predictions as they came, or what the samples say was in force."""
     events = vehicle.of(BitratePredicted)
     if events:
@@ -322,25 +322,25 @@ def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[An
     return _line((t, line.predicted_kbps) for t, line in (telemetry or samples))
 
 
-def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Line:
+def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeSeries:
     """Measured total; unknown before the first second of video, whose rate is taken over a window yet to fill."""
     received = [camera.received for camera in cameras.values() if camera.received]
     if received:
         t, y = _line((t, sample.actual_kbps) for t, sample in samples)
-        return Line(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
+        return TimeSeries(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
-    return Line(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
+    return TimeSeries(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
 
 
-def _link(lines: Sequence[Any]) -> Link | None:
+def _link(lines: Sequence[Any]) -> LinkSeries | None:
     if not lines:
         return None
     rows = np.array([(t, line.kbps, line.queue_ms, line.dropped) for t, line in lines], dtype=float)
-    return Link(*rows.T)
+    return LinkSeries(*rows.T)
 
 
 def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
-    """As the vehicle was told them, or else as the operator saw them; None where there are none.
+    """As the vehicle received them, or else as the operator received them; None where there are none.
 
     Metres by equirectangular projection around the first place, right for some km.
     """
@@ -393,12 +393,12 @@ def _camera(
     )
 
 
-def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> Decided:
-    def column(key: str) -> Values:
+def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> DecidedSeries:
+    def column(key: str) -> FloatSeries:
         return np.array([getattr(camera, key) for _, camera in decided], dtype=float)  # None becomes nan
 
     shares = [camera.roi.pixels / full if full else 1.0 for _, camera in decided]
-    return Decided(
+    return DecidedSeries(
         t=np.array([t for t, _ in decided], dtype=float),
         sending=np.array([camera.sending for _, camera in decided], dtype=bool),
         kbps=column("kbps"),
@@ -410,8 +410,8 @@ def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> Deci
     )
 
 
-def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received:
-    def column(key: str) -> Values:
+def _received(received: Sequence[tuple[float, float, CameraSample]]) -> ReceivedSeries:
+    def column(key: str) -> FloatSeries:
         return np.array([getattr(camera, key) for *_, camera in received], dtype=float)
 
     came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.arrivals]
@@ -419,8 +419,8 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
-    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame that was told before
-    return Received(
+    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame already counted
+    return ReceivedSeries(
         t=t,
         kbps=_settled(t, column("kbps"), frames),
         **{key: column(key) for key in ("width", "height")},
@@ -447,7 +447,7 @@ def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, Came
     return known
 
 
-def _known(t: Values, ms: Values, apart: Values) -> Values:
+def _known(t: FloatSeries, ms: FloatSeries, apart: FloatSeries) -> FloatSeries:
     """Latencies, nan where one is negative or was, or will be, within `TRUSTED_AGAIN_S`."""
     near = np.searchsorted(apart, t + TRUSTED_AGAIN_S, "right") > np.searchsorted(apart, t - TRUSTED_AGAIN_S)
     return np.where(near | (ms < 0), np.nan, ms)
@@ -460,13 +460,13 @@ def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:
     return Sent(t, frames, sizes, rate(t, sizes))
 
 
-def _settled(t: Values, kbps: Values, frames: Values) -> Values:
+def _settled(t: FloatSeries, kbps: FloatSeries, frames: FloatSeries) -> FloatSeries:
     """A rate that is nan until its window has filled with video twice: the first holds what waited for the line."""
     came = t[frames > 0]
     return np.where(t >= (came[0] if came.size else np.inf) + 2 * RATE_WINDOW_S, kbps, np.nan)
 
 
-def counted(counter: Values) -> Values:
+def counted(counter: FloatSeries) -> FloatSeries:
     """A running counter that goes on where the logged one began again from 0."""
     if not counter.size:
         return counter
@@ -474,7 +474,7 @@ def counted(counter: Values) -> Values:
     return np.asarray(np.cumsum(np.append(counter[0], np.where(steps < 0, counter[1:], steps))))
 
 
-def rate(t: Values, sizes: Values) -> Values:
+def rate(t: FloatSeries, sizes: FloatSeries) -> FloatSeries:
     """kbit/s at each time over the second before, from a running counter of bytes; nan before there is a second."""
     before = np.searchsorted(t, t - RATE_WINDOW_S + 1e-6, "right") - 1
     known = before >= 0

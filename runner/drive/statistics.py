@@ -17,10 +17,10 @@ from runner.drive.series import (
     RATE_WINDOW_S,
     CameraSeries,
     Flags,
-    Line,
-    Received,
+    FloatSeries,
+    ReceivedSeries,
     Series,
-    Values,
+    TimeSeries,
     held,
     mean_held,
     sending_spans,
@@ -54,21 +54,21 @@ class Latency(NamedTuple):
 class PerSecond(NamedTuple):
     """Latency of the frames of all cameras in each second: where it begins, s; median and 95th percentile, ms."""
 
-    t: Values
-    median: Values
-    p95: Values
+    t: FloatSeries
+    median: FloatSeries
+    p95: FloatSeries
 
 
 class RateCurve(NamedTuple):
     """Quality of one factor as measured: kbit/s that came out of the encoder, rising, and the quality."""
 
-    kbps: Values
-    quality: Values
+    kbps: FloatSeries
+    quality: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What a rate-quality model says of quality: a curve by factor, in units of the metric."""
+    """Quality by a rate-quality model: a curve by factor, in units of the metric."""
 
     metric: str
     curves: Mapping[float, RateCurve]
@@ -89,7 +89,7 @@ class Estimate:
     """
 
     metric: str
-    line: Line
+    line: TimeSeries
     moving: float
     clamped: float
     unknown: tuple[float, ...]
@@ -133,7 +133,7 @@ class CameraStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Statistics:
+class DriveStatistics:
     """A drive: its cameras, and all of them together."""
 
     series: Series
@@ -156,7 +156,7 @@ class Statistics:
     notes: tuple[str, ...]
 
 
-def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Statistics:
+def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> DriveStatistics:
     """All figures of a drive.
 
     models  by camera, where there is one
@@ -171,7 +171,7 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Stat
     frozen = [freeze for camera in each for freeze in camera.freezes or ()]
     watched = any(camera.freezes is not None for camera in each)
     kbps, allocated = (sum_known(getattr(camera, key) for camera in each) for key in ("kbps", "allocated"))
-    return Statistics(
+    return DriveStatistics(
         series=drive,
         cameras=cameras,
         kbps=kbps,
@@ -194,14 +194,14 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Stat
 
 
 def camera_statistics(camera: CameraSeries, end: float, model: Model | None = None) -> CameraStatistics:
-    source, got, decided = camera.received or camera.sent, camera.received, camera.decided
+    source, received, decided = camera.received or camera.sent, camera.received, camera.decided
     begin, until = (float(source.t[0]), float(source.t[-1])) if source else (0.0, end)
     sending = [(max(a, begin), min(b, until)) for a, b in sending_spans(decided, end)]
     sending_s = sum(max(0.0, b - a) for a, b in sending)
     frames = float(source.frames[-1] - source.frames[0]) if source else NAN
     kbps = ratio(float(source.bytes[-1] - source.bytes[0]) * 8 / 1000, until - begin) if source else NAN
-    allocated = mean_held(Line(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
-    stood = tuple(freezes(got.arrival_t, sending)) if got and _arrivals_logged(got) else None
+    allocated = mean_held(TimeSeries(decided.t, np.where(decided.sending, decided.kbps, 0.0)), begin, until)
+    frozen_spans = tuple(freezes(received.arrival_t, sending)) if received and _arrivals_logged(received) else None
     return CameraStatistics(
         name=camera.name,
         frames=int(source.frames[-1]) if source else 0,
@@ -212,41 +212,41 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         share=ratio(kbps, allocated),
         factors=factor_shares(camera, begin, until),
         sizes=size_shares(camera, begin, until),
-        arrival=latency(got.arrival_ms) if got else Latency(),
-        decode=latency(got.latency_ms) if got else Latency(),
-        freezes=stood,
-        frozen=NAN if stood is None else ratio(sum(freeze.seconds for freeze in stood), sending_s),
-        lost=int(got.lost[-1]) if got else None,
-        rebuilt=int(got.rebuilt[-1]) if got else None,
-        quality=estimate(camera, model, stood or ()) if model else None,
+        arrival=latency(received.arrival_ms) if received else Latency(),
+        decode=latency(received.latency_ms) if received else Latency(),
+        freezes=frozen_spans,
+        frozen=NAN if frozen_spans is None else ratio(sum(freeze.seconds for freeze in frozen_spans), sending_s),
+        lost=int(received.lost[-1]) if received else None,
+        rebuilt=int(received.rebuilt[-1]) if received else None,
+        quality=estimate(camera, model, frozen_spans or ()) if model else None,
     )
 
 
-def _arrivals_logged(got: Received) -> bool:
-    """An operator who logged frames but no arrivals kept none of them."""
-    return bool(got.arrival_t.size) or not got.frames[-1]
+def _arrivals_logged(received: ReceivedSeries) -> bool:
+    """An operator that logged frames but no arrivals kept none of them."""
+    return bool(received.arrival_t.size) or not received.frames[-1]
 
 
 def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
     """What is missing, and what to know of the estimates of quality."""
     if not drive.measured:
-        yield "neither what was sent nor what was received was logged: only what was decided is known"
+        yield "neither sent nor received video was logged: only decisions are known"
     if drive.positions is None:
-        yield "no positions were logged: it is not on the map"
+        yield "no positions were logged: not drawn on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     frozen = ", ".join(f"{name} {_part(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
     if frozen:
-        rule = "a picture that stands still counts as what it was, whatever moves meanwhile: at most as good as told"
+        rule = "a frozen picture counts as its last frame, whatever moves meanwhile: an upper bound"
         yield f"estimated quality: {rule}; frozen {frozen} of the time"
     clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
-        yield f"estimated quality: bitrates not measured, where the nearest one stands in: {clamped} of the time"
+        yield f"estimated quality: bitrates outside the measured range, the nearest one used: {clamped} of the time"
     for name, quality in estimated.items():
         if quality.unknown:
             factors = ", ".join(f"{factor:g}" for factor in quality.unknown)
             yield f"{name}: its rate-quality model was not measured at the factors {factors}, no estimate for them"
     if len({quality.metric for quality in estimated.values()}) > 1:
-        yield "the rate-quality models of the cameras are of different metrics, there is no quality of the whole drive"
+        yield "the rate-quality models of the cameras use different metrics: no quality of the whole drive"
 
 
 def _part(share: float) -> str:
@@ -256,13 +256,13 @@ def _part(share: float) -> str:
 # --- latency and freezes ----------------------------------------------------------------------------------------------
 
 
-def latency(values: Values) -> Latency:
+def latency(values: FloatSeries) -> Latency:
     """Median, 95th and 99th percentile by linear interpolation; nan of none."""
     known = values[np.isfinite(values)]
     return Latency(*map(float, np.percentile(known, (50, 95, 99)))) if known.size else Latency()
 
 
-def freezes(arrivals: Values, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
+def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
     """Where the picture stood still.
 
         gap >= max(3 * mean, mean + 150 ms)      mean: of the last 30 gaps before it    (W3C webrtc-stats, freezeCount)
@@ -302,7 +302,7 @@ def per_second(drive: Series) -> PerSecond:
     return PerSecond(edges[:-1], np.array([f.median for f in found]), np.array([f.p95 for f in found]))
 
 
-def latencies(drive: Series, camera: str | None = None) -> tuple[Values, Values]:
+def latencies(drive: Series, camera: str | None = None) -> tuple[FloatSeries, FloatSeries]:
     """When and how late, s and ms, for each frame of one or of all cameras that a latency is known of."""
     chosen = [drive.cameras[camera]] if camera else list(drive.cameras.values())
     received = [c.received for c in chosen if c.received]
@@ -321,7 +321,7 @@ def to_arrival(drive: Series) -> bool:
     return any(got is not None and bool(np.isfinite(got.arrival_ms).any()) for got in received)
 
 
-def together(values: Iterable[Values]) -> Values:
+def together(values: Iterable[FloatSeries]) -> FloatSeries:
     return np.concatenate([np.empty(0), *values])
 
 
@@ -337,13 +337,15 @@ def factor_shares(camera: CameraSeries, begin: float, end: float) -> dict[float,
 
 def size_shares(camera: CameraSeries, begin: float, end: float) -> dict[tuple[int, int], float]:
     """Share of the time by size of the picture received, or of the one decided where no operator logged, px."""
-    got, decided = camera.received, camera.decided
-    t, width, height = (got.t, got.width, got.height) if got else (decided.t, decided.width, decided.height)
+    received, decided = camera.received, camera.decided
+    t, width, height = (
+        (received.t, received.width, received.height) if received else (decided.t, decided.width, decided.height)
+    )
     shares = _shares([(int(w), int(h)) for w, h in zip(width, height, strict=True)], spans(t, begin, end))
     return {size: share for size, share in shares.items() if size[0]}
 
 
-def _shares(keys: Sequence[Any], weights: Values) -> dict[Any, float]:
+def _shares(keys: Sequence[Any], weights: FloatSeries) -> dict[Any, float]:
     total = float(weights.sum())
     found: dict[Any, float] = {}
     for key, weight in zip(keys, weights, strict=True):
@@ -365,7 +367,7 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
     return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
 
 
-def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -> Estimate:
+def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] = ()) -> Estimate:
     """Quality that the pictures of a camera have by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
@@ -375,8 +377,8 @@ def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -
     """
     t, kbps = camera.actual
     decided = camera.decided
-    factors = np.round(held(Line(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
-    full = kbps / held(Line(decided.t, decided.roi_share), t)
+    factors = np.round(held(TimeSeries(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
+    full = kbps / held(TimeSeries(decided.t, decided.roi_share), t)
     quality, outside, unknown = np.full(t.shape, np.nan), np.zeros(t.shape, dtype=bool), []
     for factor in np.unique(factors[np.isfinite(factors)]):
         at = (factors == factor) & (full > 0)
@@ -387,14 +389,14 @@ def estimate(camera: CameraSeries, model: Model, stood: Sequence[Freeze] = ()) -
         quality[at] = np.interp(np.log(full[at]), np.log(curve.kbps), curve.quality)
         outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
     moving = np.ones(t.shape, dtype=bool)
-    for freeze in stood:
+    for freeze in frozen_spans:
         _hold(quality, moving, t, freeze)
     known = np.isfinite(quality) & moving
     clamped = ratio(int((outside & known).sum()), int(known.sum()))
-    return Estimate(model.metric, Line(t, quality), mean(quality[moving]), clamped, tuple(unknown))
+    return Estimate(model.metric, TimeSeries(t, quality), mean(quality[moving]), clamped, tuple(unknown))
 
 
-def _hold(quality: Values, moving: Flags, t: Values, freeze: Freeze) -> None:
+def _hold(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:
     """Let a picture that stands still keep the quality it had; where there was none before, there is none.
 
     Rates are those of a second, which for as long after a freeze holds some of it, or what had piled up meanwhile.
@@ -410,7 +412,7 @@ def _hold(quality: Values, moving: Flags, t: Values, freeze: Freeze) -> None:
 # --- small things -----------------------------------------------------------------------------------------------------
 
 
-def mean(values: Values) -> float:
+def mean(values: FloatSeries) -> float:
     """Mean of what is known; nan of nothing."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else NAN

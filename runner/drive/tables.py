@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from runner.drive.statistics import CameraStatistics, Latency, Statistics
+from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
 
-Row = tuple[str, ...]
+TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
 MEANING = (
@@ -15,19 +15,19 @@ MEANING = (
     " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
     " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
 )
-SIZES = 3  # as many sizes of pictures are told, those seen longest
+SIZES = 3  # as many picture sizes are listed, those received longest
 
 
-def camera_rows(drive: Statistics) -> tuple[Row, list[Row]]:
+def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     """Headings, and a row for each camera."""
     kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
-    headings: Row = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
+    headings: TableRow = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
     headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
     headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind, "of the time\nfrozen")
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
 
-def drive_rows(drives: Sequence[Statistics]) -> tuple[Row, list[Row]]:
+def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableRow]]:
     """Headings, and a row for each drive."""
     headings = (
         "drive",
@@ -42,7 +42,7 @@ def drive_rows(drives: Sequence[Statistics]) -> tuple[Row, list[Row]]:
     return (*headings, "of allocated", "mean kbit/s"), [_drive(drive) for drive in drives]
 
 
-def _camera(camera: CameraStatistics) -> Row:
+def _camera(camera: CameraStatistics) -> TableRow:
     frozen = [freeze.seconds for freeze in camera.freezes or ()]
     known = camera.freezes is not None
     longest = sorted(camera.sizes, key=lambda size: -camera.sizes[size])[:SIZES]
@@ -67,7 +67,7 @@ def _camera(camera: CameraStatistics) -> Row:
     )
 
 
-def _drive(drive: Statistics) -> Row:
+def _drive(drive: DriveStatistics) -> TableRow:
     arrived = drive.decode if math.isnan(drive.arrival.median) else drive.arrival
     return (
         drive.series.label,

@@ -1,6 +1,6 @@
 """Everything that touches GStreamer, behind the one door `runner/apply.py`.
 
-raises  MissingBindings on import, with all that does not load
+raises  MissingBindings on import, with every part that does not load
 """
 
 import ctypes
@@ -9,7 +9,7 @@ from importlib import import_module
 
 from runner.errors import MissingBindings
 
-# GStreamer brings libunwind, whose functions stand in for those of libgcc in all that is loaded later: the next C++
+# GStreamer brings libunwind, whose functions stand in for those of libgcc in all libraries loaded later: the next C++
 # exception, in Matplotlib or OpenCV, ends the process. What is loaded first, is found first.
 with suppress(OSError):
     ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)

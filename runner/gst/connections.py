@@ -13,7 +13,7 @@ from fcntl import ioctl
 
 from gi.repository import GstRtspServer
 
-from runner.gst.viewers import Viewer, operator_of
+from runner.gst.viewers import StreamViewer, operator_of
 
 USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data is not taken for so long (RFC 5482)
 KEEPALIVE_S, KEEPALIVES = 2, 3  # a machine that answers none of so many, so far apart, has gone
@@ -23,7 +23,7 @@ BUFFER_S = 0.35  # of video in the send buffer, beyond what the way takes
 LEAST_BUFFER_BYTES = 16_384
 
 
-class Connection:
+class RtspConnection:
     """One client of the RTSP server, as its TCP connection shows it.
 
     silent_s     how long the other machine may be silent before the kernel asks whether it is still there
@@ -31,7 +31,7 @@ class Connection:
     viewer       where it comes from and for whom
     cameras      what it watches, with the library's transport once there is one
     interleaved  whether video runs through this connection, too
-    heard        monotonic time of its last complete request, s
+    last_request monotonic time of its last complete request, s
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
@@ -41,10 +41,10 @@ class Connection:
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self.viewer = Viewer(connection.get_ip(), since=time.monotonic())
+        self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.interleaved = False
-        self.heard = self._writable = time.monotonic()
+        self.last_request = self._writable = time.monotonic()
         self._buffer = 0
         self._written: deque[tuple[float, int]] = deque()  # when, bytes ever written by then
 

@@ -13,18 +13,18 @@ from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
 
 
-class Knobs:
+class KnobPanel:
     """The knobs of one camera's pipeline, built anew with the pipeline.
 
     Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe in front of the first
     element that changes then sets them all at once. Set one after the other while a frame passes, crop edges leave
     moments without any picture, which ends the stream.
 
-    turned  called, from any thread, when knobs were set: `applied` has what was read back
+    on_turned  called, from any thread, when knobs were set: `applied` holds the values that were read back
     """
 
-    def __init__(self, pipeline: Gst.Bin, camera: Camera, turned: Callable[[], None]) -> None:
-        self._camera, self._turned = camera, turned
+    def __init__(self, pipeline: Gst.Bin, camera: Camera, on_turned: Callable[[], None]) -> None:
+        self._camera, self._on_turned = camera, on_turned
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
         # Reentrant: new caps send an event up through the very pad whose probe sets them, which calls it once more.
@@ -67,13 +67,13 @@ class Knobs:
                 self.faults += wrong
                 if not wrong:
                     self.applied[knob] = value
-        self._turned()
+        self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
         return assignments(self._camera, knob, value)
 
-    def _assign(self, turned: Assignment) -> str:
-        """Set one property and read it back; what is wrong, or ""."""
+    def _assign(self, turned: Assignment) -> str | None:
+        """Set one property and read it back; returns the fault, None if there is none."""
         name, key, value = turned
         element = self._by_name[name]
         wanted: Any = Gst.Caps.from_string(value) if key == "caps" else value
@@ -82,4 +82,4 @@ class Knobs:
             held = element.get_property(key)
             if not (held.is_equal(wanted) if key == "caps" else held == wanted):
                 return f"{self._camera.name}: {name}.{key} is {text(str(held))} after it was set to {text(value)}"
-        return ""
+        return None

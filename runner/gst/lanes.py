@@ -20,12 +20,12 @@ from runner.errors import RunError
 from runner.gst.pipeline import counted
 from runner.lanes import FRAMES, LaneSet
 
-Luma = NDArray[np.uint8]  # height x width
+LumaPlane = NDArray[np.uint8]  # height x width
 POLL_NS = 200 * 1_000_000
 STALLED_S = 60  # no frame for so long: something waits for something else
 
-OnFrame = Callable[[int, Luma], None]  # number of the frame from 0, its luma
-OnDecoded = Callable[[int, int, Luma], None]  # lane, number of the frame, its luma as decoded
+OnFrame = Callable[[int, LumaPlane], None]  # number of the frame from 0, its luma
+OnDecoded = Callable[[int, int, LumaPlane], None]  # lane, number of the frame, its luma as decoded
 
 
 @dataclass(slots=True)
@@ -58,11 +58,11 @@ def run_lanes(
 ) -> list[Encoded]:
     """Run a sequence through all lanes, as fast as it goes.
 
-    on_frame     told each frame of the sequence before any lane has it, from one thread
-    on_picture   told each decoded picture, lane by lane from a thread of its own; it may take its time
-    on_progress  told the number of frames so far, a few times a second
+    on_frame     called with each frame of the sequence before any lane has it, from one thread
+    on_picture   called with each decoded picture, from one thread per lane; it may block
+    on_progress  called with the number of frames so far, a few times a second
     returns      by lane
-    raises       RunError with what GStreamer says; what the callbacks raise
+    raises       RunError with GStreamer's message; exceptions of the callbacks
     """
     pipeline = _parsed(lanes.line)
     run = _Run(lanes.fps)
@@ -158,7 +158,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     sample = sink.emit("pull-sample")
     buffer = sample.get_buffer()
     running_ns = sample.get_segment().to_running_time(Gst.Format.TIME, buffer.pts)
-    # An encoder may leave out frames; which one this is, its time says.
+    # An encoder may leave out frames; its time identifies it.
     number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
     result.frames += 1
     run.moved = time.monotonic()
@@ -176,7 +176,7 @@ def _guarded(run: _Run, work: Callable[[], None]) -> None:
         run.failed = error
 
 
-def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> Luma:
+def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
     """A copy of the first plane of a picture with one byte per sample."""
     picture = caps.get_structure(0)
     width, height = picture.get_int("width")[1], picture.get_int("height")[1]

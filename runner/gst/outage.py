@@ -1,4 +1,4 @@
-"""What is said of a camera that fails again and again: each reason once, and at the end how long it took."""
+"""Reports on a camera that fails repeatedly: each reason once, and the duration at the end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GATHER_MS = 300
 class Outage:
     """The present outage of one camera. Times are s by the monotonic clock.
 
-    report  told a sentence for each new reason, and one at the end
+    report  called with a sentence for each new reason, and one at the end
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:
@@ -22,9 +22,9 @@ class Outage:
         self._began = 0.0
 
     @property
-    def reason(self) -> str:
-        """Why it began; "" while there is none."""
-        return self._reasons[0] if self._reasons else ""
+    def reason(self) -> str | None:
+        """Why it began; None while there is no outage."""
+        return self._reasons[0] if self._reasons else None
 
     def failed(self, why: str, since: float) -> None:
         """Another failure.
@@ -47,13 +47,13 @@ class Outage:
 class Gathered:
     """Reports of several cameras that say the same at about the same time, made one: `front, rear: no frame for 2 s`.
 
-    report  told, from GLib's thread: cameras, what happened to them
+    report  called from GLib's thread: cameras, what happened to them
     """
 
     def __init__(self, report: Callable[[str, str], None]) -> None:
         self._report = report
         self._lock = threading.Lock()
-        self._cameras: dict[str, list[str]] = {}  # by what is said
+        self._cameras: dict[str, list[str]] = {}  # by report
 
     def __call__(self, camera: str, what: str) -> None:
         """From any thread."""

@@ -9,7 +9,7 @@ from gi.repository import Gst, GstRtp
 
 from runner.core.commands import KnobValue
 from runner.graph import Plan
-from runner.gst.knobs import Knobs
+from runner.gst.knobs import KnobPanel
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
@@ -30,12 +30,12 @@ class CameraPipeline:
         pipeline: Gst.Bin,
         plan: Plan,
         wanted: Mapping[str, KnobValue],
-        turned: Callable[[], None],
+        on_turned: Callable[[], None],
         source: WatchedSource | None = None,
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted = wanted
-        self.knobs = Knobs(pipeline, plan.camera, turned)
+        self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
             loop_clip(pipeline, plan)
         self._started = False
@@ -47,9 +47,9 @@ class CameraPipeline:
         last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
 
     @property
-    def source_fault(self) -> str:
-        """What is wrong with a source that delivers nothing and is being replaced; "" while it delivers."""
-        return self._source.outage.reason if self._source else ""
+    def source_fault(self) -> str | None:
+        """The fault of a source that delivers nothing and is being replaced; None while it delivers."""
+        return self._source.outage.reason if self._source else None
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
         """Take the knobs to where they are wanted; `changed` is what is new."""

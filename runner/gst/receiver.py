@@ -23,7 +23,7 @@ GRACE_S = 0.75  # a camera that is known to send only now may take so long
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class Reception:
     """What has come of one camera; counters run since the start and go on through rebuilt pipelines.
 
     frames      access units received
@@ -61,8 +61,8 @@ PICTURES = (
 class Receiver:
     """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream.
 
-    on_unit     told each access unit from the streaming thread
-    on_picture  told each decoded picture from the streaming thread
+    on_unit     called with each access unit, from the streaming thread
+    on_picture  called with each decoded picture, from the streaming thread
     arrivals    keep when each access unit came
     video       where what comes is kept; the plan has `video` then
     Without these no Python runs per frame.
@@ -87,9 +87,9 @@ class Receiver:
         self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
-        self._before = Received()  # what earlier pipelines have counted
+        self._before = Reception()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
-        self._told_foreign = False
+        self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
@@ -103,12 +103,12 @@ class Receiver:
         self._supervised.stop()
         self._close_filter()
 
-    def sample(self) -> Received:
+    def sample(self) -> Reception:
         """What has come so far; asks for the latency of the next frame."""
         received = replace(self._count(), arrivals=self._arrived())
-        if received.foreign and not self._told_foreign:
-            self._told_foreign = True
-            self._report(self._name, "packets that do not come from the vehicle are dropped")
+        if received.foreign and not self._foreign_reported:
+            self._foreign_reported = True
+            self._report(self._name, "packets from other hosts than the vehicle are dropped")
         now = time.monotonic()
         if not self.should_send:
             self._silent = now
@@ -124,7 +124,7 @@ class Receiver:
         return received
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
-        self._before = self._count() if self._built else Received()
+        self._before = self._count() if self._built else Reception()
         self._built = True
         self._close_filter()
         self._moved = (self._before.frames, time.monotonic())
@@ -170,19 +170,19 @@ class Receiver:
                 self._filter = SenderFilter(Gst.Uri.from_string(location).get_host())
             self._filter.attach(taken.get_fd())
         except OSError as error:
-            self._report(self._name, f"packets of others than the vehicle are not dropped: {error}")
+            self._report(self._name, f"packets from other hosts than the vehicle are not dropped: {error}")
 
     def _close_filter(self) -> None:
         if self._filter:
             self._filter.close()
             self._filter = None
 
-    def _count(self) -> Received:
+    def _count(self) -> Reception:
         before = self._before
         frames, size = counted(self._received)
         caps = self._sink.get_static_pad("sink").get_current_caps()
         picture = caps.get_structure(0) if caps else None
-        return Received(
+        return Reception(
             frames=before.frames + frames,
             bytes=before.bytes + size,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),

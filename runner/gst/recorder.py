@@ -33,13 +33,13 @@ class Recorded:
 
     frames     frames kept
     seconds    from the first to the end of the last one, by their own time
-    missing    frames that this time has room for and that are not there
+    missing    frames expected in this time that are absent
     overruns   frames that found the queue before the encoder full, also beyond the end
     repeated   frames that the source sent twice to keep its rate, those of a clip not counted
     left_out   frames that the source left out to keep its rate, likewise
     width, height  px, 0 before the first frame
     began      time of the first frame, s since 1970; 0 before it
-    why        what failed, or ""
+    failure    what failed; None: nothing
     """
 
     stage: Stage = Stage.RECORDING
@@ -52,11 +52,11 @@ class Recorded:
     width: int = 0
     height: int = 0
     began: float = 0.0
-    why: str = ""
+    failure: str | None = None
 
 
 class Recorder:
-    """Records one camera. Everything happens in the thread of GLib's main loop, where not said otherwise.
+    """Records one camera. Everything happens in the thread of GLib's main loop, unless stated otherwise.
 
     path        file that is written; closed and complete as soon as the stage is FINISHED
     duration_s  length of the recording, s; None: until `finish`
@@ -113,8 +113,8 @@ class Recorder:
         if self._recorded.stage is Stage.RECORDING:
             self._close(Stage.FAILED, "stopped before its file was finished")
 
-    def _close(self, stage: Stage, why: str = "") -> None:
-        self._recorded = replace(self._count(), stage=stage, why=why)
+    def _close(self, stage: Stage, why: str | None = None) -> None:
+        self._recorded = replace(self._count(), stage=stage, failure=why)
         GLib.source_remove(self._watching)
         self._pipeline.get_bus().remove_signal_watch()
         self._pipeline.set_state(Gst.State.NULL)
@@ -163,14 +163,14 @@ class Recorder:
             self._count_down()
         return True
 
-    def _stuck(self) -> str:
-        """What has not moved on for too long, or ""."""
+    def _stuck(self) -> str | None:
+        """What has made no progress for too long; None: nothing."""
         still_s = time.monotonic() - self._moved[1]
         if self._finishing or self._end is not None:
-            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else ""
+            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
-            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else ""
-        return f"no frame came for {SILENT_S:g} s" if still_s > SILENT_S else ""
+            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else None
+        return f"no frame for {SILENT_S:g} s" if still_s > SILENT_S else None
 
     def _count_down(self) -> None:
         """Look at every frame from now on, to cut at the right one."""

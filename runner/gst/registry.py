@@ -83,13 +83,13 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
         path = f"{where}[{index}]"
         if _template(element.factory) is None:
             if element.factory not in PACKAGE_OF:
-                rule = f"unknown element, {suggest(element.factory, _factory_names(element.factory))}"
+                rule = f"unknown element{suggest(element.factory, _factory_names(element.factory))}"
                 yield ModelError(f"{path}.element", repr(element.factory), rule)
             continue
         for key, value in element.properties.items():
-            rule = _objection(element.factory, key, value)
-            if rule:
-                yield ModelError(f"{path}.properties.{key}", _shown(value), rule)
+            problem = _property_problem(element.factory, key, value)
+            if problem:
+                yield ModelError(f"{path}.properties.{key}", _shown(value), problem)
 
 
 def _check_knobs(plan: Plan) -> Iterator[ModelError]:
@@ -109,16 +109,16 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
             if element is None:
                 continue
             path = f"graph.knobs.{knob}[{index}]"
-            rule = _objection(factory, key, filled)
+            rule = _property_problem(factory, key, filled)
             if rule:
                 yield ModelError(f"{path}.property", repr(key), rule)
             elif not _may_change(element, key) and (name, key) not in camera.graph.mutable:
-                rule = f"{factory} does not say that {key} may change while playing; if it may, list it under mutable"
+                rule = f"{factory} does not declare {key} as mutable while playing; if it is, list it under mutable"
                 yield ModelError(f"{path}.property", repr(key), rule)
 
 
 def _may_change(element: Gst.Element, key: str) -> bool:
-    """Whether an element says of a property that it may change while PLAYING."""
+    """Whether an element declares a property as mutable while PLAYING."""
     return bool(int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING)
 
 
@@ -136,7 +136,7 @@ def _check_links(plan: Plan) -> list[ModelError]:
 
 @cache
 def _unlinkable(line: str) -> str | None:
-    """What GStreamer says of a line whose neighbours cannot be linked."""
+    """GStreamer's message on a line whose neighbours cannot be linked."""
     try:
         Gst.parse_launch(line)
     except GLib.Error as error:
@@ -145,13 +145,13 @@ def _unlinkable(line: str) -> str | None:
 
 
 @lru_cache(maxsize=None, typed=True)
-def _objection(factory: str, key: str, value: Value) -> str:
-    """Why an element does not take this value for this property; "" if it does."""
+def _property_problem(factory: str, key: str, value: Value) -> str | None:
+    """Why an element does not accept this value of this property; None if it does."""
     element = _template(factory)
     assert element is not None
     spec = element.find_property(key)
     if spec is None:
-        return f"{factory} has no such property, {suggest(key, (p.name for p in element.list_properties()))}"
+        return f"{factory} has no such property{suggest(key, (p.name for p in element.list_properties()))}"
     if not int(spec.flags) & GObject.ParamFlags.WRITABLE:
         return f"{factory} does not let {key} be set"
     kind = spec.value_type.name
@@ -160,7 +160,7 @@ def _objection(factory: str, key: str, value: Value) -> str:
         return f"must be one of {', '.join(nicks)}" if nicks else f"must be a {kind.removeprefix('g')}"
     if hasattr(spec, "minimum") and not spec.minimum <= float(value) <= spec.maximum:
         return f"must be from {spec.minimum} to {spec.maximum}"
-    return ""
+    return None
 
 
 def _readable(kind: str, value: str) -> bool:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 SO_ATTACH_FILTER, SO_MEMINFO = 26, 55  # asm-generic/socket.h
 WAITING = 100_000  # packets that a socket may hold before it has its filter; more than any buffer
@@ -81,7 +81,7 @@ class SenderFilter:
         self._seen = 0
 
 
-def program(senders: Iterable[Address]) -> list[Instruction]:
+def program(senders: Iterable[IpAddress]) -> list[Instruction]:
     """A filter that takes packets of these senders, over IPv4 and IPv6, and drops all others."""
     senders = list(senders)
     four = [step for sender in senders if sender.version == 4 for step in _takes(sender, IPV4_SOURCE)]
@@ -91,7 +91,7 @@ def program(senders: Iterable[Address]) -> list[Instruction]:
     return [*version, *four, drop, (JUMP_EQUAL, 1, 0, 6), drop, *six, drop]
 
 
-def _takes(sender: Address, offset: int) -> list[Instruction]:
+def _takes(sender: IpAddress, offset: int) -> list[Instruction]:
     """Take a packet whose source is this address, else go on behind."""
     words = struct.unpack(f">{len(sender.packed) // 4}I", sender.packed)
     steps: list[Instruction] = []

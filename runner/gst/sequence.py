@@ -9,10 +9,10 @@ from pathlib import Path
 from gi.repository import GLib, Gst, GstPbutils
 
 from runner.errors import UserError
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 TIMEOUT_S = 20
-# Caps of codecs that keep every sample, as far as they are told from their caps alone.
+# Caps of codecs that keep every sample, as far as their caps alone show it.
 LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", "video/x-utvideo", "image/png")
 
 
@@ -40,7 +40,7 @@ def discover(path: Path, where: str) -> Form:
     raises  UserError where it is no readable video
     """
     if not path.is_file():
-        raise UserError("command line", where, repr(str(path)), why_no_file(path))
+        raise UserError("command line", where, repr(str(path)), file_problem(path))
     if path.stat().st_size == 0:
         raise UserError("command line", where, repr(str(path)), "the file is empty")
     discoverer = GstPbutils.Discoverer.new(TIMEOUT_S * Gst.SECOND)

@@ -17,16 +17,16 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
-from runner.gst.connections import Connection
+from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit
 from runner.system.ports import check_port_free
 
-Report = Callable[[str, str], None]  # camera, what happened
+OnReport = Callable[[str, str], None]  # camera, what happened to it
 
-OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for who asks again
-HELD_S = 5.0  # how long one that is open waits for who asks again
+OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for a later request
+HELD_S = 5.0  # how long an open one waits for a later request
 GONE_S = 5.0  # how long one that is opened again waits for the end of the pipeline before
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag by at any bitrate
 LAG_S = 1.0  # a TCP viewer that is behind by more is closed
@@ -89,18 +89,18 @@ class CameraServer:
     """RTSP server with one mount point per camera.
 
     build   makes a `CameraPipeline` of each that was built
-    report  told of pipelines that come and go, and of viewers that are closed
+    on_report  called when pipelines start and stop, and when viewers are disconnected
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, report: Report) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, on_report: OnReport) -> None:
         check_port_free(media)
-        self._media, self._build, self._report = media, build, report
+        self._media, self._build, self._on_report = media, build, on_report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
-        self._changed = threading.Condition()  # a camera's stage; also guards all that clients' threads share
-        self._connections: dict[GstRtspServer.RTSPClient, Connection] = {}
+        self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
+        self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
         self._left: set[str] = set()  # cameras that a viewer has left lately
         self._stopped = threading.Event()
@@ -155,7 +155,7 @@ class CameraServer:
         pipeline = element.get_parent()
         pipeline.connect("deep-element-added", _on_element)
         bus = pipeline.get_bus()
-        bus.enable_sync_message_emission()  # the library watches the bus itself and tells nobody
+        bus.enable_sync_message_emission()  # the library watches the bus itself and reports nothing
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
         with self._changed:
@@ -165,7 +165,7 @@ class CameraServer:
         media.connect("target-state", self._on_target_state, camera)
         # Only after the factory's own handler, which forgets the media, is another one built.
         media.connect_after("unprepared", self._on_unprepared, camera, built)
-        self._report(camera.name, "pipeline built")
+        self._on_report(camera.name, "pipeline built")
 
     def _on_stage(self, media: GstRtspServer.RTSPMedia, camera: _Camera, stage: _Stage) -> None:
         with self._changed:
@@ -185,12 +185,12 @@ class CameraServer:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
-        self._report(camera.name, "pipeline gone")
+        self._on_report(camera.name, "pipeline stopped")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
             return  # that ends the file, and not the stream
-        self._report(camera.name, message.parse_error()[0].message)
+        self._on_report(camera.name, message.parse_error()[0].message)
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
@@ -252,7 +252,7 @@ class CameraServer:
 
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
         try:
-            connection = Connection(client, self._media.session_timeout_s)
+            connection = RtspConnection(client, self._media.session_timeout_s)
         except OSError:  # it has gone already, or there are no descriptors left: it may not watch
             return
         with self._changed:
@@ -281,7 +281,7 @@ class CameraServer:
     def _on_answered(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
         connection = self._connection(client)
         if connection:
-            connection.heard = time.monotonic()
+            connection.last_request = time.monotonic()
 
     def _on_describe(
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
@@ -357,17 +357,17 @@ class CameraServer:
             connection.cameras.pop(_camera_name(context), None)
             self._left.add(_camera_name(context))
 
-    def _connection(self, client: GstRtspServer.RTSPClient) -> Connection | None:
+    def _connection(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
         with self._changed:
             return self._connections.get(client)
 
-    def _watching(self, camera: str) -> list[Connection]:
+    def _watching(self, camera: str) -> list[RtspConnection]:
         with self._changed:
             return [connection for connection in self._connections.values() if camera in connection.cameras]
 
-    def _close(self, connection: Connection, why: str) -> None:
+    def _close(self, connection: RtspConnection, why: str) -> None:
         for camera in sorted(connection.cameras):
-            self._report(camera, f"closed the viewer at {connection}: {why}")
+            self._on_report(camera, f"disconnected the viewer at {connection}: {why}")
         connection.close()
 
     def _watch_connections(self) -> bool:
@@ -381,11 +381,11 @@ class CameraServer:
         for client, connection in connections:
             if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
-            elif now - connection.heard > self._media.session_timeout_s and not client.session_filter(None):
+            elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
         return True
 
-    def _lag(self, connection: Connection) -> float:
+    def _lag(self, connection: RtspConnection) -> float:
         there = (other for other in self._connections.values() if other is not connection)
         shared = any(other.cameras.keys() & connection.cameras.keys() for other in there)
         pipelines = [pipeline for name in connection.cameras if (pipeline := self.pipelines.get(name))]

@@ -21,7 +21,7 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     identity = pipeline.get_by_name(plan.source[-1].name)
     pace = identity.get_static_pad("sink")
     _Loop(pace.get_peer(), identity, float(plan.camera.fps))
-    _born_on_release(pace)
+    _report_no_latency(pace)
     clip = _Pace(identity, float(plan.camera.fps))
     GLib.timeout_add(CHECK_MS, clip.keep)
 
@@ -31,7 +31,7 @@ class _Loop:
 
     def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
         self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
-        self._begins = True  # the next segment is a round, and not one that is told again with another offset
+        self._begins = True  # the next segment is a round, and not one repeated with another offset
         self._round: tuple[int, int] | None = None  # where this round began: running time in ns, frames before it
         self._sought = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
@@ -70,7 +70,7 @@ class _Loop:
         identity = self._identity()
         if identity is None:
             return
-        base -= self._pad.get_offset()  # as the demuxer says it
+        base -= self._pad.get_offset()  # as the demuxer states it
         frames = identity.get_property("stats").get_value("num-buffers")
         if self._round:
             began, before = self._round
@@ -119,7 +119,7 @@ def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
     return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]
 
 
-def _born_on_release(pad: Gst.Pad) -> None:
+def _report_no_latency(pad: Gst.Pad) -> None:
     """A frame of a clip is captured when it is released: decoding ahead of time is no latency."""
 
     def on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:

@@ -16,7 +16,7 @@ from runner.gst.pipeline import Build, CameraPipeline
 
 RETRY_S = 1.0  # between the beginnings of two attempts, at least
 STOPPED_S = 2.0  # how long the next pipeline waits for the end of the one before, whose port it needs
-PATIENCE_S = 5.0  # the other side may start later: who waits for it reports nothing for so long
+PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for so long
 
 
 class SupervisedPipeline:
@@ -25,8 +25,8 @@ class SupervisedPipeline:
     All methods are called in the thread of GLib's main loop. State changes run in threads of their own: an element that
     locks up holds up nobody else.
 
-    on_built  told of each new pipeline before it starts; returns the pad whose first buffer shows that it works
-    report    told what happened: each reason once, until the pipeline works again
+    on_built  called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
+    report    called with each reason once, until the pipeline works again
     rebuilt   how often a pipeline that had worked was built anew
     """
 

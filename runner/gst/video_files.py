@@ -24,7 +24,7 @@ class VideoFiles:
     """Where the video of the cameras is kept.
 
     directory  that of the drive; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counting the pipelines with a frame
-    on_video   told when the first frame of a file is there, from another thread: camera, name of the file from the
+    on_video   called when a file has its first frame, from another thread: camera, name of the file from the
                directory on, capture time of that frame in s since 1970
     """
 
@@ -40,7 +40,7 @@ class VideoFile:
 
     side      vehicle or operator
     captured  when a frame was captured; asked between queue and parser
-    report    told: camera, what failed
+    report    called with camera and what failed
     """
 
     def __init__(
@@ -115,7 +115,7 @@ def concerns_file(message: Gst.Message) -> bool:
     return bool(message.src) and message.src.get_name().startswith(_MARK)
 
 
-def born(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
+def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
     """When a frame was captured on this machine, s since 1970, by its place in the stream's running time."""
     element = pad.get_parent_element()
     segment, clock = pad.get_sticky_event(Gst.EventType.SEGMENT, 0), element.get_clock()
@@ -126,7 +126,7 @@ def born(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
 
 
 def _new_file(directory: Path, camera: str, side: str) -> Path:
-    """An empty file that was not there before.
+    """An empty file that did not exist before.
 
     raises  OSError
     """
@@ -149,7 +149,7 @@ def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     """
     query = info.get_query()
     if query.type == Gst.QueryType.CAPS:
-        return Gst.PadProbeReturn.DROP  # who hears no answer takes it that anything goes
+        return Gst.PadProbeReturn.DROP  # without an answer the element assumes no limit
     if query.type == Gst.QueryType.LATENCY:
         query.set_latency(False, 0, Gst.CLOCK_TIME_NONE)
         return Gst.PadProbeReturn.HANDLED

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.errors import RunError
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
 SILENT = 100  # waits without a unit, an end or an error, after which the file is given up
@@ -38,7 +38,7 @@ def read_video(path: Path) -> Iterator[Unit]:
     raises  RunError where the file is none or is damaged; what was read before stays good
     """
     if not path.is_file():
-        raise RunError(f"{path}: {why_no_file(path)}")
+        raise RunError(f"{path}: {file_problem(path)}")
     pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")
     pipeline.get_by_name("file").set_property("location", str(path))
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
@@ -53,7 +53,7 @@ def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     """The file's stream is found: put what its codec needs in front of the end. Nothing runs per frame here."""
     codec = pad.get_current_caps().get_structure(0).get_name().removeprefix("video/x-")
     if codec not in _PARSED or out.get_static_pad("sink").is_linked():
-        return  # whoever waits for units hears that there are none
+        return  # the waiting consumer gets no units
     parse = Gst.parse_bin_from_description(_PARSED[codec], True)
     out.get_parent().add(parse)
     parse.link(out)
@@ -81,4 +81,4 @@ def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
         if buffer.pts == Gst.CLOCK_TIME_NONE:
             continue  # a unit that is damaged at its head
         yield Unit(buffer.pts - first, codec, buffer.extract_dup(0, buffer.get_size()))
-    raise RunError(f"{path}: is damaged" if codec else f"{path}: holds no video that can be read")
+    raise RunError(f"{path}: is damaged" if codec else f"{path}: contains no readable video")

@@ -2,7 +2,7 @@
 
 A viewer on the vehicle itself (loopback) costs no uplink; it is always let in and never counted. The controller, the
 operator in control, is always let in. RTSP carries no operator of its own, so an operator's RTSP client states it as
-its User-Agent (RFC 2326, 12.41), which survives address translation and tells operators on one machine apart. It is a
+its User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
 name and no proof; nothing on either link is authenticated yet.
 """
 
@@ -15,12 +15,12 @@ from typing import NamedTuple
 _PRODUCT = "tod-runner/"
 
 
-class Viewer(NamedTuple):
+class StreamViewer(NamedTuple):
     """One viewer of one camera.
 
     address   IP address that its requests come from
     operator  id of the operator that it belongs to, "" where it states none
-    since     monotonic time at which it connected, s; tells viewers from one address apart
+    since     monotonic time at which it connected, s; distinguishes viewers from one address
     """
 
     address: str
@@ -45,7 +45,9 @@ def over_uplink(address: str) -> bool:
     return not (mapped or ip).is_loopback
 
 
-def admit(viewers: Sequence[Viewer], newcomer: Viewer, limit: int, controller: str) -> list[Viewer] | None:
+def admit(
+    viewers: Sequence[StreamViewer], new_viewer: StreamViewer, limit: int, controller: str
+) -> list[StreamViewer] | None:
     """Which viewers of a camera have to leave for a newcomer, or None where the newcomer is refused.
 
     viewers     of this camera, in the order in which they came
@@ -54,14 +56,14 @@ def admit(viewers: Sequence[Viewer], newcomer: Viewer, limit: int, controller: s
     returns     for the controller the newest of the others, and where all are the controller's own, the oldest: it is
                 what an operator leaves behind whose address changed
     """
-    if not over_uplink(newcomer.address):
+    if not over_uplink(new_viewer.address):
         return []
     counted = [viewer for viewer in viewers if over_uplink(viewer.address)]
-    excess = len(counted) + 1 - limit
-    if excess <= 0:
+    surplus = len(counted) + 1 - limit
+    if surplus <= 0:
         return []
-    if not controller or newcomer.operator != controller:
+    if not controller or new_viewer.operator != controller:
         return None
     others = [viewer for viewer in reversed(counted) if viewer.operator != controller]
     own = [viewer for viewer in counted if viewer.operator == controller]
-    return (others + own)[:excess]
+    return (others + own)[:surplus]

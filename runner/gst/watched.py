@@ -1,4 +1,4 @@
-"""A camera's source that is watched: where it freezes or fails, it is replaced while all that follows it goes on."""
+"""A camera's watched source: where it freezes or fails, it is replaced while the rest of the pipeline continues."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     asynchronous state changes stay in here. The frames are counted in C in front of the gate, so that a camera which is
     paused or off counts as fine.
 
-    Until the first frame nothing is replaced: errors fail the whole pipeline, and who asked for it is told.
+    Until the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
-    report  told what happened
+    report  called with what happened
     """
 
     def __init__(self, plan: Plan, report: Callable[[str], None]) -> None:
@@ -45,7 +45,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._lock = threading.Lock()  # of the child: the server's threads start and stop, GLib's one replaces
         self._child: Gst.Bin | None = None
         self._timer = 0
-        self._failed = ""  # what the source itself said, from its threads
+        self._failed: str | None = None  # the error of the source itself, from its threads
         self._moved = (0, 0.0)  # frames at the last change of the counter, and when
         self._attempts = 0  # of this outage
         self._tried = (0, 0.0)  # frames when the last one began, and when
@@ -93,7 +93,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
         if frames != self._moved[0] or not self._plays():
-            self._moved, self._failed = (frames, now), ""  # an error that stops no frame is not the picture's
+            self._moved, self._failed = (frames, now), None  # an error that stops no frame is not the picture's
         if not frames:
             return True
         if not self._attempts:
@@ -131,7 +131,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             if not self._timer:
                 return
             self._empty()
-            self._failed = ""
+            self._failed = None
             child = self._fill()
         child.sync_state_with_parent()
 

@@ -1,4 +1,4 @@
-"""Access units on their way to a viewer, and what one who comes late must decode first. Pure."""
+"""Access units on their way to a viewer, and the units that a late viewer must decode first. Pure."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_unit(
     returns  None for one that is of no use: browsers' decoders give up on half a picture, and bear one that is missing.
              Half an IDR picture of H.264 becomes a grey one, over which the next refresh wave paints.
 
-    Parameter sets do not tell an IDR picture: encoders repeat them at every wave.
+    Parameter sets do not identify an IDR picture: encoders repeat them at every wave.
     """
     if codec == "h265":
         return None if damaged else _read_h265(data, captured, arrived)
@@ -62,7 +62,7 @@ def read_unit(
 
 
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
-    """As `read_unit`. A recovery point is not looked for: who joins waits for the next IRAP picture."""
+    """As `read_unit`. A recovery point is not looked for: a viewer that joins waits for the next IRAP picture."""
     for header, _ in _nal_units(data):
         kind = header >> 1 & 0x3F
         if kind in H265_VCL:
@@ -88,7 +88,7 @@ class Recent:
 
     With intra-refresh an IDR comes only when the picture changes its size. Shown alone it mixes an old picture with
     new changes; after two refresh periods, or one whole wave that the stream announces, nothing of the old one is left.
-    A stream that others watched before has no IDR at all for who joins: it starts from a grey one.
+    A stream that others watched before has no IDR for a viewer that joins: it starts from a grey one.
 
     refresh_s  length of a refresh wave or distance of key frames, s; None where the graph does not state it
     codec      h264 or h265; a stream of H.265 that others watched before starts with its next IRAP picture

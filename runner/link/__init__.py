@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from runner.core.model import Endpoint, suggest
 from runner.errors import RunError
 from runner.link.ends import Ends
-from runner.link.limit import Counters, Limit
+from runner.link.limit import Limit, LinkCounters
 from runner.link.netns import namespaced
 from runner.link.relayed import relayed
 from runner.records import LinkSample
@@ -31,21 +31,21 @@ LOG_S = 0.1  # between two lines of the log
 LOOK_S = 0.02  # how late a change of the rate may be
 STOP_S = 0.5  # how long the last line of the log may take
 
-Record = Callable[[LinkSample], None]
+OnLinkSample = Callable[[LinkSample], None]
 
 
 class LimitedLink:
-    """A link that exists. Its rate is that of the start until `start` says when the drive begins.
+    """A link that exists. Its rate is the initial one until `start` sets the beginning of the drive.
 
-    record  called with each sample from a thread of the link
+    on_sample  called with each sample from a thread of the link
 
     `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
     """
 
-    def __init__(self, limit: Limit, ends: Ends, record: Record) -> None:
+    def __init__(self, limit: Limit, ends: Ends, on_sample: OnLinkSample) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
-        self._limit, self._shaper, self._record = limit, ends.shaper, record
+        self._limit, self._shaper, self._on_sample = limit, ends.shaper, on_sample
         self._stopped = threading.Event()
         self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -72,12 +72,12 @@ class LimitedLink:
         """Write the last line of the log; the rate stays."""
         self._stopped.set()
         if self._thread:
-            self._thread.join(STOP_S)  # who waits for an answer that never comes ends with who should give it
+            self._thread.join(STOP_S)  # a thread that waits for an answer ends with the child that should give it
 
     def _run(self, zero: float) -> None:
         try:
             self._follow(zero)
-        except Exception as error:  # kept for who checks
+        except Exception as error:  # kept for `check`
             self._failure = error
 
     def _follow(self, zero: float) -> None:
@@ -91,10 +91,10 @@ class LimitedLink:
                 in_force, counters = kbps, self._shaper.limit(kbps)
             if logs:
                 line = int(t / LOG_S) + 1
-                self._record(_sample(t, kbps, counters))
+                self._on_sample(_sample(t, kbps, counters))
 
 
-def _sample(t: float, kbps: float, counters: Counters) -> LinkSample:
+def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
     return LinkSample(
         t=round(t, 3),
         kbps=round(kbps, 3),
@@ -106,20 +106,22 @@ def _sample(t: float, kbps: float, counters: Counters) -> LinkSample:
 
 
 @contextmanager
-def limited_link(kind: str, limit: Limit, media: Endpoint, control: Endpoint, record: Record) -> Iterator[LimitedLink]:
+def limited_link(
+    kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample
+) -> Iterator[LimitedLink]:
     """The link while it is needed; everything that belongs to it is gone at the end.
 
     kind            netns or relay
     limit           what it does
     media, control  RTSP server and broker as the configuration states them
-    record          called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
+    on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
                     since the link was made
     raises          RunError where it cannot be made, with what to do; at the end, where it has failed meanwhile
     """
     if kind not in KINDS:
-        raise RunError(f"link={kind}: unknown kind, {suggest(kind, KINDS)}")
+        raise RunError(f"link={kind}: unknown kind{suggest(kind, KINDS)}")
     with KINDS[kind](limit, media, control) as ends:
-        link = LimitedLink(limit, ends, record)
+        link = LimitedLink(limit, ends, on_sample)
         try:
             yield link
         finally:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, TypeVar
 
-from runner.link.limit import Counters, burst_bytes, queue_bytes
+from runner.link.limit import LinkCounters, burst_bytes, queue_bytes
 
 T = TypeVar("T")
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 class Bucket(Generic[T]):
     """Packets wait until the bucket holds as many tokens (bytes) as they are long.
 
-    Departures are reckoned, not observed: who looks late finds every packet with the time at which it left, and a
+    Departures are reckoned, not observed: a late caller finds every packet with the time at which it left, and a
     scheduler that is late costs no rate. Times are seconds of any clock that does not go back.
     """
 
@@ -62,11 +62,11 @@ class Bucket(Generic[T]):
         while self._left:
             yield self._left.popleft()
 
-    def counters(self, now: float) -> Counters:
+    def counters(self, now: float) -> LinkCounters:
         self._advance(now)
         tokens = self._tokens + max(0.0, now - self._at) * self._rate
         wait_ms = 1000 * max(0.0, self._backlog - tokens) / self._rate
-        return Counters(wait_ms, self._passed, self._packets, self._dropped)
+        return LinkCounters(wait_ms, self._passed, self._packets, self._dropped)
 
     def _next(self) -> float | None:
         if not self._items:

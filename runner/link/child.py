@@ -20,7 +20,7 @@ LOOK_MS = 50  # how soon a signal to this process is noticed
 
 
 class Child:
-    """Asked through its standard input; everything that it says and that is not JSON is a complaint.
+    """Asked through its standard input; every output line that is not JSON is an error.
 
     name     for people
     command  ends when its standard input does; it is killed with the thread that makes this
@@ -29,7 +29,7 @@ class Child:
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self._name = name
         pipe = subprocess.PIPE
-        # A session of its own: Ctrl-C ends whoever asks, not who is to count until the end.
+        # A session of its own: Ctrl-C ends the parent, not the child, which counts until the end.
         self._process = subprocess.Popen(
             children.bound(command),
             stdin=pipe,
@@ -45,30 +45,30 @@ class Child:
     def ask(self, *lines: str) -> Any:
         """Send lines and wait for one answer.
 
-        raises  RunError with what it says instead
+        raises  RunError with its output instead
         """
         assert self._process.stdin
         try:
             self._process.stdin.write("".join(f"{line}\n" for line in lines).encode())
             self._process.stdin.flush()
         except OSError:
-            pass  # it is gone; what it has said follows
+            pass  # it has ended; its output follows
         return self.answer()
 
     def answer(self) -> Any:
         """The next answer. raises RunError as `ask`"""
-        complaints: list[str] = []
+        errors: list[str] = []
         for line in self._lines():
             if line[:1] in ("{", "["):
-                if complaints:
+                if errors:
                     break
                 return json.loads(line)
-            complaints.append(line.strip())
+            errors.append(line.strip())
         else:
-            # Of a traceback the last line says it all.
-            complaints = complaints[-1:] if complaints[:1] == ["Traceback (most recent call last):"] else complaints
-            complaints.append(f"it ended: {children.ending(self._process.wait(END_S))}")
-        raise RunError(f"{self._name}: {'; '.join(complaints)}")
+            # Of a traceback the last line is enough.
+            errors = errors[-1:] if errors[:1] == ["Traceback (most recent call last):"] else errors
+            errors.append(f"it ended: {children.ending(self._process.wait(END_S))}")
+        raise RunError(f"{self._name}: {'; '.join(errors)}")
 
     def check(self) -> None:
         """raises RunError where it has ended"""
@@ -85,7 +85,7 @@ class Child:
         self._process.stdout.close()
 
     def _lines(self) -> Iterator[str]:
-        """What it says, until it has nothing more to say.
+        """Its output lines, until it ends or answers.
 
         raises  RunError where it neither speaks nor ends
         """

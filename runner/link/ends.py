@@ -27,7 +27,7 @@ class Ends:
 
 
 def overrides(media: Endpoint, control: Endpoint) -> tuple[str, ...]:
-    """The words that tell a side where RTSP server and broker are."""
+    """The overrides with the addresses of RTSP server and broker."""
     return tuple(
         f"{key}={value}"
         for name, endpoint in (("media", media), ("control", control))

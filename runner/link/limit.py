@@ -33,7 +33,7 @@ class Limit:
 
 
 @dataclass(frozen=True, slots=True)
-class Counters:
+class LinkCounters:
     """What a link has done since it was made.
 
     queue_ms  wait of a packet that comes now
@@ -51,7 +51,7 @@ class Counters:
 class Shaper(Protocol):
     """Where rates are set and counters read."""
 
-    def limit(self, kbps: float) -> Counters:
+    def limit(self, kbps: float) -> LinkCounters:
         """Set the rate; what has passed so far. raises RunError where the link is gone"""
 
     def check(self) -> None:

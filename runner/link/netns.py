@@ -28,7 +28,7 @@ from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link.child import Child
 from runner.link.ends import Ends, overrides
-from runner.link.limit import Counters, Limit, burst_bytes, queue_bytes
+from runner.link.limit import Limit, LinkCounters, burst_bytes, queue_bytes
 from runner.system.signals import urgent
 
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
@@ -78,7 +78,7 @@ class _Tbf:
             self.end()
             raise RunError(f"link=netns: {error}; use a kernel that has tbf (module sch_tbf), {OTHERWISE}") from None
 
-    def limit(self, kbps: float) -> Counters:
+    def limit(self, kbps: float) -> LinkCounters:
         return self._set("change", kbps)
 
     def check(self) -> None:
@@ -87,15 +87,15 @@ class _Tbf:
     def end(self) -> None:
         self._tc.end()
 
-    def _set(self, verb: str, kbps: float) -> Counters:
+    def _set(self, verb: str, kbps: float) -> LinkCounters:
         lines = [f"qdisc show dev {OUT}"]
         if kbps != self._kbps:
             size, most = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
             tbf = f"tbf rate {round(1000 * kbps)}bit burst {size} limit {most}"
             lines.insert(0, f"qdisc {verb} dev {OUT} {self._parent} handle 2: {tbf}")
             self._kbps = kbps
-        said = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
-        return Counters(8 * said["backlog"] / kbps, said["bytes"], said["packets"], said["drops"])
+        counts = next(qdisc for qdisc in self._tc.ask(*lines) if qdisc["kind"] == "tbf")
+        return LinkCounters(8 * counts["backlog"] / kbps, counts["bytes"], counts["packets"], counts["drops"])
 
 
 def _delay(tc: str, name: str, delay_ms: float) -> None:
@@ -142,14 +142,14 @@ def _join(one: _End, other: _End) -> None:
 
 
 def _remove(ip: str, name: str) -> None:
-    """Remove a link and whatever still runs in it; what is not there need not be removed."""
-    _said(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
+    """Remove a link and whatever still runs in it; missing parts are skipped."""
+    _output_of(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
     for namespace in (name, _router(name)):
         try:
             identity = (RUN / namespace).stat().st_ino
         except FileNotFoundError:
             continue
-        _said(ip, "netns", "delete", namespace)  # first: from now on nobody enters
+        _output_of(ip, "netns", "delete", namespace)  # first: from now on nobody enters
         for pid in _inside(identity):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -221,15 +221,15 @@ def _check_allowed() -> None:
 
 
 def _run(*command: str) -> str:
-    """Standard output of a command. raises RunError with what it says where it fails"""
+    """Standard output of a command. raises RunError with its error output where it fails"""
     done = _done(command)
     if done.returncode:
-        said = " ".join(done.stderr.split()) or f"status {done.returncode}"
-        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {said}; {OTHERWISE[3:]}")
+        message = " ".join(done.stderr.split()) or f"status {done.returncode}"
+        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {message}; {OTHERWISE[3:]}")
     return done.stdout
 
 
-def _said(*command: str) -> str:
+def _output_of(*command: str) -> str:
     """Standard output of a command that may fail."""
     return _done(command).stdout
 

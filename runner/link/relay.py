@@ -34,16 +34,16 @@ UDP_HEADERS = 28  # bytes of IPv4 and UDP
 TCP_HEADERS = 52  # bytes of IPv4 and TCP with time stamps
 SEGMENT = 1448  # bytes of TCP payload in one packet of 1500
 WINDOW = 32_768  # bytes that TCP may hold here before the limit; the rest waits at the sender, as on a real link
-AT_ONCE = 64  # datagrams that are read before others get their turn
+DATAGRAMS_PER_TURN = 64  # datagrams that are read before others get their turn
 PAIR_TRIES = 200
 WAIT_S = 0.5  # for a server that has to accept
 
-Address = tuple[str, int]
+SocketAddress = tuple[str, int]
 Handler = Callable[[], None]
 Delivery = Callable[[], object]
 
 
-class Loop:
+class EventLoop:
     """Everything that can happen, one after the other: sockets, departures, rates.
 
     readers  called when their socket has something
@@ -89,7 +89,7 @@ class Loop:
         return max(0.0, min(known) - time.monotonic()) if known else None
 
 
-class Connection:
+class RelayedConnection:
     """A TCP connection through the relay.
 
     near     accepted from the client
@@ -100,7 +100,7 @@ class Connection:
 
     def __init__(
         self,
-        loop: Loop,
+        loop: EventLoop,
         near: socket.socket,
         far: socket.socket,
         limited: socket.socket,
@@ -148,7 +148,7 @@ class Connection:
             self._loop.bucket.put(size, partial(self._send, other, unit), now, keep=True)
 
     def _end(self, sock: socket.socket) -> None:
-        """One end has said its last: whatever it said still passes."""
+        """One end has closed: data that it sent before still passes."""
         if sock is not self._limited:
             self.close()
             return
@@ -185,7 +185,7 @@ class Ports:
     server    host of the vehicle's server; its ports are known when it has answered
     """
 
-    def __init__(self, loop: Loop, host: str, operator: Address, server: str) -> None:
+    def __init__(self, loop: EventLoop, host: str, operator: SocketAddress, server: str) -> None:
         self._loop, self._operator, self._server = loop, operator, server
         self.server_port: int | None = None
         self._sockets = _bind_pair(host)
@@ -211,7 +211,7 @@ class Ports:
     def _read(self, index: int, sock: socket.socket) -> None:
         host, first = self._operator
         operator = (host, first + index)
-        for _ in range(AT_ONCE):
+        for _ in range(DATAGRAMS_PER_TURN):
             try:
                 data, source = sock.recvfrom(65_536)
             except OSError:
@@ -233,7 +233,7 @@ class Rtsp:
     server    host of that
     """
 
-    def __init__(self, loop: Loop, operator: str, far: socket.socket, server: str) -> None:
+    def __init__(self, loop: EventLoop, operator: str, far: socket.socket, server: str) -> None:
         self._loop, self._operator = loop, operator
         self._host, self._server = far.getsockname()[0], server
         self._ports: list[Ports] = []
@@ -267,7 +267,7 @@ class Rtsp:
         return self._ports[-1].port
 
 
-def _sender(sock: socket.socket, data: bytes, address: Address) -> Delivery:
+def _sender(sock: socket.socket, data: bytes, address: SocketAddress) -> Delivery:
     def send() -> None:
         with suppress(OSError):  # closed meanwhile, or nobody is there: a packet lost behind the link
             sock.sendto(data, address)
@@ -292,7 +292,7 @@ def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
     raise OSError(f"no two neighbouring UDP ports are free on {host}")
 
 
-def listen(loop: Loop, host: str, accept: Callable[[socket.socket, Address], None]) -> int:
+def listen(loop: EventLoop, host: str, accept: Callable[[socket.socket, SocketAddress], None]) -> int:
     """Take connections on a port of the system's choice, which is returned; ends the relay where it cannot."""
     try:
         server = socket.create_server((host, 0))
@@ -303,28 +303,28 @@ def listen(loop: Loop, host: str, accept: Callable[[socket.socket, Address], Non
     return port
 
 
-def serve_media(loop: Loop, server: Address, near: socket.socket, operator: Address) -> None:
+def serve_media(loop: EventLoop, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
     """An operator has connected: to the vehicle's RTSP server, whose side is limited."""
     far = _connected(server)
     if far:
         passing = Rtsp(loop, operator[0], far, server[0])
-        connection = Connection(loop, near, far, far, {near: passing.requests, far: passing.replies})
+        connection = RelayedConnection(loop, near, far, far, {near: passing.requests, far: passing.replies})
         connection.at_end.append(passing.close)
     else:
         near.close()
 
 
-def serve_control(loop: Loop, broker: Address, near: socket.socket, _vehicle: Address) -> None:
+def serve_control(loop: EventLoop, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
     """The vehicle has connected, and is limited: to the broker."""
     far = _connected(broker)
     if far:
-        Connection(loop, near, far, near, {near: lambda data: [data], far: lambda data: [data]})
+        RelayedConnection(loop, near, far, near, {near: lambda data: [data], far: lambda data: [data]})
     else:
         near.close()
 
 
-def _connected(address: Address) -> socket.socket | None:
-    """None where nobody listens: whoever wants that sees its own connection end, and tries again."""
+def _connected(address: SocketAddress) -> socket.socket | None:
+    """None where nobody listens: the client then sees its own connection end, and tries again."""
     sock = socket.socket()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
     sock.settimeout(WAIT_S)
@@ -336,7 +336,7 @@ def _connected(address: Address) -> socket.socket | None:
     return sock
 
 
-def take_rates(loop: Loop, taken: bytearray) -> None:
+def take_rates(loop: EventLoop, taken: bytearray) -> None:
     """Rates from standard input, each answered with the counters."""
     data = os.read(0, 65_536)
     loop.runs = bool(data)
@@ -352,7 +352,7 @@ def take_rates(loop: Loop, taken: bytearray) -> None:
 def main() -> None:
     settings = json.loads(sys.argv[1])
     media, control = ((socket.gethostbyname(host), port) for host, port in (settings["media"], settings["control"]))
-    loop = Loop(settings["kbps"], settings["queue_ms"], settings["delay_ms"])
+    loop = EventLoop(settings["kbps"], settings["queue_ms"], settings["delay_ms"])
     listens = {
         "media": listen(loop, media[0], partial(serve_media, loop, media)),
         "control": listen(loop, control[0], partial(serve_control, loop, control)),

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from runner.core.model import Endpoint
 from runner.link.child import Child
 from runner.link.ends import Ends, overrides
-from runner.link.limit import Counters, Limit
+from runner.link.limit import Limit, LinkCounters
 from runner.system import children
 
 
@@ -45,8 +45,8 @@ class _Relay:
     def __init__(self, child: Child) -> None:
         self._child = child
 
-    def limit(self, kbps: float) -> Counters:
-        return Counters(**self._child.ask(str(kbps)))
+    def limit(self, kbps: float) -> LinkCounters:
+        return LinkCounters(**self._child.ask(str(kbps)))
 
     def check(self) -> None:
         self._child.check()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 
-LONGEST_HEADER = 65_536  # bytes; who sends more does not speak RTSP
+LONGEST_HEADER = 65_536  # bytes; a longer one is not RTSP
 
 _END = b"\r\n\r\n"
 _LENGTH = re.compile(rb"^content-length:\s*(\d+)", re.IGNORECASE | re.MULTILINE)

@@ -38,7 +38,7 @@ class Broker:
     def __init__(self, endpoint: Endpoint) -> None:
         self._address = (endpoint.host, endpoint.port)
         self._where = f"{endpoint.host}:{endpoint.port}"
-        self._said: deque[str] = deque(maxlen=KEPT_LINES)
+        self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         settings = (f"listener {endpoint.port} {endpoint.host}", *SETTINGS, "")
         file = os.memfd_create("mosquitto.conf")
         try:
@@ -63,8 +63,8 @@ class Broker:
         """raises RunError where the broker has ended"""
         status = self._process.poll()
         if status is not None:
-            said = "; ".join(filter(None, (children.ending(status), self._last_words())))
-            raise RunError(f"the MQTT broker on {self._where} ended: {said}")
+            message = "; ".join(filter(None, (children.ending(status), self._last_line())))
+            raise RunError(f"the MQTT broker on {self._where} ended: {message}")
 
     def wait_until_it_answers(self) -> None:
         """raises RunError where it does not within `START_S`"""
@@ -76,22 +76,22 @@ class Broker:
                 if probe.connect_ex(self._address) == 0 and self._process.poll() is None:
                     return
             time.sleep(0.02)
-        said = self._last_words() if self._process.poll() is not None else "it does not answer"
-        raise RunError(f"mosquitto does not come up on {self._where}: {said}; choose another control.port")
+        message = self._last_line() if self._process.poll() is not None else "it does not answer"
+        raise RunError(f"mosquitto does not start on {self._where}: {message}; choose another control.port")
 
     def end(self) -> None:
         self._process.terminate()
         children.end(self._process, END_S)
         self._reader.join(END_S)
 
-    def _last_words(self) -> str:
+    def _last_line(self) -> str:
         self._reader.join(END_S)
-        return self._said[-1] if self._said else ""
+        return self._stderr_lines[-1] if self._stderr_lines else ""
 
     def _read(self) -> None:
         assert self._process.stdout
         with self._process.stdout as lines:
-            self._said.extend(line.strip() for line in lines)
+            self._stderr_lines.extend(line.strip() for line in lines)
 
 
 @contextmanager

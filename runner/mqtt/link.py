@@ -16,7 +16,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.core.model import Endpoint
 from runner.errors import RunError
-from runner.mqtt.messages import Document, Message
+from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
@@ -48,7 +48,7 @@ class _Client(Client):
                     self.reconnect()
 
 
-class Link:
+class ControlLink:
     """One side's connection to the broker, kept for as long as it is open. Callbacks come from the link's own thread.
 
     will          topic and message that the broker publishes when this side is lost
@@ -62,14 +62,14 @@ class Link:
     def __init__(
         self,
         broker: Endpoint,
-        will: tuple[str, Document],
-        listen: Mapping[str, Callable[[Message], None]],
+        will: tuple[str, JsonObject],
+        listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         report: Callable[[str], None],
     ) -> None:
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._report = on_connected, report
-        self._trouble = ""  # why there is no connection, as reported
+        self._connection_fault: str | None = None  # why there is no connection, as reported
         self._faults: set[str] = set()  # as reported
         self.dropped = 0
         self._listening, self._closing = threading.Event(), threading.Event()
@@ -84,7 +84,7 @@ class Link:
         """Whether messages for this side will reach it, by then."""
         return self._listening.wait(seconds)
 
-    def publish(self, topic: str, message: Document) -> None:
+    def publish(self, topic: str, message: JsonObject) -> None:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
         Without a connection nothing is sent and nothing queued: after a reconnection the present counts, not the past.
@@ -92,8 +92,8 @@ class Link:
         if self._listening.is_set():
             self._send(topic, message)
 
-    def close(self, *goodbye: tuple[str, Document]) -> None:
-        """Disconnect; with messages to send before, as the will would have said it."""
+    def close(self, *goodbye: tuple[str, JsonObject]) -> None:
+        """Disconnect; with messages to send before, as the last will would state them."""
         self._closing.set()
         for topic, message in goodbye if self._listening.is_set() else ():
             with suppress(ValueError, RuntimeError):  # the connection is lost just now
@@ -119,10 +119,10 @@ class Link:
             client.message_callback_add(wanted, self._guarded(function))
         return client
 
-    def _guarded(self, function: Callable[[Message], None]) -> Callable[[Client, object, MQTTMessage], None]:
+    def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
             try:
-                function(Message(message.topic, bytes(message.payload), message.retain))
+                function(MqttMessage(message.topic, bytes(message.payload), message.retain))
             except ValueError as error:  # of the reader of a message: it is not what it should be
                 self._drop(message, str(error))
             except Exception as error:
@@ -137,7 +137,7 @@ class Link:
             self._faults.add(fault)
             self._report(fault)
 
-    def _send(self, topic: str, message: Document) -> MQTTMessageInfo:
+    def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if topic.endswith("/telemetry") else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
 
@@ -151,8 +151,8 @@ class Link:
         if refused := [wanted for wanted, code in zip(self._listen, codes, strict=False) if code.is_failure]:
             self._failed_to_connect(RunError(f"refuses to send {', '.join(refused)}"))
             return
-        if self._trouble:
-            self._trouble = ""
+        if self._connection_fault:
+            self._connection_fault = None
             self._report(f"connected to the MQTT broker at {self._broker}")
         self._listening.set()
         self._on_connected(True)
@@ -168,8 +168,8 @@ class Link:
 
     def _failed_to_connect(self, error: BaseException | None) -> None:
         why = str(getattr(error, "strerror", None) or error).lower()
-        if why != self._trouble and not self._closing.is_set():
-            self._trouble = why
+        if why != self._connection_fault and not self._closing.is_set():
+            self._connection_fault = why
             self._report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
 
 

@@ -9,8 +9,8 @@ Topics of a vehicle, below tod/<vehicle>/:
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
-Last wills say that a side is gone: the vehicle's state says {"online": false}, the operator's request says
-operator_disconnected. schemas/control.schema.json has what the vehicle sends.
+Last wills announce that a side is offline: the vehicle's state is {"online": false}, the operator's request is
+operator_disconnected. schemas/control.schema.json describes the vehicle's messages.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
 MAX_ROUND_TRIP_S = 0.5  # a longer round trip is no excuse for an old request: nobody can drive by it
 
-Document = Mapping[str, Any]
+JsonObject = Mapping[str, Any]
 
 
 def topic(vehicle: str, *parts: str) -> str:
@@ -39,7 +39,7 @@ def topic(vehicle: str, *parts: str) -> str:
     return "/".join(("tod", vehicle, *parts))
 
 
-class Message(NamedTuple):
+class MqttMessage(NamedTuple):
     """A message as it came.
 
     retained  whether the broker had kept it
@@ -56,9 +56,9 @@ class Message(NamedTuple):
 
 
 def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, Any]:
-    """A mapping, as JSON from somebody who may send anything.
+    """A mapping, from untrusted JSON.
 
-    raises  ValueError that says what is wrong
+    raises  ValueError with the problem
     """
     if len(payload) > limit:
         raise ValueError(f"{len(payload)} bytes: must be at most {limit}")
@@ -72,7 +72,7 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
 
 
 def read_state(payload: bytes) -> VehicleState | None:
-    """A vehicle's state; None: it is offline. Like the three below, raises ValueError that says what is wrong."""
+    """A vehicle's state; None: it is offline. Like the three below, raises ValueError with the problem."""
     document = _checked("state", payload)
     return from_json(VehicleState, document) if document["online"] else None
 
@@ -97,39 +97,39 @@ def _checked(kind: str, payload: bytes) -> dict[str, Any]:
     return document
 
 
-class Asked(NamedTuple):
-    """A request as it came.
+class ParsedRequest(NamedTuple):
+    """A request as received.
 
     document  the event without id and as_of, not yet checked
-    identity  its id, "" if it has none
+    identity  its id; "": it has none
     as_of     see `runner.vehicle.operators`; None where it need not say it
-    problem   why it is no request, or ""
+    problem   why it is not a valid request; None: it is
     """
 
     document: dict[str, Any]
     identity: str = ""
     as_of: float | None = None
-    problem: str = ""
+    problem: str | None = None
 
 
-def read_request(message: Message) -> Asked:
-    """A request as it came. The event itself is checked when its time is known."""
+def read_request(message: MqttMessage) -> ParsedRequest:
+    """The request as received. The event itself is checked when its time is known."""
     try:
         document = read_message(message.payload)
     except ValueError as error:
-        return Asked({}, problem=str(error))
+        return ParsedRequest({}, problem=str(error))
     if not OPERATOR.fullmatch(message.sender):
-        return Asked({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
+        return ParsedRequest({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
     if not isinstance(identity, str) or not identity:
-        return Asked(document, problem="id: must be given, as text")
-    problem = ""
+        return ParsedRequest(document, problem="id: must be given, as text")
+    problem: str | None = None
     if message.retained:
         problem = "must not be retained: a request is for now"
     elif "t" in document:
         problem = "t: must not be given, the vehicle stamps events on receipt"
     elif document == {"event": OPERATOR_GONE["event"]}:
-        return Asked(document, identity)  # a last will cannot know when it is published
+        return ParsedRequest(document, identity)  # a last will cannot know when it is published
     elif isinstance(as_of, bool) or not isinstance(as_of, int | float) or not math.isfinite(as_of):
         problem = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
-    return Asked(document, identity, None if problem else float(as_of), problem)
+    return ParsedRequest(document, identity, None if problem else float(as_of), problem)

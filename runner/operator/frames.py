@@ -84,7 +84,7 @@ def live_frames(
 
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
-    report     told camera and what happened to it
+    report     called with camera and what happened to it
     raises     ConfigError, UserError for an unknown camera
     """
     from runner import apply
@@ -92,7 +92,7 @@ def live_frames(
     vehicle = configuration(overrides, conf, runnable=False, check=apply.check_plan).vehicle()
     for name in cameras or ():
         if name not in vehicle.cameras:
-            raise UserError("cameras", "", name, f"unknown camera, {suggest(name, vehicle.cameras)}")
+            raise UserError("cameras", "", name, f"unknown camera{suggest(name, vehicle.cameras)}")
     plans = [plan for plan in compile_plans(vehicle) if cameras is None or plan.camera.name in cameras]
     frames, stopped = Frames(), threading.Event()
     side = apply.OperatorSide(plans, report, on_picture=frames.put)

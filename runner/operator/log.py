@@ -12,7 +12,7 @@ from runner.records import CameraSample, Note, Offline, Sample, VehicleState
 
 
 class DriveLog(Listener):
-    """Listens to a station and writes all that is new into a log."""
+    """Listens to a station and writes every change into a log."""
 
     def __init__(self, station: Station, log: Log) -> None:
         self._station, self._log = station, log

@@ -12,7 +12,7 @@ WINDOW_S = 1.0
 SETTLE_S = 1.5  # a window counts for the comparison only if the decision is older than window and rate control
 
 
-class Counters(Protocol):
+class StreamCounters(Protocol):
     """Running counters of one camera as the receiver has them."""
 
     @property
@@ -33,7 +33,7 @@ class Counters(Protocol):
     def latency_ms(self) -> float | None: ...
 
 
-class Decided(Protocol):
+class DecidedSetting(Protocol):
     """What the vehicle has decided for a camera."""
 
     @property
@@ -47,7 +47,7 @@ class Decided(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class MeasuredRates:
     """Frames a second and kbit/s over the last second."""
 
     fps: float = 0.0
@@ -55,7 +55,7 @@ class Rates:
 
 
 @dataclass
-class Meter:
+class ReceptionMeter:
     """Watches one camera: rates over a sliding window, and how well what comes follows what was decided.
 
     followed  kbit/s received over kbit/s allocated, one entry per settled window
@@ -67,12 +67,12 @@ class Meter:
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that came, with their count
     short: int = 0  # settled windows with fewer frames than the camera's rate asks for
     windows: int = 0
-    _past: deque[tuple[float, Counters]] = field(default_factory=deque)
+    _past: deque[tuple[float, StreamCounters]] = field(default_factory=deque)
     _decided: tuple[object, ...] | None = None
     _since: float = 0.0
     _counted: float = 0.0
 
-    def add(self, t: float, counters: Counters, decided: Decided | None) -> Rates:
+    def add(self, t: float, counters: StreamCounters, decided: DecidedSetting | None) -> MeasuredRates:
         """Take a sample of the counters at time t, s; a few of them a second."""
         settled_for = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
         if settled_for != self._decided:
@@ -87,13 +87,15 @@ class Meter:
             self._compare(rates, counters, decided)
         return rates
 
-    def _rates(self) -> Rates:
+    def _rates(self) -> MeasuredRates:
         (t0, first), (t1, last) = self._past[0], self._past[-1]
         if t1 <= t0:
-            return Rates()
-        return Rates((last.frames - first.frames) / (t1 - t0), (last.bytes - first.bytes) * 8 / 1000 / (t1 - t0))
+            return MeasuredRates()
+        return MeasuredRates(
+            (last.frames - first.frames) / (t1 - t0), (last.bytes - first.bytes) * 8 / 1000 / (t1 - t0)
+        )
 
-    def _compare(self, rates: Rates, counters: Counters, decided: Decided) -> None:
+    def _compare(self, rates: MeasuredRates, counters: StreamCounters, decided: DecidedSetting) -> None:
         self.windows += 1
         self.followed.append(rates.kbps / decided.kbps)
         self.short += rates.fps < 0.9 * self.fps

@@ -1,4 +1,4 @@
-"""What the operator's side knows: what the vehicle says and what comes of each camera. Feeds table and page."""
+"""The state of the operator's side: the vehicle's messages and the reception of each camera. Feeds table and page."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import NamedTuple
 
 from runner.configuration import agreement
 from runner.core.model import Vehicle
-from runner.mqtt.link import Link
+from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import (
     APPLY_S,
     MAX_ROUND_TRIP_S,
     OPERATOR_GONE,
-    Document,
-    Message,
+    JsonObject,
+    MqttMessage,
     read_reply,
     read_settings,
     read_state,
     read_telemetry,
     topic,
 )
-from runner.operator.meter import Counters, Meter, Rates
+from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
 from runner.records import CameraSample, CameraState, Note, Outcome, Sample, Telemetry, VehicleState
 from runner.system.clocks import Clocks
@@ -51,15 +51,15 @@ class Listener:
 
 
 class CameraRow(NamedTuple):
-    """One camera: its rates and counters, and what the vehicle says of it, if anything."""
+    """One camera: its rates and counters, and the vehicle's state of it, if known."""
 
     name: str
-    rates: Rates
-    received: Counters
+    rates: MeasuredRates
+    received: StreamCounters
     state: CameraState | None
 
 
-class _Asked(NamedTuple):
+class _PendingRequest(NamedTuple):
     on_reply: OnReply | None
     event: str
     until: float
@@ -74,7 +74,7 @@ class Station:
     Requests go out by `ask`; samples of the cameras' counters come in by `take`.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: agreement.Settings) -> None:
+    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath) -> None:
         self._vehicle, self._settings = vehicle, settings
         self.identity = uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
@@ -83,16 +83,16 @@ class Station:
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self._telemetry: Telemetry | None = None
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it came
-        self._heard = 0.0
+        self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name of those that the broker knows, whether they are online
         self._connected_at: float | None = None
-        self._differences = ""
-        self._asked: dict[str, _Asked] = {}
+        self._differences: str | None = None
+        self._pending: dict[str, _PendingRequest] = {}
         self._lock = threading.Lock()
-        self.meters = {name: Meter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
+        self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
         self.clocks = Clocks()
-        self.samples: Mapping[str, Counters] = {}
-        self._rates: dict[str, Rates] = {}
+        self.samples: Mapping[str, StreamCounters] = {}
+        self._rates: dict[str, MeasuredRates] = {}
         self._reported = 0.0
         listen = {
             topic("+", "state"): self._on_any_state,
@@ -101,7 +101,9 @@ class Station:
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         self._requests = topic(vehicle.name, "request", self.identity)
-        self._link = Link(vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note)
+        self._link = ControlLink(
+            vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note
+        )
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns at once."""
@@ -111,7 +113,7 @@ class Station:
         self.state = None  # a goodbye is no loss
         self._link.close((self._requests, OPERATOR_GONE))
 
-    def ask(self, event: Document, on_reply: OnReply | None = None) -> None:
+    def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.
 
         on_reply  called with what became of it: applied (read back from the elements), refused, expired or timed out
@@ -122,7 +124,7 @@ class Station:
             return
         identity, now = uuid.uuid4().hex, time.monotonic()
         with self._lock:
-            self._asked[identity] = _Asked(on_reply, event["event"], now + self.answer_s)
+            self._pending[identity] = _PendingRequest(on_reply, event["event"], now + self.answer_s)
         self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
 
     def _vehicle_now(self, now: float) -> float:
@@ -147,11 +149,11 @@ class Station:
         cameras = self.state.cameras if self.state else {}
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
-    def take(self, samples: Mapping[str, Counters]) -> None:
+    def take(self, samples: Mapping[str, StreamCounters]) -> None:
         """A sample of every camera's counters; to be called a few times a second, since time is judged here too."""
         now = time.monotonic()
-        if self.state and now - self._heard > SILENT_S:
-            self._lose(f"the vehicle has been silent for {SILENT_S:g} s")
+        if self.state and now - self._last_message > SILENT_S:
+            self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
         self._look_for_vehicle(now)
         self.ask({"event": "operator_connected"})  # the sign of life
@@ -180,15 +182,15 @@ class Station:
         clock = "" if ahead is None else f"; its clock is ahead by at least {ahead:.0f} ms: latencies are unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_kbps} kbit/s{clock}"
 
-    def _with_known_ages(self, now: float, samples: Mapping[str, Counters]) -> Mapping[str, Counters]:
+    def _with_known_ages(self, now: float, samples: Mapping[str, StreamCounters]) -> Mapping[str, StreamCounters]:
         before = self.clocks.ahead_ms
         samples = self.clocks.checked(now, samples)
         after = self.clocks.ahead_ms
         if before is None and after is not None:
             rule = "synchronise both clocks (NTP, PTP)"
-            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: ages of pictures are unknown; {rule}")
+            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: picture ages are unknown; {rule}")
         elif before is not None and after is None:
-            self.note("the vehicle's clock is no longer ahead: ages of pictures are known")
+            self.note("the vehicle's clock is no longer ahead: picture ages are known")
         return samples
 
     def _sample(self) -> Sample:
@@ -210,7 +212,7 @@ class Station:
     def _camera(self, name: str) -> CameraState | None:
         return self.state.cameras.get(name) if self.state else None
 
-    def _on_any_state(self, message: Message) -> None:
+    def _on_any_state(self, message: MqttMessage) -> None:
         """The state of any vehicle at the broker: of another one only its name is of use."""
         name, state = message.topic.split("/")[1], read_state(message.payload)
         if len(self._vehicles) < MOST_VEHICLES or name in self._vehicles:
@@ -221,14 +223,14 @@ class Station:
             raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")
         self._published = state
         if state:
-            self._hear()
+            self._vehicle_online()
         else:
-            self._lose("the vehicle is offline")
+            self._vehicle_lost("the vehicle is offline")
 
-    def _hear(self) -> None:
+    def _vehicle_online(self) -> None:
         """The vehicle is online, once state and telemetry have come."""
         before, state = self.state, self._published
-        self._heard = time.monotonic()
+        self._last_message = time.monotonic()
         if state is None or before is state or not self._telemetry:
             return
         self._set_state(state)
@@ -250,15 +252,15 @@ class Station:
         if text := decision_note(before, state):
             self.note(text)
 
-    def _on_telemetry(self, message: Message) -> None:
+    def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
         if message.retained:  # published before: not a sign of life, and not the vehicle's time now
             return
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
-        self._hear()
+        self._vehicle_online()
 
-    def _on_configuration(self, message: Message) -> None:
+    def _on_configuration(self, message: MqttMessage) -> None:
         """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""
         differences = agreement.differences(self._settings, read_settings(message.payload).settings)
         if differences and differences != self._differences:
@@ -275,10 +277,10 @@ class Station:
             known = f"online are {', '.join(online)}" if online else "no vehicle is online"
             self.note(f"the broker knows no vehicle named {self._vehicle.name}, {known}")
 
-    def _on_reply(self, message: Message) -> None:
+    def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)
         with self._lock:
-            asked = self._asked.pop(reply.id, None)
+            asked = self._pending.pop(reply.id, None)
         if asked is None:
             return
         if asked.on_reply:
@@ -288,9 +290,9 @@ class Station:
 
     def _time_out(self, now: float) -> None:
         with self._lock:
-            late = {identity: asked for identity, asked in self._asked.items() if now > asked.until}
+            late = {identity: asked for identity, asked in self._pending.items() if now > asked.until}
             for identity in late:
-                del self._asked[identity]
+                del self._pending[identity]
         for asked in late.values():
             if asked.on_reply:
                 reason = f"no answer from the vehicle within {self.answer_s:g} s"
@@ -300,9 +302,9 @@ class Station:
         self._connected_at = time.monotonic() if here else None
         if not here:
             self._published = None
-            self._lose("the control link is lost")
+            self._vehicle_lost("the control link is lost")
 
-    def _lose(self, why: str) -> None:
+    def _vehicle_lost(self, why: str) -> None:
         if self.state:
             self.note(why)
         self._telemetry = None

@@ -25,14 +25,14 @@ from runner.mqtt.messages import read_message
 from runner.operator.station import Listener, Station
 from runner.page.control import Control
 from runner.page.history import History
-from runner.page.viewer import Viewer
+from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
 
 STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that stands for so long is marked within 150 ms
-NOTES = 50  # told to a page that opens
+NOTES = 50  # sent to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
 SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here and not megabytes later
 START_S = 10.0  # the port is known to be free: only a machine that stands still takes longer
@@ -48,8 +48,8 @@ POLICY = (
 )
 
 
-class Page(Listener):
-    """The page and everybody who looks at it.
+class PageServer(Listener):
+    """The page and its viewers.
 
     A listener of the station; it and `show` may be called from any thread, everything else happens in the page's own.
 
@@ -65,7 +65,7 @@ class Page(Listener):
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
-        self._viewers: set[Viewer] = set()
+        self._viewers: set[PageViewer] = set()
         self._control = Control()
         self._silent: set[RequestHandler] = set()  # new connections without a complete request
         self._loop = asyncio.new_event_loop()
@@ -117,7 +117,7 @@ class Page(Listener):
     def _logger(self) -> logging.Logger:
         """What the server library complains of, without its tracebacks."""
         logger = logging.Logger("page")
-        logger.addHandler(_Complaints(self._station.note))
+        logger.addHandler(_FaultHandler(self._station.note))
         return logger
 
     def _connection(self) -> asyncio.Protocol:
@@ -170,7 +170,7 @@ class Page(Listener):
             line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, autoping=False)
         await ws.prepare(request)
-        viewer = Viewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
+        viewer = PageViewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
         self._greet(viewer)
         self._viewers.add(viewer)
         self._control.opened(token, time.monotonic())
@@ -190,8 +190,8 @@ class Page(Listener):
             self._tell_control()
         return ws
 
-    async def _listen(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
-        """What a viewer says, until it leaves.
+    async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer) -> None:
+        """The messages of a viewer, until it disconnects.
 
         raises  TimeoutError for one that makes no progress: pings go the way of the video, and answers come back
         """
@@ -201,7 +201,7 @@ class Page(Listener):
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._on_message(viewer, message.data)
 
-    def _greet(self, viewer: Viewer) -> None:
+    def _greet(self, viewer: PageViewer) -> None:
         viewer.tell("hello", _introduction(self._vehicle))
         viewer.tell("state", state_to_json(self._station.state))
         viewer.tell("history", self._history.columns())
@@ -212,7 +212,7 @@ class Page(Listener):
         for viewer in self._viewers:
             viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
 
-    def _on_message(self, viewer: Viewer, text: str | bytes) -> None:
+    def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
         """One message of a page; whatever it holds, it is answered and nothing else suffers."""
         try:
             document = read_message(text.encode() if isinstance(text, str) else text)
@@ -233,7 +233,7 @@ class Page(Listener):
             case _:
                 self._on_request(viewer, document)
 
-    def _on_request(self, viewer: Viewer, document: dict[str, Any]) -> None:
+    def _on_request(self, viewer: PageViewer, document: dict[str, Any]) -> None:
         identity = document.pop("id", None)
 
         def answer(result: str, reason: str) -> None:
@@ -248,15 +248,15 @@ class Page(Listener):
         else:
             self._station.ask(document, on_reply)
 
-    def _problem(self, token: str, identity: object, event: object) -> str:
-        """Why a request is not even sent to the vehicle, or ""."""
+    def _problem(self, token: str, identity: object, event: object) -> str | None:
+        """Why a request is not sent to the vehicle; None if it is."""
         if not isinstance(identity, str) or not 0 < len(identity) <= 64:
             return "id: must be given, as text of at most 64 characters"
         if event not in EVENTS:
             return f"event: {event!r}: must be one of {', '.join(EVENTS)}"
         if self._control.seen_by(token) != "you":
             return "this page does not hold control; take it first"
-        return ""
+        return None
 
 
 def _recent(camera: Camera) -> Recent:
@@ -264,7 +264,7 @@ def _recent(camera: Camera) -> Recent:
     return Recent(None if period is None else float(period), video_codec(camera.graph))
 
 
-class _Complaints(logging.Handler):
+class _FaultHandler(logging.Handler):
     """Notes each fault of this server once. What is not HTTP is its sender's fault, and answered with 400."""
 
     def __init__(self, note: Callable[[str], None]) -> None:
@@ -279,7 +279,7 @@ class _Complaints(logging.Handler):
             self._note(text)
 
 
-async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
+async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
     """Send what waits, as fast as the viewer takes it."""
     try:
         while True:
@@ -289,12 +289,12 @@ async def _send(ws: web.WebSocketResponse, viewer: Viewer) -> None:
             else:
                 await ws.send_bytes(message)
     except ConnectionError:
-        pass  # who reads the socket ends it
+        pass  # the reader of the socket ends it
 
 
 async def _ping(ws: web.WebSocketResponse) -> None:
     """Ask a viewer to say something now and then."""
-    with suppress(ConnectionError):  # who reads the socket ends it
+    with suppress(ConnectionError):  # the reader of the socket ends it
         while True:
             await asyncio.sleep(PING_S)
             await ws.ping()

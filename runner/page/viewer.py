@@ -21,10 +21,10 @@ WAITING_TEXTS = 500
 Burst = Callable[[int], list[AccessUnit]]  # by camera index: what a decoder that starts now must get
 
 
-class Viewer:
+class PageViewer:
     """Queues of one viewer. Used from one thread.
 
-    token  who it is: a random name that the browser keeps when the page is loaded again
+    token  its identity: a random name that the browser keeps when the page is loaded again
     burst  asked for what brings a late decoder up to date, when the viewer is ready to take it and not before
     """
 

@@ -90,7 +90,7 @@ class MapPqos:
             return ()
         return (
             f"position lat {event.lat}, lon {event.lon} is off the map, but lat {event.lon}, lon {event.lat} is on it: "
-            f"lon and lat look swapped in the map or in the positions; predicting {plain(self._off_map)} kbit/s",
+            f"lon and lat appear swapped in the map or in the positions; predicting {plain(self._off_map)} kbit/s",
         )
 
 
@@ -128,7 +128,7 @@ def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
     """
     table = read_table(path, (TIME, RATE))
     if len(table) < 2:
-        raise ModelError("file", path, "must have two rows or more, else nothing says how long a rate holds")
+        raise ModelError("file", path, "must have at least two rows, else the duration of a rate is unknown")
     times, rates = table[:, 0].tolist(), [exact(rate) for rate in table[:, 1].tolist()]
     begin, end = times[0], 2 * times[-1] - times[-2]
 

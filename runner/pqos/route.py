@@ -15,7 +15,7 @@ STRAIGHT = 2.0  # how many times its length a hop costs more when it turns off a
 
 
 def route(points: Floats) -> Ints:
-    """Order in which to drive through the points of a map; the same first and last index says that it is closed.
+    """Order in which to drive through the points of a map; equal first and last indices mean that it is closed.
 
     points   rows of lon, lat in degrees
     returns  indices of rows; points closer than a few metres to others are left out

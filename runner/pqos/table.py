@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.core.model import ModelError
 from runner.schema import shown
-from runner.system.files import why_no_file
+from runner.system.files import file_problem
 
 FINITE = sys.float_info.max
 MOST_BYTES = 200_000_000  # a month at 1 Hz
@@ -70,7 +70,7 @@ def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> P
     if path is None:
         raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
     if not path.is_file():
-        raise ModelError(key, name, why_no_file(path))
+        raise ModelError(key, name, file_problem(path))
     if path.stat().st_size > MOST_BYTES:
         raise ModelError(key, name, f"must be at most {MOST_BYTES // 1_000_000} MB long")
     return path
@@ -182,7 +182,7 @@ def _checked(path: Path, columns: Sequence[Column], text: _Text) -> NDArray[np.f
     if values is None:
         raise _not_a_number(path, text)
     if not len(values):
-        raise ModelError("file", path, "must have rows, there is none")
+        raise ModelError("file", path, "must have rows")
     good = (values >= [column.least for column in columns]) & (values <= [column.most for column in columns])
     times = [j for j, column in enumerate(columns) if column.time]
     for j in times:

@@ -84,7 +84,7 @@ def recorded(path: Path, loop: bool) -> Track:
     columns = (TIME, LAT, LON, SPEED) if SPEED.names[0] in header(path) else (TIME, LAT, LON)
     times, lat, lon, *speed = read_table(path, columns).T
     if len(times) < 2:
-        raise ModelError("file", path, "must have two rows or more")
+        raise ModelError("file", path, "must have at least two rows")
     return Track(times, lat, lon, speed[0] if speed else None, loop)
 
 

@@ -118,7 +118,7 @@ def to_yaml(measured: Measured) -> str:
 def read_model(path: Path) -> dict[str, Any]:
     """A model file.
 
-    raises  UserError that says what is wrong with it
+    raises  UserError with its first problem
     """
     from runner import schema
 
@@ -130,7 +130,7 @@ def read_model(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise wrong((error.strerror or str(error)).lower()) from None
     except ValueError as error:
-        raise wrong(f"is no model file: {error}") from None
+        raise wrong(f"is not a model file: {error}") from None
     if isinstance(document, dict) and document.get("version", VERSION) != VERSION:
         raise wrong(f"is of version {document['version']}, this tod-runner reads {VERSION}")
     found = schema.findings(document, SCHEMA)
@@ -150,9 +150,9 @@ def dumps(document: Mapping[str, Any]) -> bytes:
 
 
 def _clip_to_json(clip: Clip) -> dict[str, Any]:
-    said = {key: value for key, value in asdict(clip).items() if key != "path"}
-    rounded = {key: round(value, 3) for key, value in said.items() if key.startswith(("si", "ti"))}
-    return {"file": Path(clip.path).name, **said, "fps": plain(Fraction(clip.fps)), **rounded}
+    properties = {key: value for key, value in asdict(clip).items() if key != "path"}
+    rounded = {key: round(value, 3) for key, value in properties.items() if key.startswith(("si", "ti"))}
+    return {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
 
 
 def _point_to_json(point: Point) -> dict[str, Any]:

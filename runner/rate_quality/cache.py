@@ -14,7 +14,7 @@ from runner.system.files import write_whole
 
 
 def digest(*parts: object) -> str:
-    """Digest of anything whose text says it all."""
+    """Digest of values that their text identifies."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
@@ -26,7 +26,7 @@ def file_digest(path: Path) -> str:
 class Cache:
     """JSON documents by digest, one small file each, written at once or not at all.
 
-    warn  told, in a line, of a file that cannot be used; it is made again
+    warn  called with a line on a file that cannot be used; it is made again
     """
 
     def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
@@ -42,7 +42,7 @@ class Cache:
             self._warn(f"{path}: cannot be read ({error}), measured again")
             return None
         if not isinstance(document, dict):
-            self._warn(f"{path}: is no cache file, measured again")
+            self._warn(f"{path}: is not a cache file, measured again")
             return None
         return document
 

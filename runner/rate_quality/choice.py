@@ -23,11 +23,11 @@ from runner.rate_quality.curves import (
     reaches,
 )
 
-FEW_FRAMES = 40  # scored ones, below which a mean says little
+FEW_FRAMES = 40  # scored ones, below which a mean is uncertain
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class ChoiceCriteria:
     """What decides between points; see conf/study/paper.yaml.
 
     metric  the one that chooses, sign -1 where lower is better
@@ -67,25 +67,25 @@ class Choice:
     warnings: tuple[str, ...]
 
 
-def choose(points: Sequence[Point], wishes: Wishes) -> Choice:
+def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
     """Choose factors, bounds and b_full from points.
 
     raises  ValueError where no factor is left
     """
-    score = mean_score(wishes.metric, wishes.sign)
-    cores = cores_needed(points, wishes.fps)
+    score = mean_score(criteria.metric, criteria.sign)
+    cores = cores_needed(points, criteria.fps)
     dropped: dict[Fraction, str] = {}
-    if wishes.cores is not None:
+    if criteria.cores is not None:
         dropped = {
-            f: f"needs {c:.2f} of a core, allowed {wishes.cores:g}" for f, c in cores.items() if c > wishes.cores
+            f: f"needs {c:.2f} of a core, allowed {criteria.cores:g}" for f, c in cores.items() if c > criteria.cores
         }
     left = [point for point in points if point.scaling not in dropped]
     if not left:
-        raise ValueError(f"no factor's encoder needs at most {wishes.cores:g} of a core")
+        raise ValueError(f"no factor's encoder needs at most {criteria.cores:g} of a core")
     curves = draw_curves(left, score)
-    ladder, table = best_ladder(curves, wishes.tolerance, wishes.narrowest)
-    warnings = list(_warnings(left, curves, ladder, wishes))
-    b_full, unreached = _b_full(curves, ladder, wishes)
+    ladder, table = best_ladder(curves, criteria.tolerance, criteria.narrowest)
+    warnings = list(_warnings(left, curves, ladder, criteria))
+    b_full, unreached = _b_full(curves, ladder, criteria)
     warnings += unreached
     ladder = _below(curves, ladder, b_full)
     dropped |= {
@@ -97,7 +97,7 @@ def choose(points: Sequence[Point], wishes: Wishes) -> Choice:
         b_min=(0, *(round(bound) for bound in ladder.bounds)),
         b_full=b_full,
         ladder=ladder,
-        crossings=tuple(crossings(kept, ladder, wishes.metric, wishes.sign)),
+        crossings=tuple(crossings(kept, ladder, criteria.metric, criteria.sign)),
         dropped=dict(sorted(dropped.items())),
         table=tuple(table),
         cores=cores,
@@ -130,15 +130,17 @@ def cores_needed(points: Iterable[Point], fps: Fraction) -> dict[Fraction, float
     return dict(sorted(found.items()))
 
 
-def _b_full(curves: Curves, ladder: Ladder, wishes: Wishes) -> tuple[int, list[str]]:
+def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[int, list[str]]:
     """The bitrate at which the quality is good enough; the largest measured one where it never is."""
-    reached = reaches(curves, ladder, wishes.sign * wishes.good)
+    reached = reaches(curves, ladder, criteria.sign * criteria.good)
     if reached is not None:
         return ceil(reached), []
     largest = round(float(curves.kbps[-1]))
-    best = wishes.sign * float(curves.best[-1])
-    said = f"b_full: {wishes.metric} {wishes.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is taken"
-    return largest, [said]
+    best = criteria.sign * float(curves.best[-1])
+    warning = (
+        f"b_full: {criteria.metric} {criteria.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is taken"
+    )
+    return largest, [warning]
 
 
 def _below(curves: Curves, ladder: Ladder, b_full: int) -> Ladder:
@@ -156,18 +158,18 @@ def _why_dropped(factor: Fraction, curves: Curves, b_full: int) -> str:
     return f"the best from {wins[0]:.0f} to {wins[-1]:.0f} kbit/s, where it gains too little over the others"
 
 
-def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, wishes: Wishes) -> Iterable[str]:
-    score = mean_score(wishes.metric, wishes.sign)
-    scored = len(points[0].scores[wishes.metric])
+def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> Iterable[str]:
+    score = mean_score(criteria.metric, criteria.sign)
+    scored = len(points[0].scores[criteria.metric])
     if scored < FEW_FRAMES:
-        yield f"only {scored} frames were scored; a longer sequence would say more"
+        yield f"only {scored} frames were scored; use a longer sequence"
     if len(ladder.scaling) == 1:
         low, high = curves.kbps[0], curves.kbps[-1]
         yield f"the curves never cross between {low:.0f} and {high:.0f} kbit/s: {_shown(ladder.scaling[0])} is the best"
-    if ladder.regret_max > wishes.tolerance:
-        said = f"{ladder.regret_max:.2g} of {wishes.metric}, more than the {wishes.tolerance:g} allowed"
-        yield f"no choice of factors whose ranges are wide enough loses less than {said}"
-    fallen = falls(points, score, wishes.tolerance)
+    if ladder.regret_max > criteria.tolerance:
+        warning = f"{ladder.regret_max:.2g} of {criteria.metric}, more than the {criteria.tolerance:g} allowed"
+        yield f"no choice of factors whose ranges are wide enough loses less than {warning}"
+    fallen = falls(points, score, criteria.tolerance)
     if fallen:
         worst = max(fallen, key=lambda pair: score(pair[0]) - score(pair[1]))
         pair = " to ".join(str(point.target_kbps) for point in worst)
@@ -178,7 +180,7 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, wishes: W
         if over:
             top = max(over, key=lambda point: point.target_kbps)
             comes = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
-            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it comes to {comes}; left out there"
+            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it reaches {comes}; excluded there"
 
 
 def _shown(factor: Fraction) -> str:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-Document = Mapping[str, Any]  # of a model file
+ModelDocument = Mapping[str, Any]  # of a model file
 
 
-def compare(a: Document, b: Document) -> Iterator[str]:
+def compare(a: ModelDocument, b: ModelDocument) -> Iterator[str]:
     """Lines for a person: what they were measured on, then factors, bounds and b_full, then the points."""
     yield from _origins(a, b)
     if a["scaling"] == b["scaling"]:
@@ -22,7 +22,7 @@ def compare(a: Document, b: Document) -> Iterator[str]:
     yield from _points(a, b)
 
 
-def _origins(a: Document, b: Document) -> Iterator[str]:
+def _origins(a: ModelDocument, b: ModelDocument) -> Iterator[str]:
     for what, key in (("metric", "metric"), ("plan", "plan")):
         if a[key] != b[key]:
             yield f"{what:<10} {a[key]} -> {b[key]}"
@@ -47,7 +47,7 @@ def _changes(before: str, after: str) -> Iterator[str]:
     yield from (f"+ {element}" for element in second if element not in first)
 
 
-def _certain(a: Document, b: Document, factor: float) -> str:
+def _certain(a: ModelDocument, b: ModelDocument, factor: float) -> str:
     """Whether the ranges of confidence of a bound overlap."""
     ranges = [(c["low"], c["high"]) for m in (a, b) for c in m["crossings"] if c["upper"] == factor]
     if len(ranges) < 2:
@@ -56,7 +56,7 @@ def _certain(a: Document, b: Document, factor: float) -> str:
     return ", within their confidence" if low <= other_high and other_low <= high else ", outside their confidence"
 
 
-def _points(a: Document, b: Document) -> Iterator[str]:
+def _points(a: ModelDocument, b: ModelDocument) -> Iterator[str]:
     """Where both have encoded the same: how far their qualities are apart."""
     both = sorted(set(a["metrics"]) & set(b["metrics"]))
     mine, theirs = ({(p["scaling"], p["target_kbps"]): p for p in model["points"]} for model in (a, b))
@@ -78,5 +78,5 @@ def _list(values: list[float]) -> str:
     return "[" + ", ".join(f"{value:g}" for value in values) + "]"
 
 
-def _files(model: Document) -> str:
+def _files(model: ModelDocument) -> str:
     return ", ".join(clip["file"] for clip in model["sequences"].values())

@@ -15,7 +15,7 @@ from runner.lanes import Lane, cut, fragment
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest
-from runner.rate_quality.choice import Wishes, choose, pooled
+from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.metrics import Metric, find_metric
 from runner.rate_quality.sequence import Sequence as Clip
@@ -23,7 +23,7 @@ from runner.rate_quality.sequence import as_filmed, survey
 from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep
 from runner.rate_quality.workers import open_executor, parallel_tasks
-from runner.system.files import why_no_file, write_whole
+from runner.system.files import file_problem, write_whole
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -74,7 +74,7 @@ def _check_output(output: Path, models: Iterable[str]) -> None:
         raise UserError("command line", "output", repr(str(output)), rule) from None
     for path in (output / f"{model}.yaml" for model in models):
         if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
-            rule = "is there and was not written by tod-runner model; choose another directory"
+            rule = "exists and was not written by tod-runner model; choose another directory"
             raise UserError("command line", "output", repr(str(path)), rule)
 
 
@@ -135,14 +135,14 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
     where = f"masks.{name}"
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if picture is None:
-        rule = "cannot be read as a picture" if path.is_file() else why_no_file(path)
+        rule = "cannot be read as a picture" if path.is_file() else file_problem(path)
         raise UserError("command line", where, repr(str(path)), rule)
     if picture.shape != (camera.height, camera.width):
         found = f"{picture.shape[1]}x{picture.shape[0]}"
         raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the sequence is")
     mask: Mask = picture > 127
     if not mask.any():
-        raise UserError("command line", where, repr(str(path)), "is all black: nothing would count")
+        raise UserError("command line", where, repr(str(path)), "is all black: no pixel would count")
     return mask
 
 
@@ -151,7 +151,7 @@ def _measure(
 ) -> Measured:
     chooses = metrics[0]
     sign = 1 if chooses.higher_is_better else -1
-    wishes = Wishes(
+    criteria = ChoiceCriteria(
         metric=chooses.name,
         sign=sign,
         tolerance=chooses.tolerance if study.tolerance is None else study.tolerance,
@@ -160,9 +160,9 @@ def _measure(
         cores=study.cpu_cores,
         fps=sweeps[0].plan.camera.fps,
     )
-    points = _points(study, wishes, sweeps, lambda share: progress(name, share))
+    points = _points(study, criteria, sweeps, lambda share: progress(name, share))
     try:
-        choice = choose(points, wishes)
+        choice = choose(points, criteria)
     except ValueError as error:
         raise RunError(f"{name}: {error}") from None
     first = sweeps[0]
@@ -178,7 +178,7 @@ def _measure(
         labels={metric.name: metric.label for metric in metrics},
         metric=chooses.name,
         sign=sign,
-        good=wishes.good,
+        good=criteria.good,
         plan=study.plan,
         stride=first.stride,
         points=points,
@@ -187,32 +187,34 @@ def _measure(
     )
 
 
-def _points(study: Study, wishes: Wishes, sweeps: Sequence[Sweep], told: Callable[[float], None]) -> list[Point]:
+def _points(
+    study: Study, criteria: ChoiceCriteria, sweeps: Sequence[Sweep], on_progress: Callable[[float], None]
+) -> list[Point]:
     """Points of one model, round by round, until its plan wants no more."""
     groups: list[list[Point]] = [[] for _ in sweeps]
     done = expected = 0.0
-    while lanes := _next(study, wishes, pooled(groups)):
+    while lanes := _next(study, criteria, pooled(groups)):
         cost = float(sum(lane.scaling**2 for lane in lanes)) * len(sweeps)
         later = LATER_ROUNDS * cost if study.plan == "adaptive" and not done else 0.0
         expected = max(expected, done + cost + later)
         for index, sweep in enumerate(sweeps):
             part = cost / len(sweeps)
-            groups[index] += sweep.measure(lanes, _rising(told, done / expected, part / expected))
+            groups[index] += sweep.measure(lanes, _rising(on_progress, done / expected, part / expected))
             done += part
-    told(1.0)
+    on_progress(1.0)
     return pooled(groups)
 
 
-def _rising(told: Callable[[float], None], begun: float, part: float) -> Callable[[float], None]:
-    """Tells how much of the whole is done, from how much of a part is; the end is told by who knows that it is."""
-    return lambda share: told(min(0.99, begun + part * share))
+def _rising(on_progress: Callable[[float], None], begun: float, part: float) -> Callable[[float], None]:
+    """A callback that converts progress of a part to progress of the whole; the caller reports the end."""
+    return lambda share: on_progress(min(0.99, begun + part * share))
 
 
-def _next(study: Study, wishes: Wishes, points: Sequence[Point]) -> list[Lane]:
+def _next(study: Study, criteria: ChoiceCriteria, points: Sequence[Point]) -> list[Lane]:
     if study.plan == "full":
         return plans.full(study.scalings, study.rates, points)
-    score = mean_score(wishes.metric, wishes.sign)
-    return plans.adaptive(study.scalings, study.rates, points, score, wishes.tolerance, wishes.narrowest)
+    score = mean_score(criteria.metric, criteria.sign)
+    return plans.adaptive(study.scalings, study.rates, points, score, criteria.tolerance, criteria.narrowest)
 
 
 def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
@@ -224,7 +226,7 @@ def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
 
 
 def _write(measured: Measured, output: Path, sweeps: Sequence[Sweep]) -> str:
-    """Write all files of a model; the line that says so."""
+    """Write all files of a model; returns the line that reports them."""
     from runner.rate_quality.plots import plot
 
     write_whole(output / f"{measured.name}.model.json", dumps(to_json(measured)))

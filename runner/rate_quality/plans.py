@@ -41,7 +41,7 @@ def adaptive(
     curves = draw_curves(points, score)
     ladder, _ = best_ladder(curves, tolerance, narrowest)
     left = max(0, len(scalings) * len(rates) // SHARE - len(points))
-    return (_unknown(_crossings(ladder), points) or _unknown(_rivals(curves, ladder, tolerance), points))[:left]
+    return (_unknown(_crossings(ladder), points) or _unknown(_near_best(curves, ladder, tolerance), points))[:left]
 
 
 def _crossings(ladder: Ladder) -> list[Lane]:
@@ -50,7 +50,7 @@ def _crossings(ladder: Ladder) -> list[Lane]:
     return [Lane(factor, round(kbps)) for neighbours, kbps in pairs for factor in neighbours]
 
 
-def _rivals(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
+def _near_best(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
     """Factors that are left out and nearly as good, where they are most so, beside the one that is kept there."""
     kept = along(curves, ladder.scaling, ladder.bounds)
     wanted: list[tuple[float, list[Lane]]] = []

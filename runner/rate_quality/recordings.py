@@ -69,7 +69,7 @@ def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
     wanted = [directory / INDEX, *(final(directory, name) for name in cameras)]
     taken = [path.name for path in (*wanted, *(part(directory, name) for name in cameras)) if path.exists()]
     if taken:
-        rule = f"{', '.join(taken)} there already; nothing is overwritten, choose another directory"
+        rule = f"{', '.join(taken)} already exist; choose another directory"
         raise UserError("command line", "output", repr(str(directory)), rule)
     claimed: dict[str, Path] = {}
     try:
@@ -99,7 +99,7 @@ def keep(directory: Path, camera: str) -> Path:
     incomplete, path = part(directory, camera), final(directory, camera)
     try:
         if path.exists():
-            raise RunError(f"{path} came into being meanwhile; the recording is {incomplete}")
+            raise RunError(f"{path} was created meanwhile; the recording is {incomplete}")
         _flush(incomplete)
         incomplete.rename(path)
         _flush(directory)

@@ -64,7 +64,7 @@ def decoding(path: str, fps: Fraction) -> str:
 def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
     """Look a clip through.
 
-    say     told, in a line, that this takes a while
+    say     called with a line: this takes a while
     raises  UserError where it cannot be used
     """
     from runner.apply import discover
@@ -78,8 +78,8 @@ def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
         say(f"looking through {path}")
         known = _look_through(path, form.fps)
         cache.store(key, known)
-    said = asdict(form) | {"lossless": form.lossless or _recorded(path)}
-    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **said, **known)
+    properties = asdict(form) | {"lossless": form.lossless or _recorded(path)}
+    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
         found = f"{path}: {sequence.frames} frames"
         raise UserError("command line", where, found, f"is too short, at least {FEWEST_FRAMES} are needed")

@@ -83,7 +83,7 @@ def check_cameras(study: Study, cameras: Sequence[str]) -> None:
     named += [("masks", name) for name in study.masks]
     for key, name in named:
         if name not in cameras:
-            raise ModelError(key, repr(name), f"no such camera is measured, {suggest(name, cameras)}")
+            raise ModelError(key, repr(name), f"no such camera is measured{suggest(name, cameras)}")
     members = [name for _, name in named[: len(named) - len(study.masks)]]
     for name in members:
         if members.count(name) > 1:

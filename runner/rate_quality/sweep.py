@@ -49,29 +49,29 @@ class Sweep:
     found: int = 0
     _keys: dict[Lane, str] = field(default_factory=dict)
 
-    def measure(self, lanes: Sequence[Lane], told: Callable[[float], None]) -> list[Point]:
+    def measure(self, lanes: Sequence[Lane], on_progress: Callable[[float], None]) -> list[Point]:
         """Points of some lanes, from the cache or measured; each is kept as soon as its task is done.
 
-        told    the share of the work that is done, never falling
+        on_progress  called with the share of the work that is done, never falling
         raises  RunError; what is finished by then stays in the cache
         """
         points = [point for lane in lanes if (point := self._kept(lane))]
         self.found += len(points)
         have = {(point.scaling, point.target_kbps) for point in points}
         missing = [lane for lane in lanes if (lane.scaling, lane.kbps) not in have]
-        for point in self._run(self._tasks(missing), told):
+        for point in self._run(self._tasks(missing), on_progress):
             self.cache.store(self._key(Lane(point.scaling, point.target_kbps)), self._json(point))
             points.append(point)
             self.encoded += 1
         return points
 
-    def _run(self, tasks: list[Task], told: Callable[[float], None]) -> Iterator[Point]:
+    def _run(self, tasks: list[Task], on_progress: Callable[[float], None]) -> Iterator[Point]:
         """Points as their tasks end."""
-        done = Done([task.cost for task in tasks], told)
+        done = TaskProgress([task.cost for task in tasks], on_progress)
         own_process = isinstance(self.executor, ThreadPoolExecutor)
         futures: dict[Future[list[Point]], int] = {}
         for number, task in enumerate(tasks):
-            tell = (lambda share, n=number: done.tell(n, share),) if own_process else ()
+            tell = (lambda share, n=number: done.update(n, share),) if own_process else ()
             futures[self.executor.submit(run_task, task, *tell)] = number
         try:
             waiting = set(futures)
@@ -80,7 +80,7 @@ class Sweep:
                 for future in ended:
                     number = futures.pop(future)  # a cluster forgets what nobody holds, and need not find it again
                     yield from future.result()
-                    done.tell(number, 1.0)
+                    done.update(number, 1.0)
         finally:
             done.cancelled = True
             for future in futures:
@@ -136,19 +136,19 @@ class Sweep:
         return {metric.name: metric.identity for metric in self.metrics}
 
 
-class Done:
-    """How much of some tasks is done, told from any of their threads."""
+class TaskProgress:
+    """The share of several tasks that is done; updated from any of their threads."""
 
-    def __init__(self, costs: Sequence[float], told: Callable[[float], None]) -> None:
-        self._costs, self._shares, self._told = costs, [0.0] * len(costs), told
+    def __init__(self, costs: Sequence[float], on_progress: Callable[[float], None]) -> None:
+        self._costs, self._shares, self._on_progress = costs, [0.0] * len(costs), on_progress
         self._lock = threading.Lock()
         self.cancelled = False
 
-    def tell(self, number: int, share: float) -> None:
+    def update(self, number: int, share: float) -> None:
         """raises Cancelled where nobody waits for the task any more"""
         if self.cancelled:
             raise Cancelled
         with self._lock:
             self._shares[number] = max(share, self._shares[number])
             done = sum(cost * share for cost, share in zip(self._costs, self._shares, strict=True))
-            self._told(done / sum(self._costs))
+            self._on_progress(done / sum(self._costs))

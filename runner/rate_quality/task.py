@@ -14,7 +14,7 @@ from runner.lanes import Lane, LaneSet
 from runner.rate_quality.curves import Point
 
 if TYPE_CHECKING:
-    from runner.rate_quality.metrics import Luma, Mask, Meter, Metric
+    from runner.rate_quality.metrics import Luma, Mask, Metric, QualityMeter
 
 OVERHEAD = 0.1  # of an encoding at full size: what a lane costs whatever its size, decoding and looking at pictures
 
@@ -51,10 +51,10 @@ class Cancelled(Exception):
     """The person has had enough."""
 
 
-def run_task(task: Task, told: Callable[[float], None] = lambda share: None) -> list[Point]:
+def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: None) -> list[Point]:
     """Encode, decode and score all lanes of a task.
 
-    told    the share that is done, a few times a second; what it raises ends the task
+    on_progress  called with the share that is done, a few times a second; an exception that it raises ends the task
     raises  RunError
     """
     from runner.apply import run_lanes
@@ -66,7 +66,7 @@ def run_task(task: Task, told: Callable[[float], None] = lambda share: None) -> 
             task.compiled,
             references.put,
             lambda lane, frame, luma: scoring[lane].take(frame, luma, references),
-            lambda frames: told(frames / task.frames),
+            lambda frames: on_progress(frames / task.frames),
         )
         for one in scoring:
             one.finish(references)
@@ -127,7 +127,7 @@ class _Scoring:
     def __init__(self, task: Task, number: int) -> None:
         size = (task.roi.width, task.roi.height)
         self._task, self._size, self._lane = task, size, task.lanes[number]
-        self._meters: dict[str, Meter] = {
+        self._meters: dict[str, QualityMeter] = {
             metric.name: metric.meter(size, task.compiled.fps, task.stride, task.mask) for metric in task.metrics
         }
         self._every = {metric.name: metric.every_frame for metric in task.metrics}

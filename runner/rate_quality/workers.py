@@ -17,7 +17,7 @@ from runner.system.bound import die_with
 P = ParamSpec("P")
 T = TypeVar("T")
 
-SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is not there
+SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is offline
 
 
 def parallel_tasks(wanted: int | None) -> int:
@@ -41,7 +41,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
     if workers == "threads":
         pool = ThreadPoolExecutor(parallel)
     else:
-        # Idle workers wait for ever for a process that was killed.
+        # Idle workers would wait forever for a process that was killed.
         pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
     try:
         yield pool
@@ -73,39 +73,39 @@ class _Cluster(Executor):
         self._executor = executor
 
     def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        return self._executor.submit(uncollected, function, *args, **kwargs)
+        return self._executor.submit(without_cycle_collection, function, *args, **kwargs)
 
 
 class _Collector:
     """Python's collector of cycles, which several threads of a process may want still."""
 
     def __init__(self) -> None:
-        self._lock, self._wishes, self._was_on = threading.Lock(), 0, False
+        self._lock, self._users, self._was_on = threading.Lock(), 0, False
 
     def __enter__(self) -> None:
         with self._lock:
-            if not self._wishes:
+            if not self._users:
                 self._was_on = gc.isenabled()
                 gc.disable()
-            self._wishes += 1
+            self._users += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
-            self._wishes -= 1
-            if not self._wishes and self._was_on:
+            self._users -= 1
+            if not self._users and self._was_on:
                 gc.enable()
 
 
-_still = _Collector()
+_collector = _Collector()
 
 
-def uncollected(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
+def without_cycle_collection(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
     """Call a function and leave cycles of garbage until the last such call of the process is over.
 
     A Dask worker looks at the frames of its threads every few milliseconds. Where cycles are collected just then and a
     thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them, wait
-    for themselves for ever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
+    for themselves forever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
     as few cycles, however many frames they see.
     """
-    with _still:
+    with _collector:
         return function(*args, **kwargs)

@@ -151,7 +151,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
 
 
 def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
-    """A worker's life: views in, reports out; Ctrl-C is the parent's to answer, who then ends the worker."""
+    """A worker's life: views in, reports out; the parent handles Ctrl-C, then ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:

@@ -1,6 +1,6 @@
 """The street of the synthetic drive: its course, its textures, and the upright faces along it.
 
-The course is one lap of a street that goes on for ever, each lap shifted by `period_m` in x: that closes the loop
+The course is one lap of an endless street, each lap shifted by `period_m` in x: that closes the loop
 without the full turn of a ring road, where every camera would pan most of the time and a forward one would see nearly
 as much motion as one that looks aside.
 Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.
@@ -477,17 +477,19 @@ def stand_faces(course: Course) -> Faces:
     )
 
 
-Row = tuple[float, ...]  # ax, ay, bx, by, along_m, height_m, texture, shade, box
+FaceRow = tuple[float, ...]  # ax, ay, bx, by, along_m, height_m, texture, shade, box
 
 
-def face(a: tuple[float, float], b: tuple[float, float], along: float, height: float, texture: int, box: int) -> Row:
+def face(
+    a: tuple[float, float], b: tuple[float, float], along: float, height: float, texture: int, box: int
+) -> FaceRow:
     """One face, lit by the sun if its right-hand side (seen from a to b) is turned to it."""
     direction = np.array([b[1] - a[1], a[0] - b[0]]) / max(math.dist(a, b), 1e-9)
     light = 256 * (0.86 + 0.16 * max(0.0, float(direction @ SUN)))
     return (*a, *b, along, height, texture, light, box)
 
 
-def wall_faces(course: Course, side: int) -> list[Row]:
+def wall_faces(course: Course, side: int) -> list[FaceRow]:
     """Fronts of one side of the street, in pieces of equal length, so that no window is stretched in a bend."""
     house, _, heights = plan_houses(course)
     x, y = course.beside(side * WALL_D)
@@ -495,7 +497,7 @@ def wall_faces(course: Course, side: int) -> list[Row]:
     at = np.linspace(0, lengths[-1], len(house) + 1)
     points = list(zip(np.interp(at, lengths, x).tolist(), np.interp(at, lengths, y).tolist(), strict=True))
     step = course.length_m / len(house)
-    rows: list[Row] = []
+    rows: list[FaceRow] = []
     for k, (a, b) in enumerate(pairwise(points)):
         from_left = k if side > 0 else (k + len(house) // 2) % len(house)
         height = float(heights[house[from_left]])
@@ -504,10 +506,10 @@ def wall_faces(course: Course, side: int) -> list[Row]:
     return rows
 
 
-def things_beside(course: Course) -> list[Row]:
+def things_beside(course: Course) -> list[FaceRow]:
     """Hedges, railings, trees and lamps on the pavement, cars and vans in some of the parking bays of 6 m."""
     random = np.random.default_rng(3)
-    rows: list[Row] = []
+    rows: list[FaceRow] = []
     for bay in range(int(course.length_m / 6)):
         for side in (-1, 1):
             s = 6 * bay + 3.05
@@ -528,7 +530,7 @@ def at_offset(course: Course, s: float, d: float) -> tuple[float, float, float]:
     return x - d * math.sin(psi), y + d * math.cos(psi), psi
 
 
-def parked(course: Course, s: float, d: float, box: int, kind: tuple[int, float, float, float]) -> list[Row]:
+def parked(course: Course, s: float, d: float, box: int, kind: tuple[int, float, float, float]) -> list[FaceRow]:
     """The four sides of a box, anticlockwise, so that each one's right-hand side looks outward."""
     texture, length, width, height = kind
     x, y, psi = at_offset(course, s, d)
@@ -541,7 +543,7 @@ def parked(course: Course, s: float, d: float, box: int, kind: tuple[int, float,
     return [face(corners[k], corners[(k + 1) % 4], 0, height, texture + k % 2, box) for k in range(4)]
 
 
-def strip(course: Course, s: float, d: float, texture: int, height: float) -> list[Row]:
+def strip(course: Course, s: float, d: float, texture: int, height: float) -> list[FaceRow]:
     """Hedge of a front garden or railing at the kerb, 4.5 m long, in pieces that follow the bend."""
     ends = [at_offset(course, s + 1.5 * piece, d)[:2] for piece in range(4)]
     if d < 0:
@@ -549,10 +551,10 @@ def strip(course: Course, s: float, d: float, texture: int, height: float) -> li
     return [face(a, b, s + 1.5 * piece, height, texture, -1) for piece, (a, b) in enumerate(pairwise(ends))]
 
 
-def upright(course: Course, s: float, d: float, texture: int, width: float, height: float) -> list[Row]:
+def upright(course: Course, s: float, d: float, texture: int, width: float, height: float) -> list[FaceRow]:
     """Two crossed cut-outs, so that a tree is one from every side."""
     x, y, psi = at_offset(course, s, d)
-    rows: list[Row] = []
+    rows: list[FaceRow] = []
     for turn in (0.6, 0.6 + math.pi / 2):
         dx, dy = width / 2 * math.cos(psi + turn), width / 2 * math.sin(psi + turn)
         rows.append((x - dx, y - dy, x + dx, y + dy, 0.0, height - 0.01, float(texture), 240.0, -1.0))

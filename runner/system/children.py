@@ -61,18 +61,18 @@ class VerbProcess:
 
     name    for people
     before  comes before its command line
-    said    file that takes its standard error; None: it goes where this process's goes
+    stderr  file that takes its standard error; None: it goes where this process's goes
     """
 
     def __init__(
-        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), said: IO[str] | None = None
+        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), stderr: IO[str] | None = None
     ) -> None:
-        self.name, self._said = name, said
+        self.name, self._stderr = name, stderr
         read, self._lifeline = os.pipe()
         try:
             self.process = subprocess.Popen(
                 [*before, sys.executable, "-m", "runner", verb, *words],
-                stderr=said,
+                stderr=stderr,
                 env={**environment(), LIFELINE: str(read)},
                 pass_fds=[read],
                 start_new_session=True,
@@ -85,14 +85,14 @@ class VerbProcess:
         return self.process.poll()
 
     def check(self) -> None:
-        """raises RunError where it has ended, with what it has said"""
+        """raises RunError where it has ended, with its error output"""
         status = self.poll()
         if status is None:
             return
         text = ""
-        if self._said:
-            self._said.seek(0)
-            text = self._said.read().strip()
+        if self._stderr:
+            self._stderr.seek(0)
+            text = self._stderr.read().strip()
         raise RunError(f"{self.name} ended early ({ending(status)})" + (f":\n{text}" if text else ""))
 
     def ask(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether the clocks of two machines agree well enough to tell the age of a picture. Pure."""
+"""Whether the clocks of two machines agree well enough to determine the age of a picture. Pure."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-CLOCKS_APART_MS = -1.0  # an age below it tells that the vehicle's clock is ahead; above it, it is noise
-TRUSTED_AGAIN_S = 10.0  # for so long no age may be negative before ages are told again
-CURRENT_S = 1.0  # a picture that came longer ago has no age to tell
+CLOCKS_APART_MS = -1.0  # an age below it shows that the vehicle's clock is ahead; above it, it is noise
+TRUSTED_AGAIN_S = 10.0  # for so long no age may be negative before ages are known again
+CURRENT_S = 1.0  # an older picture has no current age
 
 
 @dataclass
 class Clocks:
-    """Whether the ages of pictures can be told: each is the difference of two machines' clocks.
+    """Whether the ages of pictures are known: each is the difference of two machines' clocks.
 
-    A negative age tells that the vehicle's clock is ahead, by at least as much. All ages are too small then: unknown.
-    A clock that is behind makes them too large; nothing tells that.
+    A negative age shows that the vehicle's clock is ahead, by at least as much. All ages are too small then: unknown.
+    A clock that is behind makes them too large; this is not detectable.
 
-    ahead_ms  by how much the vehicle's clock is ahead at least; None: nothing tells so
+    ahead_ms  by how much the vehicle's clock is ahead at least; None: not detected
     """
 
     ahead_ms: float | None = None

@@ -60,7 +60,7 @@ def _opened(part: Path, path: Path, argument: str) -> TextIO:
         raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
 
 
-def why_no_file(path: Path) -> str:
+def file_problem(path: Path) -> str:
     """The rule that a path breaks which names no regular file: a device, a pipe or a directory is none."""
     return "must be a file" if path.exists() else "no such file"
 
@@ -71,7 +71,7 @@ def read_file(path: Path, most_bytes: int) -> bytes:
     raises  ValueError with the rule that it breaks
     """
     if not path.is_file():
-        raise ValueError(why_no_file(path))
+        raise ValueError(file_problem(path))
     try:
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)

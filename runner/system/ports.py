@@ -1,4 +1,4 @@
-"""Whether a server may listen where it is told to."""
+"""Whether a server may listen at its configured address."""
 
 from __future__ import annotations
 

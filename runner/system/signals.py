@@ -66,7 +66,7 @@ class _Watch:
         self.number = 0  # of the first signal
         self.stop: Stop | None = None
         self.urgent: list[Action] = []
-        self.told = False  # whether the main thread knows of it
+        self.delivered = False  # whether the main thread knows of it
         self.interrupted = False  # by an exception
         self._deadline: float | None = None
 
@@ -74,7 +74,7 @@ class _Watch:
     def handled(self) -> Iterator[None]:
         """Take the signals, and give them back at the end."""
         self.number, self.stop, self._deadline = 0, Stop(), None
-        self.told = self.interrupted = False
+        self.delivered = self.interrupted = False
         read, write = os.pipe()
         os.set_blocking(write, False)
         self._wakeup, self._over = write, False
@@ -89,7 +89,7 @@ class _Watch:
             for number, handler in zip(NUMBERS, before, strict=True):
                 signal.signal(number, handler)
             self._over = True
-            self._rouse()
+            self._wake()
             thread.join(END_S)
             if not thread.is_alive():
                 os.close(write)
@@ -98,8 +98,8 @@ class _Watch:
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         """Called by the interpreter in the main thread, before or after the thread has read the number."""
         self.number = self.number or number  # the thread may not have read it yet
-        if self.stop is None and not self.told:
-            self.told = self.interrupted = True
+        if self.stop is None and not self.delivered:
+            self.delivered = self.interrupted = True
             raise KeyboardInterrupt
 
     def _run(self, wakeup: int, lifeline: int | None) -> None:
@@ -117,11 +117,11 @@ class _Watch:
                 for number in filter(NUMBERS.__contains__, os.read(wakeup, 64)):
                     self._take(number)
             if self._deadline is not None and time.monotonic() >= self._deadline:
-                self._end("no orderly end in time: ending at once")
+                self._end("shutdown timed out: ending now")
 
     def _take(self, number: int) -> None:
         if self._deadline is not None or (self.stop and self.stop.is_set()):
-            self._end("a second signal: ending at once")
+            self._end("second signal: ending now")
         self.number = self.number or number
         self.ask()
 
@@ -130,12 +130,12 @@ class _Watch:
         stop = self.stop
         limit_s = stop.limit_s if stop else END_S
         self._deadline = None if limit_s is None else time.monotonic() + limit_s
-        self._rouse()
+        self._wake()
         if stop:
-            self.told = True
+            self.delivered = True
             stop.set()
 
-    def _rouse(self) -> None:
+    def _wake(self) -> None:
         """Let the thread look at what has changed."""
         with suppress(BlockingIOError):  # the pipe is full: it is about to look anyway
             os.write(self._wakeup, b"\0")
@@ -200,7 +200,7 @@ def interruptible() -> Iterator[None]:
     stop, _watch.stop = _watch.stop, None
     try:
         if _watch.number:
-            _watch.told = True
+            _watch.delivered = True
             raise KeyboardInterrupt
         yield
     except Exception:

@@ -23,12 +23,12 @@ from runner.core.model import Progress, Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
-from runner.mqtt.link import Link
-from runner.mqtt.messages import OFFLINE, Message, read_request, read_settings, read_state, read_telemetry, topic
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import OFFLINE, MqttMessage, read_request, read_settings, read_state, read_telemetry, topic
 from runner.plans import compile_plans, render_missing
 from runner.records import Outcome, Settings, Telemetry, VehicleState, to_json
 from runner.vehicle.inbox import Request
-from runner.vehicle.loop import Loop
+from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
     from runner.apply import VehicleSide
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 STUCK_S = 2.0  # a loop that finishes nothing for so long is stuck
 WATCH_S = 0.25  # how often that is looked at
 END_S = 5.0  # a loop that does not end within this is left behind
-ANOTHER_S = 0.5  # a vehicle sends telemetry five times a second; who hears none of this name by then has it
+NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none of this name came by then, the name is free
 CONSOLE_LINES = 1000
 TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
 
@@ -49,7 +49,7 @@ class LiveVehicle:
     failure  why the vehicle had to end; None: it runs, or was stopped
     """
 
-    def __init__(self, side: VehicleSide, loop: Loop) -> None:
+    def __init__(self, side: VehicleSide, loop: ControlLoop) -> None:
         self.side, self.loop = side, loop
         self.failure: RunError | None = None
         self._thread: threading.Thread | None = None
@@ -58,7 +58,7 @@ class LiveVehicle:
 
     def start(self) -> None:
         """Run the loop in a thread, until the vehicle is left."""
-        self._thread = threading.Thread(target=self._run_apart, name="loop", daemon=True)
+        self._thread = threading.Thread(target=self._run_in_thread, name="loop", daemon=True)
         self._thread.start()
 
     def run(self, duration_s: float | None = None) -> None:
@@ -74,7 +74,7 @@ class LiveVehicle:
         if self.failure:
             raise self.failure
 
-    def _run_apart(self) -> None:
+    def _run_in_thread(self) -> None:
         try:
             self.run()
         except RunError as error:
@@ -134,7 +134,7 @@ class _Console:
             self._say(line)
 
 
-class _ControlEnd:
+class _VehicleControl:
     """The vehicle's end of the control link: requests in, replies, state, telemetry and configuration out.
 
     Nothing is published before it is known that no other vehicle of this name is at the broker.
@@ -145,14 +145,14 @@ class _ControlEnd:
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._alone = threading.Event()
-        self._asked: threading.Timer | None = None
+        self._announce_timer: threading.Timer | None = None
         listen = {
             self._topic("request", "+"): self._on_request,
             self._topic("telemetry"): self._on_telemetry,
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        self._link = Link(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
+        self._link = ControlLink(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -163,8 +163,8 @@ class _ControlEnd:
             self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
     def close(self) -> None:
-        if self._asked:
-            self._asked.cancel()
+        if self._announce_timer:
+            self._announce_timer.cancel()
         self._link.close(*([(self._topic("state"), OFFLINE)] if self._alone.is_set() else []))
 
     def _topic(self, *parts: str) -> str:
@@ -174,9 +174,9 @@ class _ControlEnd:
         if here and self._alone.is_set():
             self._announce()
         elif here:
-            self._asked = threading.Timer(ANOTHER_S, self._announce)
-            self._asked.daemon = True
-            self._asked.start()
+            self._announce_timer = threading.Timer(NAME_CHECK_S, self._announce)
+            self._announce_timer.daemon = True
+            self._announce_timer.start()
 
     def _announce(self) -> None:
         if self._live.failure:
@@ -185,38 +185,38 @@ class _ControlEnd:
         self.publish(self._settings)
         self._live.loop.publish_again()  # the broker may have published the last will, or forgotten everything
 
-    def _on_request(self, message: Message) -> None:
+    def _on_request(self, message: MqttMessage) -> None:
         if self._live.loop.overrun(message.sender):
             return
-        asked = read_request(message)
+        parsed = read_request(message)
         reply = self._topic("reply", message.sender)
 
         def answer(outcome: Outcome) -> None:
-            self._link.publish(reply, {"id": asked.identity, **to_json(outcome)})
+            self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
-        request = Request(message.sender, asked.document, answer, asked.as_of)
-        if asked.problem:
-            self._live.loop.refuse(request, asked.problem)
+        request = Request(message.sender, parsed.document, answer, parsed.as_of)
+        if parsed.problem:
+            self._live.loop.refuse(request, parsed.problem)
         else:
             self._live.loop.take(request)
 
-    def _on_telemetry(self, message: Message) -> None:
+    def _on_telemetry(self, message: MqttMessage) -> None:
         """Before anything was published, telemetry that comes now is another vehicle's."""
         if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
             rule = "choose another `name`, or stop the other vehicle"
             self._live.fail(RunError(f"a vehicle named {self._name} is at the broker already; {rule}"))
 
-    def _on_state(self, message: Message) -> None:
+    def _on_state(self, message: MqttMessage) -> None:
         """A last will that the broker publishes late, when the vehicle is back already."""
         if self._alone.is_set() and read_state(message.payload) is None:
             self._live.loop.publish_again()
 
-    def _on_configuration(self, message: Message) -> None:
+    def _on_configuration(self, message: MqttMessage) -> None:
         run = read_settings(message.payload).run
         own = run == self._settings.run
         if self._alone.is_set() and not message.retained and not own and run not in self._others:
             self._others.add(run)
-            self._report(f"another vehicle named {self._name} has come to the broker: operators see both")
+            self._report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
 @contextmanager
@@ -228,7 +228,7 @@ def live_vehicle(
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
 ) -> Iterator[LiveVehicle]:
-    """Everything that the vehicle's side needs, stopped and said goodbye for at the end.
+    """Everything that the vehicle's side needs, stopped and disconnected at the end.
 
     log       directory that the drive is recorded to
     say       called, from a thread of its own, with one line on what happens
@@ -252,8 +252,8 @@ def live_vehicle(
 
     video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
-    control = _ControlEnd(vehicle, document, report)
-    loop = Loop(vehicle, side, pqos, track, drive, control.publish, report)
+    control = _VehicleControl(vehicle, document, report)
+    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report)
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
-from runner.core.commands import Command, Knobs
+from runner.core.commands import Command, KnobValues
 from runner.core.events import (
     ClockAdvanced,
     Event,
@@ -46,14 +46,14 @@ class Applier(Protocol):
     """What the loop asks of the side that streams."""
 
     def turn(self, commands: Iterable[Command]) -> None: ...
-    def applied(self) -> Mapping[str, Knobs]: ...
+    def applied(self) -> Mapping[str, KnobValues]: ...
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
     def give_control(self, operator: str) -> None: ...
 
 
-class _Asked(NamedTuple):
+class _PendingReply(NamedTuple):
     """A request that was accepted and is not answered before its commands are read back as applied."""
 
     answer: Answer
@@ -62,7 +62,7 @@ class _Asked(NamedTuple):
 
 
 @dataclass
-class Loop:
+class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` what they have.
 
     publish  called with the state (decided and applied) whenever it changed, and telemetry a few times a second
@@ -86,7 +86,7 @@ class Loop:
     _inbox: Inbox = field(default_factory=Inbox)
     _stopped: bool = False
     _ticks: int = 0
-    _asked: list[_Asked] = field(default_factory=list)
+    _pending: list[_PendingReply] = field(default_factory=list)
     _published: VehicleState | None = None  # the state as last published
     _publish_again: bool = False
     _cause: str = ""  # the event that the decision in force came from
@@ -111,7 +111,7 @@ class Loop:
         if dropped is request:
             self.refuse(request, f"too many: {WAITING} requests of this sender are waiting")
         elif dropped:
-            self.refuse(dropped, "superseded: a newer one came before this was taken")
+            self.refuse(dropped, "superseded by a newer measurement")
 
     def overrun(self, sender: str) -> bool:
         """Whether a sender floods the vehicle, so that its message is counted and not even read. From any thread."""
@@ -210,8 +210,9 @@ class Loop:
         stamped = {**request.document, "t": t}
         problem = event_problem(stamped)
         event = None if problem else parse(stamped)
-        self._hear(request.sender, t, event)
+        self._update_presence(request.sender, t, event)
         if event is None:
+            assert problem
             self._refuse(problem, t, request.answer)
         elif request.as_of is not None and (late := self._operators.expired(request.sender, t, request.as_of)):
             self.refused += 1
@@ -221,7 +222,7 @@ class Loop:
         else:
             self._take(event, request.answer)
 
-    def _hear(self, sender: str, t: float, event: Event | None) -> None:
+    def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
         """Any message of an operator shows its presence. The core sees the first that comes and the last that goes."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
@@ -229,8 +230,8 @@ class Loop:
         elif isinstance(event, OperatorDisconnected):
             self._operators.disconnected(sender)
         else:
-            self._operators.heard(sender, t)
-        self._presence_changed(before, t, "said goodbye")
+            self._operators.message_received(sender, t)
+        self._presence_changed(before, t, "disconnected")
 
     def _watch_operators(self, t: float) -> None:
         before = self._operators.present
@@ -287,7 +288,7 @@ class Loop:
             self._answer(answer, Outcome(event.t, "refused", after.refused))
         elif answer:
             knobs = [(command.camera, command.knob) for command in after.commands]
-            self._asked.append(_Asked(answer, knobs, event.t + APPLY_S))
+            self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S))
         if after.commands or after.decision != before.decision:
             self._report_decision(before, event)
 
@@ -306,30 +307,30 @@ class Loop:
             self._publish_again = False
             self._published = state
             self.publish(state)
-        self._asked = [asked for asked in self._asked if not self._answered(asked, applied)]
+        self._pending = [asked for asked in self._pending if not self._answered(asked, applied)]
 
-    def _state(self, applied: Mapping[str, Knobs]) -> VehicleState:
+    def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights, faults = self._run.decision, self._run.state.weights, self.applier.sources()
         cameras = {
             name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name))
             for name, setting in decision.settings.items()
         }
-        fault = self._run.fault or None
+        fault = self._run.fault
         return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
 
-    def _answered(self, asked: _Asked, applied: Mapping[str, Knobs]) -> bool:
+    def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request, if all that it made of knobs is applied, or time is up."""
         now, commanded = self._now(), self._run.commanded
-        watched = [(name, knob) for name, knob in asked.knobs if applied[name]]
+        watched = [(name, knob) for name, knob in pending.knobs if applied[name]]
         waiting = [f"{name} {knob}" for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
-        if waiting and now < asked.until:
+        if waiting and now < pending.until:
             return False
         if waiting:
-            asked.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {', '.join(waiting)}"))
+            pending.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {', '.join(waiting)}"))
             return True
-        unwatched = dict.fromkeys(name for name, _ in asked.knobs if not applied[name])
+        unwatched = dict.fromkeys(name for name, _ in pending.knobs if not applied[name])
         reason = f"nobody watches {', '.join(unwatched)}: kept until somebody does" if unwatched else ""
-        asked.answer(Outcome(now, "applied", reason))
+        pending.answer(Outcome(now, "applied", reason))
         return True
 
     def _publish_measured(self, t: float) -> None:

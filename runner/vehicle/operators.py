@@ -1,6 +1,6 @@
 """Which operators are present, and whether a request is too old to be carried out. Pure: time is given.
 
-An operator is whoever sends requests under an id of its own, which is part of the topic. It is present from its
+An operator is a client that sends requests under an id of its own, which is part of the topic. It is present from its
 `operator_connected` on. It leaves by its own silence or its own `operator_disconnected`; any later message of its own
 brings it back.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
 
-SILENT_S = 1.0  # an operator who sends nothing for so long has left; a present one sends four messages a second
+SILENT_S = 1.0  # an operator that sends nothing for so long is offline; a present one sends four messages a second
 AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks that drift apart
 DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
 MOST = 64  # operators remembered; the one that has been silent longest is forgotten for a new one
@@ -20,7 +20,7 @@ MOST = 64  # operators remembered; the one that has been silent longest is forgo
 
 @dataclass(slots=True)
 class _Operator:
-    heard: float
+    last_message: float
     since: float = 0.0
     present: bool = False
     announced: bool = False
@@ -43,7 +43,7 @@ class Operators:
 
     @property
     def in_control(self) -> str:
-        """The operator who has been present longest without a break, "" for none."""
+        """The operator that has been present longest without a break, "" for none."""
         present = {name: operator.since for name, operator in self._known.items() if operator.present}
         return min(present, key=lambda name: present[name], default="")
 
@@ -51,19 +51,19 @@ class Operators:
         """An operator announces itself, or does so again as its sign of life; returns whether it was away."""
         operator = self._operator(name, t)
         operator.announced = True
-        return self.heard(name, t)
+        return self.message_received(name, t)
 
-    def heard(self, name: str, t: float) -> bool:
+    def message_received(self, name: str, t: float) -> bool:
         """Any message of an operator at time t, s; returns whether it brings a present operator back."""
         operator = self._operator(name, t)
-        operator.heard = t
+        operator.last_message = t
         returns = operator.announced and not operator.present
         if returns:
             operator.present, operator.since = True, t
         return returns
 
     def disconnected(self, name: str) -> bool:
-        """An operator says goodbye, or its last will does; returns whether it was present."""
+        """An operator disconnects, itself or by its last will; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
@@ -71,14 +71,14 @@ class Operators:
         return was_present
 
     def silent(self, t: float) -> list[str]:
-        """Operators who have been silent for too long since the last call; they count as away now."""
-        gone = [name for name, o in self._known.items() if o.present and t - o.heard > SILENT_S]
+        """Operators that have been silent for too long since the last call; they count as offline now."""
+        gone = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
         for name in gone:
             self._known[name].present = False
         return gone
 
-    def expired(self, name: str, t: float, as_of: float) -> str:
-        """Why a request is too old to be carried out at time t, or "".
+    def expired(self, name: str, t: float, as_of: float) -> str | None:
+        """Why a request is too old to be carried out at time t; None if it is not.
 
         as_of  the vehicle's time in the newest telemetry that the sender had, plus the time since by the sender's
                clock. So `t - as_of` is one round trip for a request that nothing held up; no clocks are compared.
@@ -90,11 +90,11 @@ class Operators:
         round_trip = min(operator.delays, default=0.0)
         operator.delays.append(max(0.0, delay))
         limit = self._expires_s + min(round_trip, MAX_ROUND_TRIP_S)
-        return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else ""
+        return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else None
 
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:
             if len(self._known) >= MOST:
-                del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].heard))]
-            self._known[name] = _Operator(heard=t)
+                del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].last_message))]
+            self._known[name] = _Operator(last_message=t)
         return self._known[name]

@@ -29,8 +29,10 @@ class Verb(NamedTuple):
 
 
 VERBS = {
-    "print": Verb("what would run, and why; starts nothing", "runner.verbs.print", ("total_kbps", "format")),
-    "validate": Verb("check your files and what they compose to", "runner.verbs.validate", ("all",), "FILE"),
+    "print": Verb(
+        "print pipelines and decisions without starting them", "runner.verbs.print", ("total_kbps", "format")
+    ),
+    "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
     "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
@@ -40,7 +42,7 @@ VERBS = {
     "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
     "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
     "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
-    "doctor": Verb("what is missing on this machine", "runner.verbs.doctor", (), "VERB"),
+    "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
 }
 
 
@@ -89,7 +91,7 @@ class Arguments:
             if equals and key in own:
                 values[key] = value
             elif word.startswith("-"):
-                raise UserError("command line", "", word, "there are no flags; write NAME=VALUE, or --help")
+                raise UserError("command line", "", word, "flags are not supported; write NAME=VALUE, or --help")
             elif VERBS[verb].takes == DRIVE and (not equals or "/" in key):  # a path may hold a = of its own
                 plain.append(word)
             elif not equals and not word.startswith("~"):
@@ -146,7 +148,7 @@ def _check_name(verb: str, key: str) -> None:
         raise UserError("command line", name, None, rule)
     hint = suggest(name, (*own, *configured))
     if "did you mean" in hint:
-        raise UserError("command line", name, None, f"unknown name, {hint}")
+        raise UserError("command line", name, None, f"unknown name{hint}")
 
 
 def study_word(word: str) -> str:

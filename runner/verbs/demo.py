@@ -6,9 +6,9 @@ terminal shows the same. Every camera runs at 5 Hz for each core, which carries 
 browser without a GPU; give fps_max=40, or null for the cameras' own rates.
 
 With log=DIR both sides write what they do and see to DIR. With output=OUT a report is made at the end, as by the verb
-report (models= goes there); the drive then lies in OUT/drive, where no log= says otherwise. An experiment states what
-is driven; one with several runs makes several drives and compares them. With link= a link of limited rate joins both
-sides.
+report (models= goes there); the drive then lies in OUT/drive, unless log= names another directory. An experiment
+defines the drives; one with several runs makes several drives and compares them. With link= a link of limited rate
+joins both sides.
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
@@ -130,9 +130,7 @@ def _prepared(
         config = configuration(own.overrides, own.conf, runnable=False)
         _, link = config.experiment()
     if link and directory is None:
-        raise UserError(
-            "command line", "link", link.kind, "what it does is to be looked at: give log=DIR or output=OUT"
-        )
+        raise UserError("command line", "link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     config = config.drivable(apply.check_plan)
     config.pqos()
     vehicle = config.vehicle()
@@ -196,12 +194,12 @@ def _drive(run: _Run, duration_s: float) -> None:
 
 @contextmanager
 def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) -> Iterator[tuple[VerbProcess, ...]]:
-    """Both sides as processes, vehicle and operator. What the vehicle says is told only where it matters."""
+    """Both sides as processes, vehicle and operator. The vehicle's error output is shown only where it failed."""
     to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
-    with tempfile.TemporaryFile("w+") as said, ExitStack() as stack:
+    with tempfile.TemporaryFile("w+") as stderr, ExitStack() as stack:
         before = link.vehicle_command if link else ()
         sides = (
-            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, said),
+            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr),
             VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={duration_s}"]),
         )
         for side in sides:
@@ -210,8 +208,8 @@ def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) ->
             yield sides
         finally:
             _end(sides)
-            said.seek(0)
-            for line in said:
+            stderr.seek(0)
+            for line in stderr:
                 if WITHOUT_LOG in line:
                     say(line.rstrip())
 

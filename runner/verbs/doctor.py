@@ -37,7 +37,7 @@ NEEDED = {  # extras of this package that a verb needs whatever the configuratio
 }
 
 
-class Finding(NamedTuple):
+class Diagnosis(NamedTuple):
     """One thing looked at."""
 
     fine: bool
@@ -52,7 +52,7 @@ def run(arguments: Arguments) -> int:
     for fine, what in findings:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
     if not findings:
-        print(f"ok      {verb} needs nothing besides this package")
+        print(f"ok      {verb} needs only this package")
     return 0 if all(fine for fine, _ in findings) else 1
 
 
@@ -61,17 +61,17 @@ def _verb(arguments: Arguments) -> str:
     if len(words) > 1:
         raise UserError("command line", "", words[1], "must be one verb")
     if words[0] not in VERBS:
-        raise UserError("command line", "", words[0], f"unknown verb, {suggest(words[0], VERBS)}")
+        raise UserError("command line", "", words[0], f"unknown verb{suggest(words[0], VERBS)}")
     return words[0]
 
 
-def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[Finding]:
+def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[Diagnosis]:
     """Everything that a verb needs with this configuration."""
     for extra in _extras(verb, vehicle, document):
         for module in EXTRAS[extra]:
             there = find_spec(module) is not None
             hint = "" if there else f": install the extra {extra}, see docs/install.md"
-            yield Finding(there, f"Python module {module}{hint}")
+            yield Diagnosis(there, f"Python module {module}{hint}")
     if verb in STREAMING:
         bindings = list(_bindings())
         yield from bindings
@@ -97,36 +97,36 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield from ["cluster"] if study["workers"] == "dask" else []
 
 
-def _bindings() -> Iterator[Finding]:
+def _bindings() -> Iterator[Diagnosis]:
     """GStreamer's Python bindings: PyGObject and typelibs."""
     try:
         from runner import apply
     except MissingBindings as error:
-        yield from (Finding(False, f"{part}: {why}") for part, why in error.missing.items())
+        yield from (Diagnosis(False, f"{part}: {why}") for part, why in error.missing.items())
     else:
-        yield from (Finding(True, f"typelib {name}") for name in apply.TYPELIBS)
+        yield from (Diagnosis(True, f"typelib {name}") for name in apply.TYPELIBS)
 
 
-def _elements(vehicle: Vehicle) -> Iterator[Finding]:
+def _elements(vehicle: Vehicle) -> Iterator[Diagnosis]:
     from runner.apply import missing_plugins, missing_recorders
 
     plans = compile_plans(vehicle)
     lines = [line for plan in plans for line in (plan.source, plan.vehicle, plan.operator, plan.recorder)]
     names = {element.factory for line in lines for element in line}
     missing = dict.fromkeys(s for plan in plans for s in (*missing_plugins(plan), *missing_recorders(plan)))
-    yield from (Finding(False, sentence) for sentence in missing)
+    yield from (Diagnosis(False, sentence) for sentence in missing)
     if not missing:
-        yield Finding(True, f"{len(names)} GStreamer elements")
+        yield Diagnosis(True, f"{len(names)} GStreamer elements")
 
 
-def _broker() -> Finding:
+def _broker() -> Diagnosis:
     try:
-        return Finding(True, f"MQTT broker {find_mosquitto()}, for the demo")
+        return Diagnosis(True, f"MQTT broker {find_mosquitto()}, for the demo")
     except RunError as error:
-        return Finding(False, str(error))
+        return Diagnosis(False, str(error))
 
 
-def _ports(verb: str, vehicle: Vehicle) -> Iterator[Finding]:
+def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
     """Ports that a verb listens on."""
     ports: dict[str, Endpoint] = {}
     if verb in ("vehicle", "demo"):
@@ -139,14 +139,14 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Finding]:
         try:
             check_port_free(endpoint)
         except RunError as error:
-            yield Finding(False, f"{key}: {error}")
+            yield Diagnosis(False, f"{key}: {error}")
         else:
-            yield Finding(True, f"{key}: {endpoint.host}:{endpoint.port} is free")
+            yield Diagnosis(True, f"{key}: {endpoint.host}:{endpoint.port} is free")
 
 
-def _cores(vehicle: Vehicle) -> Finding:
+def _cores(vehicle: Vehicle) -> Diagnosis:
     """Whether the cores carry all cameras at full rate, as an estimate; never called missing."""
     load_mpx = sum(float(camera.fps) * camera.width * camera.height for camera in vehicle.cameras.values()) / 1e6
     cores = os.cpu_count() or 1
     need = load_mpx / CORE_MPX_S
-    return Finding(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving comes on top")
+    return Diagnosis(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving needs more")

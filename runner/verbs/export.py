@@ -1,7 +1,7 @@
 """usage: tod-runner export DRIVE [output=FILE.mcap]
 
 A drive as MCAP, for Foxglove and every other reader of MCAP. DRIVE is a directory that log=DIR wrote; whatever of it is
-there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= says otherwise.
+there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= names another file.
 
   /position               foxglove.LocationFix
   /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)
@@ -44,7 +44,7 @@ def run(arguments: Arguments) -> int:
     directory = Path(arguments.words[0])
     output = arguments.path("output") or directory / "drive.mcap"
     if os.path.lexists(output):
-        rule = "is there already; remove it, or name another file by output="
+        rule = "already exists; remove it, or name another file by output="
         raise UserError("command line", "output", repr(str(output)), rule)
     if arguments.overrides:
         raise UserError("command line", "", arguments.overrides[0], "an export has no configuration, only output=")

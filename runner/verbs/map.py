@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner.drive.capacity import Cell, Sample, cannot_tell, cells, limited_samples
+from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.errors import RunError, UserError
@@ -27,20 +27,20 @@ PERCENTILE, CELL_M = 10.0, 10.0
 
 def run(arguments: Arguments) -> int:
     output, percentile, cell_m = _wanted(arguments)
-    samples: list[Sample] = []
+    samples: list[CapacitySample] = []
     seen, without = 0, list[str]()
     for word in arguments.words:
         drive = series(read_drive(Path(word)))
         print("".join(f"{warning}\n" for warning in drive.warnings), end="", file=sys.stderr)
-        if why := cannot_tell(drive):
+        if why := capacity_problem(drive):
             without.append(f"{word} {why}")
             continue
         samples += limited_samples(drive)
         seen += len(drive.actual.t)
     if not samples:
-        rule = "nothing was lost and nothing late: what came says what was sent, not what the link carries"
-        told = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
-        raise RunError(f"no map: {'; '.join([*without, *told])}")
+        rule = "no packet was lost and no frame was late: the received bitrate does not show the link's capacity"
+        reasons = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
+        raise RunError(f"no map: {'; '.join([*without, *reasons])}")
     squares = cells(samples, percentile, cell_m)
     _write(output, squares)
     left_out = f"; left out: {'; '.join(without)}" if without else ""
@@ -51,7 +51,7 @@ def run(arguments: Arguments) -> int:
 def _wanted(arguments: Arguments) -> tuple[Path, float, float]:
     """File, percentile and size of a square."""
     if arguments.overrides:
-        rule = "unknown argument, there is output, percentile, cell_m"
+        rule = "unknown argument; expected one of output, percentile, cell_m"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
         raise UserError("command line", "", None, "must name a drive: a directory that log= wrote")

@@ -92,7 +92,7 @@ def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
         kinds = options("cameras", conf_directories(arguments.conf))
         if wanted not in kinds:
             hint = suggest(wanted, [*vehicle.cameras, *kinds])
-            raise UserError("command line", "camera", repr(wanted), f"is neither mounted nor a kind of camera, {hint}")
+            raise UserError("command line", "camera", repr(wanted), f"is neither mounted nor a kind of camera{hint}")
         words.append(f"+cameras@cameras.{wanted}={wanted}")
         config = configuration(words, arguments.conf, runnable=False, check=check_plan)
         study, vehicle = config.study(), config.vehicle()

@@ -23,10 +23,10 @@ from runner.operator.live import LiveOperator, live_operator
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, streaming
-from runner.verbs.table import Table, show_summary
+from runner.verbs.table import LiveTable, show_summary
 
 if TYPE_CHECKING:
-    from runner.page.server import Page
+    from runner.page.server import PageServer
 
 SHOW_S = 0.25
 
@@ -36,7 +36,7 @@ def run(arguments: Arguments) -> int:
     duration = arguments.number("duration_s")
     sys.setswitchinterval(SWITCH_S)
     with (
-        Table() as table,
+        LiveTable() as table,
         live_operator(arguments.overrides, arguments.conf, log=arguments.path("log")) as operator,
     ):
         station = operator.station
@@ -54,15 +54,15 @@ def run(arguments: Arguments) -> int:
 
 
 @contextmanager
-def _served(operator: LiveOperator) -> Iterator[Page | None]:
+def _served(operator: LiveOperator) -> Iterator[PageServer | None]:
     """The page, unless the configuration switches it off."""
     vehicle, station = operator.vehicle, operator.station
     if not vehicle.page.serve:
         yield None
         return
-    from runner.page.server import Page
+    from runner.page.server import PageServer
 
-    page = Page(vehicle, station)
+    page = PageServer(vehicle, station)
     page.start()
     station.listeners.append(page)
     station.note(f"page: {page.url}")

@@ -4,7 +4,7 @@ Record each camera without loss: the frames as its source delivers them, in nati
 DIR/CAMERA.mkv, and what was recorded into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with
 Ctrl-C; either way the files are complete. A file has its name only when it is complete; until then, and where its
 camera fails, it is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing, since the encoder or the disk was
-too slow, are counted and told. recording=NAME chooses the encoder, a file of conf/recording/.
+too slow, are counted and reported. recording=NAME chooses the encoder, a file of conf/recording/.
 
 Before the start the disk must have room for the raw frames (width x height x 1.5 bytes x fps) times of_raw of
 conf/recording/, for duration_s or else for 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
@@ -107,8 +107,8 @@ class _Session:
         self._ended[name] = recorded
         unfinished = recordings.part(self._directory, name)
         if recorded.stage.value == "failed":
-            before = f"; what came before is in {unfinished}" if unfinished.stat().st_size else ""
-            self._fail(f"{name}: {recorded.why}{before}")
+            before = f"; the part before is in {unfinished}" if unfinished.stat().st_size else ""
+            self._fail(f"{name}: {recorded.failure}{before}")
             return
         try:
             recordings.keep(self._directory, name)
@@ -159,7 +159,7 @@ class _Session:
         kept = camera.name in self._kept
         path = (recordings.final if kept else recordings.part)(self._directory, camera.name)
         if not path.exists():
-            return {"failed": recorded.why}
+            return {"failed": recorded.failure}
         entry: dict[str, Any] = {
             "file": path.name,
             "bytes": path.stat().st_size,
@@ -174,7 +174,7 @@ class _Session:
             "left_out_frames": recorded.left_out,
             "began": round(recorded.began, 3),
         }
-        return entry if kept else {"failed": recorded.why or "not named", **entry}
+        return entry if kept else {"failed": recorded.failure or "not named", **entry}
 
     def _line(self, name: str, entry: Mapping[str, Any]) -> str:
         size = f"{entry['width_px']}x{entry['height_px']} at {entry['fps']:g} Hz"
@@ -186,7 +186,7 @@ class _Session:
 
 
 def _warnings(recorded: Recorded) -> Iterator[str]:
-    """What a person should know who takes the file for all that the camera saw."""
+    """Warnings for users who expect the file to be complete."""
     if recorded.missing:
         of = recorded.frames + recorded.missing
         why = ", the encoder or the disk was too slow" if recorded.overruns else ""

@@ -1,8 +1,8 @@
 """usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
-standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json says what an
-event is. A line that is no event ends the run with its number; what was put out before stays. An event that cannot be
+standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
+events. An invalid line ends the run with its number; earlier output stays. An event that cannot be
 accepted is answered with "accepted": false and the reason, and the run goes on.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with the configuration that it was driven with:
@@ -48,7 +48,7 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
-Heard = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
+InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
 
 _encode = json.JSONEncoder(ensure_ascii=False).encode
 
@@ -104,7 +104,7 @@ def _log(arguments: Arguments, config: Mapping[str, Any], began: Began | None) -
 
 
 def replay(
-    vehicle: Vehicle, inputs: Iterable[Heard], pqos: Pqos | None = None, log: Log | None = None
+    vehicle: Vehicle, inputs: Iterable[InputEvent], pqos: Pqos | None = None, log: Log | None = None
 ) -> Iterator[str]:
     """One line of JSON per event, in order.
 
@@ -119,7 +119,7 @@ def replay(
         yield answers.line(document, now)
 
 
-def _predicted(inputs: Iterable[Heard], pqos: Pqos) -> Iterator[Heard]:
+def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
     """The events with the predictions of another source in place of their own."""
     for document, event in inputs:
         if not isinstance(event, BitratePredicted):
@@ -149,13 +149,13 @@ class _Answers:
         return f'{_encode(heard)[:-1]}, {self._in_force(now.decision)}, "commands": {commands}}}\n'
 
     def _in_force(self, decision: Decision) -> str:
-        if self._decision is None or not decision.says_the_same(self._decision):
+        if self._decision is None or not decision.equals_with_reasons(self._decision):
             self._decision, self._text = decision, _encode(records.to_json(InForce.of(decision)))[1:-1]
         return self._text
 
 
-def events(lines: Iterable[str], name: str) -> Iterator[Heard]:
-    """Events of a JSON Lines text, each with the JSON it came from. What else a drive's file says is passed over.
+def events(lines: Iterable[str], name: str) -> Iterator[InputEvent]:
+    """Events of a JSON Lines text, each with the JSON it came from. Other lines of a drive log are skipped.
 
     raises  UserError with the number of the line
     """
@@ -191,7 +191,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
 def _keep(path: Path, output: Path | None) -> None:
     """raises UserError where what is read would be written over"""
     if output and output.is_file() and path.exists() and output.samefile(path):
-        raise UserError("command line", "output", repr(str(output)), "is what is read, choose another file")
+        raise UserError("command line", "output", repr(str(output)), "is the input, choose another file")
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from runner.verbs.screen import progress_bar
 
 if TYPE_CHECKING:
     from runner.drive.read import Drive
-    from runner.drive.statistics import Statistics
+    from runner.drive.statistics import DriveStatistics
 
 DOCUMENT = "report.json"
 
@@ -65,8 +65,8 @@ def report(
         held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
         made, left_out = figures(drives)
         write_figures(made, output, progress)
-        told = document.to_json(drives, held, [figure.name for figure in made], left_out)
-        write_whole(output / DOCUMENT, dumps(told))
+        summary = document.to_json(drives, held, [figure.name for figure in made], left_out)
+        write_whole(output / DOCUMENT, dumps(summary))
         index = output / "index.html"
         write_whole(index, page(drives, held, made, left_out).encode())
     show(drives, held, left_out)
@@ -88,7 +88,7 @@ def check_report(output: Path, models: Path | None) -> None:
 
 def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
     if arguments.overrides:
-        rule = f"unknown argument, there is {', '.join((*_own(), 'conf'))}"
+        rule = f"unknown argument; expected one of {', '.join((*_own(), 'conf'))}"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
         raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")
@@ -115,7 +115,7 @@ def _need_libraries() -> None:
 
 def _measured(
     paths: Sequence[Path], models: Path | None, bases: Sequence[Path], progress: Callable[[float], None]
-) -> list[Statistics]:
+) -> list[DriveStatistics]:
     from dataclasses import replace
 
     from runner.drive.models import find_models
@@ -138,7 +138,7 @@ def _measured(
 
 
 def labels(drives: Sequence[Drive]) -> list[str]:
-    """Short names that tell drives apart: the directory's, more of its path where two are called the same."""
+    """Short names that distinguish drives: the directory's, more of its path where two are called the same."""
     paths = [drive.path.resolve() for drive in drives]
     found: list[str] = []
     for number, path in enumerate(paths):

@@ -10,27 +10,27 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from runner.drive.checks import Check
-from runner.drive.statistics import Statistics
+from runner.drive.checks import ClaimCheck
+from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import VERDICTS, camera_rows, drive_rows
 
 
-def show(drives: Sequence[Statistics], checks: Mapping[str, Sequence[Check]], left_out: Sequence[str]) -> None:
+def show(
+    drives: Sequence[DriveStatistics], checks: Mapping[str, Sequence[ClaimCheck]], left_out: Sequence[str]
+) -> None:
     """The cameras of each drive, the drives beside each other, claims, and what to know of them."""
     console = Console(width=None if sys.stdout.isatty() else 190)
     for drive in drives:
         console.print(_table(drive.series.label, *camera_rows(drive)))
-        for told in (*drive.series.warnings, *drive.notes):
-            console.print(f"{drive.series.label}: {told}", markup=False, highlight=False)
+        for note in (*drive.series.warnings, *drive.notes):
+            console.print(f"{drive.series.label}: {note}", markup=False, highlight=False)
     if len(drives) > 1:
         console.print(_table("all drives", *drive_rows(drives)))
     for label, held in checks.items():
         rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
-        console.print(
-            _table(f"{label}: what the paper reports and what came out", ("claim", "came out", "holds"), rows)
-        )
-    for told in left_out:
-        console.print(told, markup=False, highlight=False)
+        console.print(_table(f"{label}: claims of the paper and results", ("claim", "result", "holds"), rows))
+    for note in left_out:
+        console.print(note, markup=False, highlight=False)
 
 
 def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

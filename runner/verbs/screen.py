@@ -31,7 +31,7 @@ def streaming() -> ModuleType:
 
 
 def say(what: str) -> None:
-    """One line for the person who looks on, with the time of day."""
+    """One line for the user, with the time of day."""
     now = time.time()
     clock = time.strftime("%H:%M:%S", time.localtime(now))
     print(f"{clock}.{int(now * 1000) % 1000:03d} {redacted(what)}", file=sys.stderr, flush=True)

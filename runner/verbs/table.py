@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from runner.operator.meter import Meter, middle, percentile
+from runner.operator.meter import ReceptionMeter, middle, percentile
 from runner.operator.station import CameraRow, Listener
 from runner.records import Note
 from runner.system.signals import urgent
@@ -28,7 +28,7 @@ NOTES = 4
 KEPT_NEWS = 1000
 
 
-class Table(Listener):
+class LiveTable(Listener):
     """Shown in place on a terminal, every few seconds elsewhere."""
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Table(Listener):
         self._shown = 0.0
         self._stack = ExitStack()
 
-    def __enter__(self) -> Table:
+    def __enter__(self) -> LiveTable:
         if self._live:
             self._stack.enter_context(urgent(_show_cursor))
             self._stack.enter_context(self._live)
@@ -103,7 +103,7 @@ def _size_style(row: CameraRow) -> str:
     return "bold yellow" if wrong else ""
 
 
-def show_summary(meters: Mapping[str, Meter], received: Mapping[str, Any]) -> None:
+def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, Any]) -> None:
     """What came against what was decided, over the whole run."""
     table = RichTable(title="received", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("camera")

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from runner import schema
-from runner.configuration.build import Check
+from runner.configuration.build import PlanCheck
 from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
@@ -47,43 +47,43 @@ from runner.verbs import Arguments
 DATA = ("maps", "traces")  # folders for what pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files meet each other
 STANDING_ALONE = ("experiment", "link")  # packaged, never meet a choice of the command line
-Ask = Callable[[Configuration], object]
-READERS: dict[str, Ask] = {  # by group, what reads its part of the configuration, if not the vehicle
+ConfigReader = Callable[[Configuration], object]
+READERS: dict[str, ConfigReader] = {  # by group, what reads its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
     "study": Configuration.study,
     "link": Configuration.experiment,
 }
-Choices = tuple[tuple[str, str], ...]  # group and file
+ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
 
-class Run(NamedTuple):
+class ExperimentRun(NamedTuple):
     """One of the runs of an experiment: where it stands, and the overrides that it adds."""
 
     file: str
     path: str
     words: tuple[str, ...]
 
-    def blamed(self, problem: Problem) -> Problem:
-        """A problem of the command line, told of the run if that has the word."""
+    def attributed(self, problem: Problem) -> Problem:
+        """A problem of the command line, attributed to the run if that has the word."""
         word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
         if problem.file != COMMAND_LINE or word is None:
             return problem
         return Problem(self.file, self.path, word, problem.rule)
 
 
-class Task(NamedTuple):
+class ValidationTask(NamedTuple):
     """A configuration to check: overrides, files that are chosen on top, and the run of an experiment among those."""
 
     overrides: tuple[str, ...]
-    choices: Choices = ()
-    run: Run | None = None
+    choices: ChosenFiles = ()
+    run: ExperimentRun | None = None
 
     @property
     def words(self) -> tuple[str, ...]:
         return (*self.overrides, *words_of(dict(self.choices)), *(self.run.words if self.run else ()))
 
     @property
-    def asks(self) -> Sequence[Ask]:
+    def readers(self) -> Sequence[ConfigReader]:
         """What is asked of the configuration."""
         if not self.choices or "experiment" in dict(self.choices):
             return Configuration.pqos, Configuration.experiment
@@ -171,7 +171,7 @@ def _is_yaml(name: str) -> bool:
 
 
 def check_file(path: Path, relative: Path) -> Iterator[Problem]:
-    """Problems of one file. The folder says which schema it follows."""
+    """Problems of one file. The folder determines its schema."""
     name, group = label(path), "/".join(relative.parts[:-1])
     if rule := _misplaced(group, relative):
         yield Problem(name, "", None, rule)
@@ -189,19 +189,19 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
-def _misplaced(group: str, relative: Path) -> str:
-    """Why Hydra would not find a file, or ""."""
+def _misplaced(group: str, relative: Path) -> str | None:
+    """Why Hydra would not find a file; None if it would."""
     first = relative.parts[0]
     if group and group not in GROUPS:
         nested = f"files stand in {first}/ itself, not in folders below" if first in GROUPS else ""
-        return f"would be ignored: {nested or f'no such group as {group}/, {suggest(group, GROUPS)}'}"
+        return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
     if not group and relative.stem != "config":
         return f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
     if relative.suffix != ".yaml":
         return f"would be ignored: Hydra reads {relative.stem}.yaml"
     if group and not choosable(relative.stem):
         return "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
-    return ""
+    return None
 
 
 # --- what they compose to ---------------------------------------------------------------------------------------------
@@ -224,7 +224,7 @@ class _Tasks:
         self._vehicle_settled = "vehicle" in settled
         self._tasks = list(dict.fromkeys(filter(self._concerned, self._all())))
 
-    def __iter__(self) -> Iterator[Task]:
+    def __iter__(self) -> Iterator[ValidationTask]:
         return iter(self._tasks)
 
     @property
@@ -232,9 +232,9 @@ class _Tasks:
         """Groups and files that are chosen by any of them."""
         return list(dict.fromkeys(choice for task in self._tasks for choice in task.choices))
 
-    def _all(self) -> Iterator[Task]:
+    def _all(self) -> Iterator[ValidationTask]:
         """Single files before those that they meet; the same may come twice."""
-        yield Task(self._overrides)
+        yield ValidationTask(self._overrides)
         for group, names in self._files.items():
             for name in names:
                 yield from self._of_one_file(group, name)
@@ -244,29 +244,29 @@ class _Tasks:
             vehicles = [None]
         for met in product(vehicles, *others):
             chosen = zip(CROSSED, met, strict=True)
-            yield Task(self._overrides, tuple((group, one) for group, one in chosen if one))
+            yield ValidationTask(self._overrides, tuple((group, one) for group, one in chosen if one))
         if self._everything:
             yield from self._reached()
 
-    def _of_one_file(self, group: str, name: str) -> Iterator[Task]:
+    def _of_one_file(self, group: str, name: str) -> Iterator[ValidationTask]:
         """A file with the choices of the command line; an experiment also with each of its runs."""
         packaged = name not in options(group, self._directories[:-1])
         overrides = () if packaged and group in STANDING_ALONE else self._overrides
-        task = Task(overrides, ((group, name),))
+        task = ValidationTask(overrides, ((group, name),))
         yield task
         if group == "experiment":
             yield from (task._replace(run=run) for run in _runs(name, task.words, self._user))
 
-    def _reached(self) -> Iterator[Task]:
+    def _reached(self) -> Iterator[ValidationTask]:
         """Files that refer to other groups or choose of them, with every choice of those."""
         for group, names in self._files.items():
             for name in names if group not in STANDING_ALONE else ():
                 with suppress(ConfigError):  # reported of the file alone
                     for other in reaches(find_file(self._directories, group, name)):
                         for choice in self._files.get(other, ()):
-                            yield Task(self._overrides, ((group, name), (other, choice)))
+                            yield ValidationTask(self._overrides, ((group, name), (other, choice)))
 
-    def _concerned(self, task: Task) -> bool:
+    def _concerned(self, task: ValidationTask) -> bool:
         if self._named is None:
             return True
         chosen = (find_file(self._directories, group, name) for group, name in task.choices)
@@ -287,7 +287,7 @@ def _settled(words: Iterable[str]) -> set[str]:
 _composed = lru_cache(maxsize=32)(compose)  # experiments are composed to see their runs, too
 
 
-def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[Run]:
+def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[ExperimentRun]:
     """The runs of an experiment; none where it cannot be composed, which another task reports."""
     try:
         section = _composed(overrides, user).document.get("experiment")
@@ -297,7 +297,7 @@ def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Ite
     runs = section.get("runs") if isinstance(section, dict) else None
     for name, words in (runs if isinstance(runs, dict) else {}).items():
         if isinstance(words, list) and all(isinstance(word, str) for word in words):
-            yield Run(file, f"experiment.runs.{name}", tuple(words))
+            yield ExperimentRun(file, f"experiment.runs.{name}", tuple(words))
 
 
 @dataclass
@@ -318,11 +318,11 @@ class _Checker:
     def __post_init__(self) -> None:
         self._registry = _registry_check(self.notes)
 
-    def check(self, task: Task) -> None:
+    def check(self, task: ValidationTask) -> None:
         if self.broken.isdisjoint(task.choices) and not self._is_fine_assembled(task):
             self._check_composed(task)
 
-    def _is_fine_assembled(self, task: Task) -> bool:
+    def _is_fine_assembled(self, task: ValidationTask) -> bool:
         """Whether there is nothing wrong with a configuration made of sections; what is wrong is looked at composed."""
         if task.run or task.overrides != self.combinations.overrides:
             return False
@@ -332,34 +332,34 @@ class _Checker:
         sections = {(key, id(value)) for key, value in assembled.document.items()}
         fits = {key for key, _ in sections & self.fine}
         config = Configuration(assembled, self.user, runnable=False, check=self._registry, fits=fits)
-        if _problems(config, task.asks):
+        if _problems(config, task.readers):
             return False
         self.fine |= sections
         return True
 
-    def _check_composed(self, task: Task) -> None:
+    def _check_composed(self, task: ValidationTask) -> None:
         try:
             composed = _composed(task.words, self.user)
             config = Configuration(composed, self.user, runnable=False, check=self._registry)
-            problems = _problems(config, task.asks)
+            problems = _problems(config, task.readers)
         except ConfigError as error:
             problems = error.problems
         if problems and len(task.choices) == 1:
             self.broken |= set(task.choices)
-        self.problems += map(task.run.blamed, problems) if task.run else problems
+        self.problems += map(task.run.attributed, problems) if task.run else problems
 
 
-def _problems(config: Configuration, asks: Iterable[Ask]) -> list[Problem]:
+def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Problem]:
     problems = []
-    for ask in asks:
+    for read in readers:
         try:
-            ask(config)
+            read(config)
         except ConfigError as error:
             problems += error.problems
     return problems
 
 
-def _registry_check(notes: dict[str, None]) -> Check | None:
+def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
     """The check against GStreamer's registry; what it could not look at goes to the notes."""
     try:
         from runner.apply import check_plan, missing_plugins, missing_recorders

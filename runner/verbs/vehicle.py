@@ -6,7 +6,7 @@ after duration_s. With log=DIR events, decisions and telemetry are written to DI
 
   tod-runner vehicle                                        the paper's vehicle with a synthetic drive
   tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link
-  tod-runner vehicle graph=h264_srt media.host=192.0.2.7    dial out to an operator who listens there
+  tod-runner vehicle graph=h264_srt media.host=192.0.2.7    connect to an operator that listens there
 """
 
 from __future__ import annotations

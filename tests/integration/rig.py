@@ -88,7 +88,7 @@ class Operator:
     """An operator's end of the control link, as a program would write it."""
 
     def __init__(self, broker: Any, vehicle: str = "delivery_robot", name: str = "") -> None:
-        from runner.mqtt.link import Link
+        from runner.mqtt.link import ControlLink
         from runner.mqtt.messages import OPERATOR_GONE, read_state, topic
 
         self.name = name or f"op{free_port()}"
@@ -103,7 +103,7 @@ class Operator:
             topic(vehicle, "reply", self.name): lambda m: self.replies.update({(r := json.loads(m.payload))["id"]: r}),
             topic(vehicle, "telemetry"): self._on_telemetry,
         }
-        self.link = Link(broker, (self.requests, OPERATOR_GONE), listen, lambda here: None, lambda what: None)
+        self.link = ControlLink(broker, (self.requests, OPERATOR_GONE), listen, lambda here: None, lambda what: None)
         self.link.connect()
         assert self.link.wait_connected(15)
 

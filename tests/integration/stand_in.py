@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from runner.apply import Received
-from runner.core.commands import Command, Knobs, KnobValue
+from runner.apply import Reception
+from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
 
 FRAMES = 5  # that a camera which sends has delivered from one look to the next
@@ -42,7 +42,7 @@ class RecordingVehicle:
                 self._wanted[command.camera][command.knob] = command.value
         self.on_turned()
 
-    def applied(self) -> dict[str, Knobs]:
+    def applied(self) -> dict[str, KnobValues]:
         with self._lock:
             return {name: dict(knobs) if name in self.watched else {} for name, knobs in self._wanted.items()}
 
@@ -71,13 +71,13 @@ class RecordingOperator:
     """Stands in for `runner.apply.OperatorSide`: cameras that should send deliver frames of a fixed size."""
 
     def __init__(self, plans: Sequence[Plan], *_: Any, **__: Any) -> None:
-        self._received = {plan.camera.name: Received() for plan in plans}
+        self._received = {plan.camera.name: Reception() for plan in plans}
 
-    def sample(self, sending: Mapping[str, bool]) -> dict[str, Received]:
+    def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
         for name, received in self._received.items():
             frames = received.frames + (FRAMES if sending.get(name) else 0)
             size = (640, 480) if frames else (0, 0)
-            self._received[name] = Received(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
+            self._received[name] = Reception(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
         return dict(self._received)
 
     def stop(self) -> None:

@@ -115,7 +115,7 @@ def test_a_camera_that_is_off_before_the_first_client_answers_at_once():
     with streaming() as (side, vehicle, (plan,), reported):
         turn(side, sending=False)
         assert describe(vehicle.media, CAMERA) == "RTSP/1.0 200 OK"
-        until(lambda: f"{CAMERA}: pipeline gone" in reported)  # the server refuses who comes in this very moment
+        until(lambda: f"{CAMERA}: pipeline stopped" in reported)  # the server refuses who comes in this very moment
         with watching(plan) as client:
             until(lambda: side.applied()[CAMERA].get("sending") is False)
             turn(side, sending=True, size=(240, 130), bitrate=200)
@@ -127,7 +127,7 @@ def test_a_rebuilt_pipeline_gets_the_settings_in_force():
         turn(side, size=(480, 260), bitrate=545)
         with watching(plan) as client:
             until(lambda: len(client.sizes) > 5)
-        until(lambda: f"{CAMERA}: pipeline gone" in reported)
+        until(lambda: f"{CAMERA}: pipeline stopped" in reported)
         turn(side, size=(240, 130), bitrate=300)
         with watching(plan) as client:
             until(lambda: len(client.sizes) > 5)

@@ -147,7 +147,7 @@ def filmed(tmp_path_factory):
                 until(lambda r=receiving: all(c.width == 160 for c in r.sample({}).values()))
             finally:
                 receiving.stop()
-            until(lambda: reported.count("pipeline gone") == reported.count("pipeline built"))
+            until(lambda: reported.count("pipeline stopped") == reported.count("pipeline built"))
     finally:
         sending.stop()
     for side, name in (("vehicle", "drive.jsonl"), ("operator", "operator.jsonl")):
@@ -249,9 +249,9 @@ def test_a_video_that_is_missing_or_damaged_is_told_and_the_rest_exported(filmed
     assert done.returncode == 0
     told = sorted(line for line in done.stderr.splitlines() if "video/" in line)
     assert told == [
-        f"{drive}/video/front.vehicle.0.ts: no such file; the export goes on without it",
-        f"{drive}/video/rear.vehicle.0.ts: holds no video that can be read; the export goes on without it",
-        f"{drive}/video/rear.vehicle.1.ts: holds no video that can be read; the export goes on without it",
+        f"{drive}/video/front.vehicle.0.ts: no such file; the export continues without it",
+        f"{drive}/video/rear.vehicle.0.ts: contains no readable video; the export continues without it",
+        f"{drive}/video/rear.vehicle.1.ts: contains no readable video; the export continues without it",
     ]
     topics = messages(drive / "drive.mcap")
     assert "/rear/video" not in topics
@@ -374,7 +374,7 @@ def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
     [
         (["{"], "drive.jsonl: line 1: not JSON: "),
         ([json.dumps(began("vehicle")), "garbage", "{}"], "drive.jsonl: line 2: not JSON: "),
-        ([json.dumps({"t": 0, "event": "clock_advanced"})], "drive.jsonl: line 1: is no beginning of a drive"),
+        ([json.dumps({"t": 0, "event": "clock_advanced"})], "drive.jsonl: line 1: not the first line of a drive log"),
         ([json.dumps(began("vehicle") | {"format": 9})], "drive.jsonl: line 1: format: 9: "),
         ([], "drive.jsonl: is empty"),
     ],
@@ -392,13 +392,13 @@ def test_words_that_are_no_export(tmp_path):
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     (tmp_path / "empty").mkdir()
     (tmp_path / "there.mcap").write_text("precious")
-    there = "is there already; remove it, or name another file by output="
+    there = "already exists; remove it, or name another file by output="
     name = "must name one drive: a directory that log= wrote"
     for words, told in (
         ([], f"command line: {name}"),
         ([str(drive), str(drive)], f"command line: {drive} {drive}: {name}"),
         ([f"{tmp_path}/none"], f"{tmp_path}/none: no such directory"),
-        ([f"{tmp_path}/empty"], f"{tmp_path}/empty: holds no drive: neither drive.jsonl nor operator.jsonl"),
+        ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
         ([str(drive), "mode=single"], "command line: mode=single: an export has no configuration, only output="),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],

@@ -133,7 +133,7 @@ def test_a_viewer_of_a_camera_that_is_not_there_is_refused_and_served_when_it_is
         with watching(plan) as client:
             until(lambda: client.errors, seconds=30)
         camera.send_signal(signal.SIGCONT)
-        until(lambda: "rear: pipeline gone" in reported)
+        until(lambda: "rear: pipeline stopped" in reported)
         with watching(plan) as client:
             until(lambda: len(client.sizes) > 10)
         assert side.sources() == {}

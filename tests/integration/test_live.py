@@ -285,7 +285,7 @@ def test_a_broker_that_cannot_start_is_told(tmp_path, monkeypatch):
     broken.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with (
-        pytest.raises(RunError, match=r"mosquitto does not come up on .*: Error: Address not available; choose "),
+        pytest.raises(RunError, match=r"mosquitto does not start on .*: Error: Address not available; choose "),
         private_broker(Endpoint("127.0.0.1", free_port())),
     ):
         pass

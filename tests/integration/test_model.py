@@ -253,7 +253,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, 
 WATCHED = """
 import gc, sys, threading, time
 from runner.__main__ import main
-from runner.rate_quality.workers import uncollected
+from runner.rate_quality.workers import without_cycle_collection
 
 def watch():
     while True:
@@ -263,7 +263,7 @@ def watch():
 gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # others run meanwhile
 gc.set_threshold(50)
 threading.Thread(target=watch, daemon=True).start()
-sys.exit(uncollected(main, sys.argv[1:]))
+sys.exit(without_cycle_collection(main, sys.argv[1:]))
 """
 
 
@@ -418,7 +418,7 @@ def test_a_camera_of_the_users_own_is_not_overwritten(tod, clip, tmp_path):
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}")
     assert status == 2
     assert err == (
-        f"command line: output: '{own}': is there and was not written by tod-runner model; choose another directory\n"
+        f"command line: output: '{own}': exists and was not written by tod-runner model; choose another directory\n"
     )
     assert own.read_text() == "width_px: 1920\n"
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", "output=/proc/models")

@@ -113,7 +113,7 @@ def test_packets_of_strangers_are_dropped_and_counted():
         assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
         assert {(received.lost, received.rebuilt) for received in samples.values()} == {(0, 0)}
         until(lambda: told)
-    assert told == ["front, rear: packets that do not come from the vehicle are dropped"]
+    assert told == ["front, rear: packets from other hosts than the vehicle are dropped"]
 
 
 def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():

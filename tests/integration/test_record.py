@@ -167,7 +167,7 @@ def test_the_others_go_on_where_a_source_fails(tmp_path, conf):
     done = run("record", *words, *mounted)
     assert done.returncode == 1
     part = output / ".rear.mkv.part"
-    assert f"rear: Failed after iterations as requested.; what came before is in {part}" in done.stderr
+    assert f"rear: Failed after iterations as requested.; the part before is in {part}" in done.stderr
     assert "mast: Cannot identify device '/dev/none'.\n" in done.stderr
     assert sorted(path.name for path in output.iterdir()) == [part.name, "front.mkv", "recording.json"]
     assert len(recorded(output / "front.mkv")) == 60
@@ -254,7 +254,7 @@ def test_nothing_is_overwritten(tmp_path):
     for name in names:
         (tmp_path / name).write_text("mine")
     done = run("record", "vehicle=delivery_robot", "source=test", f"output={tmp_path}", "duration_s=1")
-    rule = "front.mkv, .rear.mkv.part there already; nothing is overwritten, choose another directory"
+    rule = "front.mkv, .rear.mkv.part already exist; choose another directory"
     assert (done.returncode, done.stderr) == (2, f"command line: output: '{tmp_path}': {rule}\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
     assert all((tmp_path / name).read_text() == "mine" for name in names)
@@ -263,7 +263,7 @@ def test_nothing_is_overwritten(tmp_path):
 def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
     recordings.claim_files(tmp_path, ["rear"])["rear"].write_text("new")
     (tmp_path / "rear.mkv").write_text("old")
-    with pytest.raises(RunError, match=r"rear.mkv came into being meanwhile; the recording is .*/\.rear\.mkv\.part"):
+    with pytest.raises(RunError, match=r"rear.mkv was created meanwhile; the recording is .*/\.rear\.mkv\.part"):
         recordings.keep(tmp_path, "rear")
     assert (tmp_path / "rear.mkv").read_text() == "old"
 

@@ -306,7 +306,7 @@ def test_the_controller_is_let_in_and_the_other_viewer_closed(outside):
             assert stranger.ended()
             anna.read()
             until(lambda: anna.frames > 5)
-        closed = f"{CAMERA}: closed the viewer at {outside}: the operator in control watches from {outside}"
+        closed = f"{CAMERA}: disconnected the viewer at {outside}: the operator in control watches from {outside}"
         assert closed in vehicle.reported
 
 

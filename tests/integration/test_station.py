@@ -9,9 +9,9 @@ import pytest
 from rig import Heard, free_port, passes, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
-from runner.gst.receiver import Received
+from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
-from runner.mqtt.link import Link
+from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.station import SILENT_S, Station
 
@@ -46,7 +46,7 @@ class Vehicle:
         self.requests = []
         self.operator = ""  # who asked last
         listen = {topic("delivery_robot", "request", "+"): self._on_request}
-        self.link = Link(broker, (topic("delivery_robot", "state"), OFFLINE), listen, lambda here: None, print)
+        self.link = ControlLink(broker, (topic("delivery_robot", "state"), OFFLINE), listen, lambda here: None, print)
         self.link.connect()
         assert self.link.wait_connected(15)
 
@@ -87,7 +87,7 @@ def results(replies):
 
 
 def samples():
-    return dict.fromkeys(("front", "rear", "mast"), Received())
+    return dict.fromkeys(("front", "rear", "mast"), Reception())
 
 
 def test_who_comes_says_hello_and_is_answered(both):
@@ -144,12 +144,12 @@ def test_a_silent_vehicle_is_not_there_and_returns_by_a_word(both):
 
 def test_a_vehicle_whose_clock_is_ahead_is_warned_of_where_its_ages_stood(both):
     station, _, heard = both
-    station.take({name: Received(frames=9, latency_ms=-500.4) for name in samples()})
+    station.take({name: Reception(frames=9, latency_ms=-500.4) for name in samples()})
     warning = "delivery_robot, mode automatic, total 1500 kbit/s; its clock is ahead by at least 500 ms: "
     assert station.headline() == f"{warning}latencies are unknown"
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert heard.said[-1][1].clock_ahead_ms == 500.4
-    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: ages of pictures are unknown; ")
+    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: picture ages are unknown; ")
 
 
 def test_a_decision_is_one_note_however_many_cameras_it_changes(both):

@@ -89,7 +89,7 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
             before = operator.sample({})
             until(lambda b=before: all(c.frames > b[n].frames + 20 for n, c in operator.sample({}).items()))
         came, sent = operator.sample({}), sides.sending.sent()
-    until(lambda: "front: pipeline gone" in sides.reported or sides.plans[0].server is None)
+    until(lambda: "front: pipeline stopped" in sides.reported or sides.plans[0].server is None)
     sides.stop()
     for name in CAMERAS:
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
@@ -122,7 +122,7 @@ def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path
     for number in range(2):
         with watching(sides.plans[0]) as client:
             until(lambda c=client: len(c.sizes) > 20)
-        until(lambda n=number: sides.reported.count("front: pipeline gone") == n + 1)
+        until(lambda n=number: sides.reported.count("front: pipeline stopped") == n + 1)
     assert [file for _, file, _ in sides.told] == ["video/front.vehicle.0.ts", "video/front.vehicle.1.ts"]
     for number in range(2):
         assert decoded(tmp_path / f"video/front.vehicle.{number}.ts")[1] >= 20
@@ -157,7 +157,9 @@ def test_the_file_has_no_say_in_the_stream(sides):
         pipeline.add(end)
         pipeline.get_by_name("pay0").link(end)
         if plan.video:
-            video_files.VideoFile(sides.files, "front", "vehicle", video_files.born, sides.report).follow(pipeline)
+            video_files.VideoFile(sides.files, "front", "vehicle", video_files.captured_at, sides.report).follow(
+                pipeline
+            )
         pipeline.set_state(Gst.State.PLAYING)
         try:
             caps = until(lambda: pipeline.get_by_name("sent").get_static_pad("src").get_current_caps())
@@ -191,7 +193,7 @@ def goes_on(sides, camera="front"):
         assert {c.rebuilt for c in came.values()} == {0}
         sides.resize(160, 90)
         until(lambda: operator.sample({})[camera].width == 160)
-    others = [line for line in sides.reported if "no video is kept" not in line and "gone" not in line]
+    others = [line for line in sides.reported if "no video is kept" not in line and "pipeline stopped" not in line]
     assert sorted(others) == [f"{name}: pipeline built" for name in CAMERAS]
 
 
@@ -275,7 +277,7 @@ def test_h265_is_kept_as_it_is(tmp_path):
     sides = Sides(tmp_path, "graph=h265", conf=conf, cameras=("front",))
     with sides.receiving() as operator:
         until(lambda: operator.sample({})["front"].frames > 40)
-    until(lambda: "front: pipeline gone" in sides.reported)
+    until(lambda: "front: pipeline stopped" in sides.reported)
     sides.stop()
     for side in ("vehicle", "operator"):
         sizes, count = decoded(tmp_path / f"video/front.{side}.0.ts", whole=side == "vehicle")

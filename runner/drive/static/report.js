@@ -1,10 +1,10 @@
 /** Draws the charts of a report from the data in the page. Nothing is loaded from anywhere. */
 "use strict";
 
-/** An element of the page, which holds all that are asked for. */
+/** An element of the page; the page has every element that is looked up. */
 const by = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 /**
- * What runner/drive/figures.py says of each chart; here it only becomes plotly's traces.
+ * The charts as runner/drive/figures.py describes them, converted to plotly's traces.
  * @typedef {{title: string, low: number, high: number, marks: number[], log: boolean, percent: boolean}} Axis
  * @typedef {{label: string, x: number[], y: (number|null)[], colour: number|string, dash: number, width: number, steps: boolean,
  *   filled: boolean, around: number[][]|null, why: string[]|null}} Curve

@@ -13,7 +13,7 @@ export class Clock {
   echoes = [];
   offset = 0;
 
-  /** @param {number} sent when the page asked (page clock)  @param {number} server what the station's clock said */
+  /** @param {number} sent when the page asked (page clock)  @param {number} server the station's clock */
   heard(sent, server) {
     const received = now();
     this.echoes.push({ delay: received - sent, offset: server - (sent + received) / 2 });

@@ -1,4 +1,4 @@
-/** The header: vehicle, mode, totals, who is in control; and the banner when something is not there. */
+/** The header: vehicle, mode, totals, who is in control; and the banner when vehicle or station is offline. */
 
 import { inControl, listen, mode, publish, store } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
@@ -10,10 +10,10 @@ const HOLDERS = { you: "You are in control", another: "Another page is in contro
 
 const buttons = [...by("modes").querySelectorAll("button")];
 
-/** Ask for another mode. What is highlighted stays what the vehicle says. */
-export function selectMode(wanted) {
-  if (wanted === mode() && !pending("mode")) return;
-  request("mode", { event: "mode_selected", mode: wanted }, `mode ${wanted}`);
+/** Ask for another mode. The mode that the vehicle reports stays highlighted. */
+export function selectMode(selected) {
+  if (selected === mode() && !pending("mode")) return;
+  request("mode", { event: "mode_selected", mode: selected }, `mode ${selected}`);
 }
 
 export function toggleControl() {
@@ -57,11 +57,11 @@ function refreshControl() {
 function refreshBanner() {
   const away = store.connected ? store.state && !store.state.online : performance.now() > START_MS;
   const text = store.connected
-    ? "THE VEHICLE IS NOT THERE: no control link, the pictures are not live"
-    : "NO CONNECTION TO THE STATION: the pictures are not live; trying again";
+    ? "VEHICLE OFFLINE: video is not live"
+    : "NO CONNECTION TO THE STATION: video is not live; reconnecting";
   by("banner").hidden = !away;
   write(by("banner"), away ? `✕ ${text}` : "");
-  const words = !store.connected ? "no station" : !store.state ? "no state yet" : away ? "vehicle away" : "connected";
+  const words = !store.connected ? "no station" : !store.state ? "no state yet" : away ? "vehicle offline" : "connected";
   write(by("connection"), `${words === "connected" ? "●" : "✕"} ${words}`);
   mark(by("connection"), "data-state", words === "connected" ? "fine" : "bad");
 }
@@ -70,7 +70,7 @@ function refreshWarning() {
   const ahead = store.connected && store.state?.online ? store.sample?.clock_ahead_ms : null;
   const known = ahead === null || ahead === undefined;
   const by_s = known ? "" : (ahead / 1000).toFixed(1);
-  const text = `▲ The vehicle's clock is ahead by at least ${by_s} s: the age of its pictures is unknown, and LATE cannot be shown`;
+  const text = `▲ The vehicle's clock is ahead by at least ${by_s} s: the age of its pictures is unknown; LATE is not shown`;
   by("warning").hidden = known;
   write(by("warning"), known ? "" : text);
 }

@@ -16,7 +16,7 @@ const WHY = {
 
 /** The selected camera; "" before the first hello, when nothing is shown here. */
 const name = () => store.selected ?? "";
-const whyNot = () => (!decided(name()) ? "The vehicle is not there." : inControl() ? null : `${capital(whyNoControl())}.`);
+const whyNot = () => (!decided(name()) ? "The vehicle is offline." : inControl() ? null : `${capital(whyNoControl())}.`);
 const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 

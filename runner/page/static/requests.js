@@ -1,12 +1,12 @@
 /**
- * Requests to the vehicle, each with the control it came from. A request is a wish: what is shown as set is what the
- * vehicle's state says, and until the answer comes the control is shown as pending.
+ * Requests to the vehicle, each with the control that sent it. The page shows the values of the vehicle's state, not those
+ * of a request; a control is shown as pending until its request is answered.
  */
 
 import { inControl, listen, note, publish, store } from "./store.js";
 import { send } from "./link.js";
 
-const GIVE_UP_MS = 6000; // the station itself says "timed out" long before
+const GIVE_UP_MS = 6000; // the station itself answers "timed out" long before
 const PREFIX = Math.random().toString(36).slice(2, 8);
 
 /**

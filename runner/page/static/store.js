@@ -1,4 +1,4 @@
-/** What the page knows, as the station has told it; whoever shows something of it listens for the kind of message. */
+/** The page's state, as received from the station; views listen for the kinds of message that they show. */
 
 const SHOWN_S = 300;
 const listeners = new Map();

@@ -59,7 +59,7 @@ export class Stream {
     this.patience = RESYNC_EVERY_MS;
     this.transit = null; // usual time from the station to here
     this.on = this.sending = null;
-    this.status = this.told = "synchronising";
+    this.status = this.reported = "synchronising";
     /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
     this.late_age = NaN; // of the last picture that was late
@@ -257,8 +257,8 @@ export class Stream {
     this.status = judge(this.times(), this.station.limits, time);
     const text = this.overlay(time);
     if (this.context && text !== this.painted) this.paint(time);
-    const changed = this.status !== this.told;
-    this.told = this.status;
+    const changed = this.status !== this.reported;
+    this.reported = this.status;
     return changed;
   }
 

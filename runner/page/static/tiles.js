@@ -11,7 +11,7 @@ import { by, factor, make, mark, size, spoken, whole, write } from "./format.js"
 export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
 const ALARMS = ["late", "frozen", "lost", "unsupported"];
-const SILENT = ["lost", "off", "paused"]; // nothing comes: what came last says nothing of now
+const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 const THIN = "\u2009"; // space
 const CHROME = 66; // header and caption of a tile, as in the style sheet
 
@@ -77,7 +77,7 @@ function tile({ name }) {
   return element;
 }
 
-/** Ask to switch a camera on or off: the other of what the vehicle says. */
+/** Ask to switch a camera on or off: the opposite of the state that the vehicle reports. */
 export function switchCamera(name) {
   const on = !decided(name)?.on;
   request(`on:${name}`, { event: "camera_switched", camera: name, on }, `${name} ${on ? "on" : "off"}`);
@@ -143,7 +143,7 @@ function refreshSwitch(name, { on }) {
   mark(on, "data-pending", asked ? "" : null);
   on.disabled = !inControl() || !now;
   write(on, asked ? (asked.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
-  mark(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is not there") : "switch this camera on or off (o)");
+  mark(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : "switch this camera on or off (o)");
 }
 
 function refreshCaption(name, { rates, form, reason }) {

@@ -25,7 +25,7 @@ function refresh() {
   const now = mode();
   const most = (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
   const total = now ? store.state?.total_kbps : undefined;
-  const reason = !now ? "the vehicle is not there" : WHY[now] ?? (inControl() ? null : whyNoControl());
+  const reason = !now ? "the vehicle is offline" : WHY[now] ?? (inControl() ? null : whyNoControl());
   write(figure, whole(total));
   write(prediction, whole(store.sample?.predicted_kbps));
   write(why, reason ?? "shared among the cameras by demand and weight");

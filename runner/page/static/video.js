@@ -14,7 +14,7 @@ import "./yuv.js";
 
 const WATCH_MS = 15;
 const CONNECT_MS = 1000; // a station that has not answered by then is asked again
-const SILENT_MS = 2000; // the station says something four times a second
+const SILENT_MS = 2000; // the station sends four messages a second
 const RECONNECT_MS = 500;
 const TELL_MS = 250;
 const HEADER = 24;

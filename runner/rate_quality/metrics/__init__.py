@@ -9,9 +9,9 @@ from pathlib import Path
 
 from runner.core.model import suggest
 from runner.errors import UserError
-from runner.rate_quality.metrics.interface import Luma, Mask, Meter, Metric, Size
+from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, QualityMeter
 
-__all__ = ["NAMES", "VMAF_MODEL", "Luma", "Mask", "Meter", "Metric", "Size", "find_metric"]
+__all__ = ["NAMES", "VMAF_MODEL", "Luma", "Mask", "Metric", "PictureSize", "QualityMeter", "find_metric"]
 
 NAMES = ("psnr", "mssim", "vmaf", "brisque")
 VMAF_MODEL = "vmaf_v0.6.1"
@@ -49,4 +49,4 @@ def find_metric(
 
             return brisque.metric(brisque_model, brisque_range)
         case _:
-            raise UserError("", "metric", repr(name), f"unknown metric, {suggest(name, NAMES)}")
+            raise UserError("", "metric", repr(name), f"unknown metric{suggest(name, NAMES)}")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from runner.errors import UserError
 from runner.rate_quality.compiled import compiled
-from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, Size
+from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, PictureSize
 from runner.rate_quality.metrics.svr import Regression, load
 
 Plane = NDArray[np.float32]
@@ -57,8 +57,8 @@ def metric(model: Path | None, ranges: Path | None) -> Metric:
     )
 
 
-def meter(regression: Regression, size: Size, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
-    """Meter of one lane. There is never a mask: the metric says so."""
+def meter(regression: Regression, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
+    """Meter of one lane. It supports no mask, as the metric states."""
     return FrameMeter(size, lambda _, picture: score(picture, regression))
 
 
@@ -114,7 +114,7 @@ def fit_ggd(values: Plane) -> tuple[float, float]:
     return shape(mean * mean, variance), variance
 
 
-class Statistics(NamedTuple):
+class ProductSums(NamedTuple):
     """Of a set of values: how many there are in all, below 0 and above; sums of squares and of absolute values."""
 
     total: int
@@ -125,10 +125,10 @@ class Statistics(NamedTuple):
     absolute: float
 
 
-def statistics(mscn: Plane, down: int, right: int) -> Statistics:
+def statistics(mscn: Plane, down: int, right: int) -> ProductSums:
     """Of the products of neighbours that both lie in the picture (Eq. 7 to 10)."""
     rows, columns = mscn.shape[0] - down, mscn.shape[1] - abs(right)
-    return Statistics(rows * columns, *sum_products(mscn, down, right))
+    return ProductSums(rows * columns, *sum_products(mscn, down, right))
 
 
 @compiled
@@ -150,7 +150,7 @@ def sum_products(mscn: Plane, down: int, right: int) -> tuple[int, int, float, f
     return below, above, squares_below, squares_above, absolute
 
 
-def fit_aggd(seen: Statistics) -> tuple[float, float, float, float]:
+def fit_aggd(seen: ProductSums) -> tuple[float, float, float, float]:
     """Shape, mean, left and right variance of an asymmetric generalised Gaussian, by moment matching.
 
         r(a) = E[|x|]^2 / E[x^2] * (g^3 + 1)(g + 1) / (g^2 + 1)^2,    g = left / right deviation

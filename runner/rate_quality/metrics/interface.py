@@ -1,4 +1,4 @@
-"""What a metric of picture quality is, and who scores the pictures of a lane."""
+"""What a metric of picture quality is, and the meter that scores the pictures of a lane."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from runner.errors import UserError
 
 Luma = NDArray[np.uint8]  # height x width
 Mask = NDArray[np.bool_]  # height x width, True where it counts
-Size = tuple[int, int]  # width, height in px
+PictureSize = tuple[int, int]  # width, height in px
 
 
-class Meter(Protocol):
+class QualityMeter(Protocol):
     """Scores the pictures of one lane, given in order of frames, from one thread."""
 
     def add(self, frame: int, reference: Luma, picture: Luma) -> None:
@@ -54,13 +54,13 @@ class Metric:
     bounds: tuple[float, float]
     tolerance: float
     good: float
-    build: Callable[[Size, Fraction, int, Mask | None], Meter] = field(repr=False, compare=False)
+    build: Callable[[PictureSize, Fraction, int, Mask | None], QualityMeter] = field(repr=False, compare=False)
     smallest_px: int = 1
     higher_is_better: bool = True
     every_frame: bool = False
     takes_mask: bool = True
 
-    def meter(self, size: Size, fps: Fraction, stride: int = 1, mask: Mask | None = None) -> Meter:
+    def meter(self, size: PictureSize, fps: Fraction, stride: int = 1, mask: Mask | None = None) -> QualityMeter:
         """A meter for one lane.
 
         size    width and height in px of every picture
@@ -87,7 +87,7 @@ class FrameMeter:
     score  of reference and picture
     """
 
-    def __init__(self, size: Size, score: Callable[[Luma, Luma], float]) -> None:
+    def __init__(self, size: PictureSize, score: Callable[[Luma, Luma], float]) -> None:
         self._size, self._score = size, score
         self._scores: dict[int, float] = {}
 
@@ -99,7 +99,7 @@ class FrameMeter:
         return self._scores
 
 
-def check(size: Size, *pictures: Luma) -> None:
+def check(size: PictureSize, *pictures: Luma) -> None:
     """Refuse what compiled code would read beyond its end. Raises ValueError."""
     for picture in pictures:
         if picture.shape != size[::-1] or picture.dtype != np.uint8:

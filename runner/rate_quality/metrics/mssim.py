@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.rate_quality.compiled import compiled
-from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, Size, no_pixels
+from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, PictureSize, no_pixels
 
 SIDE, SIGMA = 11, 1.5  # of the window, px
 MARGIN = SIDE // 2
@@ -28,8 +28,8 @@ C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
 ONE = np.float32(1)
 GREY = np.float32(128)  # taken off first: squares stay small, and float32 exact enough
 
-Line = NDArray[np.float32]
-Lines = np.ndarray[Any, np.dtype[np.float32]]
+PixelRow = NDArray[np.float32]
+PixelRows = np.ndarray[Any, np.dtype[np.float32]]
 
 
 def metric() -> Metric:
@@ -45,7 +45,7 @@ def metric() -> Metric:
     )
 
 
-def meter(size: Size, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
+def meter(size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
     """Meter of one lane. Raises UserError for a mask without the centre of a window."""
     width, height = size
     if mask is None:
@@ -64,16 +64,16 @@ def meter(size: Size, fps: Fraction, stride: int, mask: Mask | None) -> FrameMet
     return FrameMeter(size, score)
 
 
-def gaussian() -> Line:
+def gaussian() -> PixelRow:
     """One side of the window, of sum 1."""
     x = np.arange(SIDE) - MARGIN
     bell = np.exp(-(x**2) / (2 * SIGMA**2))
-    weights: Line = (bell / bell.sum()).astype(np.float32)
+    weights: PixelRow = (bell / bell.sum()).astype(np.float32)
     return weights
 
 
 @compiled
-def total(x: Luma, y: Luma, weights: Line, counts: NDArray[np.uint8]) -> float:
+def total(x: Luma, y: Luma, weights: PixelRow, counts: NDArray[np.uint8]) -> float:
     """Sum of SSIM over the windows that count.
 
     weights  one side of the window
@@ -103,7 +103,7 @@ def total(x: Luma, y: Luma, weights: Line, counts: NDArray[np.uint8]) -> float:
 
 
 @compiled
-def multiply(x: Luma, y: Luma, lines: Lines) -> None:
+def multiply(x: Luma, y: Luma, lines: PixelRows) -> None:
     """What means are taken of, for one row: x, d, x^2 + y^2 and d^2, with x and y less grey, d = x - y."""
     for j in range(len(x)):
         a, b = np.float32(x[j]) - GREY, np.float32(y[j]) - GREY
@@ -116,7 +116,7 @@ def multiply(x: Luma, y: Luma, lines: Lines) -> None:
 
 
 @compiled
-def smooth_row(line: Line, w: Line, smooth: Line) -> None:
+def smooth_row(line: PixelRow, w: PixelRow, smooth: PixelRow) -> None:
     """Weighted mean of each 11 neighbours in a row."""
     for j in range(len(smooth)):
         smooth[j] = (
@@ -130,7 +130,7 @@ def smooth_row(line: Line, w: Line, smooth: Line) -> None:
 
 
 @compiled
-def smooth_column(ring: Lines, w: Line, smooth: Line) -> None:
+def smooth_column(ring: PixelRows, w: PixelRow, smooth: PixelRow) -> None:
     """Weighted mean of the 11 lines of a ring; the weights are turned as the ring is."""
     w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10]
     for j in range(len(smooth)):
@@ -150,7 +150,7 @@ def smooth_column(ring: Lines, w: Line, smooth: Line) -> None:
 
 
 @compiled
-def compare(means: Lines, counts: NDArray[np.uint8]) -> float:
+def compare(means: PixelRows, counts: NDArray[np.uint8]) -> float:
     """Sum of SSIM over one row of windows, from the means of x, d, x^2 + y^2 and d^2, with x and y less grey."""
     result = np.float32(0)
     for j in range(len(counts)):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, Size, no_pixels
+from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, PictureSize, no_pixels
 
 HIGHEST_DB = 100.0  # also of equal pictures, whose ratio is infinite
 
@@ -26,7 +26,7 @@ def metric() -> Metric:
     )
 
 
-def meter(size: Size, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
+def meter(size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
     """Meter of one lane. Raises UserError for a mask without a pixel."""
     pixels = size[0] * size[1] if mask is None else int(np.count_nonzero(mask))
     if not pixels:

@@ -21,13 +21,13 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.errors import RunError, UserError
-from runner.rate_quality.metrics.interface import Luma, Mask, Metric, Size, check
+from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
 
 PATIENCE_S = 120.0  # a busy machine scores a picture in less
 PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
 SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, which they say
 GREY = 128  # chroma, which VMAF does not look at
-LOG, COMPLAINTS = "scores.json", "stderr"
+LOG, STDERR_FILE = "scores.json", "stderr"
 
 
 class Tool(NamedTuple):
@@ -63,8 +63,8 @@ def metric(model: str) -> Metric:
     )
 
 
-def meter(tool: Tool, model: str, size: Size, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
-    """Meter of one lane. There is never a mask: the metric says so."""
+def meter(tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> VmafMeter:
+    """Meter of one lane. It supports no mask, as the metric states."""
     return VmafMeter(tool, model, size, fps, stride)
 
 
@@ -81,7 +81,7 @@ def find_tool() -> Tool:
         exe = os.path.abspath(shutil.which(name) or name)  # it will run in another directory
         if version := _version(exe):
             return Tool(exe, version)
-    what = f"TOD_FFMPEG={named} is no ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
+    what = f"TOD_FFMPEG={named} is not an ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
     raise RunError(f"{what}: install the extra vmaf, see docs/install.md")
 
 
@@ -145,7 +145,7 @@ def command(exe: str, inputs: Sequence[Sequence[str]], model: str, stride: int) 
     return [exe, "-nostdin", "-v", "error", *raw, "-lavfi", f"[0:v][1:v]libvmaf={options}", "-f", "null", "-"]
 
 
-def picture_format(size: Size, pixel_format: str, fps: Fraction) -> list[str]:
+def picture_format(size: PictureSize, pixel_format: str, fps: Fraction) -> list[str]:
     """Options of a raw video."""
     return ["-pix_fmt", pixel_format, "-s", f"{size[0]}x{size[1]}", "-r", f"{fps.numerator}/{fps.denominator}"]
 
@@ -163,12 +163,12 @@ def read_log(directory: Path, status: int) -> Scores:
 
 def complaint(directory: Path, status: int) -> RunError:
     """An end of ffmpeg that should not be, with its first words: the last ones name no cause."""
-    said = (directory / COMPLAINTS).read_text(errors="replace").strip().splitlines()
-    why = re.sub(r"^\[[^]]*\] ", "", said[0]) if said else f"status {status}"
+    lines = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
+    why = re.sub(r"^\[[^]]*\] ", "", lines[0]) if lines else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
 
 
-def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, model: str) -> list[float]:
+def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format: str, model: str) -> list[float]:
     """Score of each picture of a raw video.
 
     pixel_format  of both files, as ffmpeg names it
@@ -177,7 +177,7 @@ def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, m
     tool = find_tool()
     layout = picture_format(size, pixel_format, Fraction(25))
     inputs = [[*layout, "-i", str(path.resolve())] for path in (picture, reference)]
-    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / COMPLAINTS).open("w") as complaints:
+    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / STDERR_FILE).open("w") as complaints:
         words = command(tool.exe, inputs, model, 1)
         status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=complaints).returncode
         return list(read_log(Path(name), status).by_picture.values())
@@ -189,13 +189,13 @@ def score_files(reference: Path, picture: Path, size: Size, pixel_format: str, m
 class VmafMeter:
     """Pictures to a process, scores from its log.
 
-    No call waits for ever: whichever pipe has room is written to, the end of the process is seen at once, and one
+    No call waits forever: whichever pipe has room is written to, the end of the process is seen at once, and one
     that stands still is given up after `PATIENCE_S`.
     """
 
     version = ""  # of libvmaf, known at the end
 
-    def __init__(self, tool: Tool, model: str, size: Size, fps: Fraction, stride: int) -> None:
+    def __init__(self, tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int) -> None:
         self._size = size
         self._frames: list[int] = []
         self._sound = True  # no picture went in by half
@@ -224,7 +224,7 @@ class VmafMeter:
                 with suppress(OSError, AttributeError):
                     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
             words = command(exe, [[*layout, "-i", f"pipe:{pipe}"] for pipe in theirs], model, stride)
-            with (self._path / COMPLAINTS).open("wb") as complaints:
+            with (self._path / STDERR_FILE).open("wb") as complaints:
                 return subprocess.Popen(
                     words,
                     cwd=self._path,
@@ -269,7 +269,7 @@ class VmafMeter:
 
     def close(self) -> dict[int, float]:
         if self._scores is None:
-            self._scores = {}  # a failure is told once
+            self._scores = {}  # a failure is raised once
             try:
                 if self._frames and self._sound:
                     self._scores = self._finish()
@@ -287,7 +287,7 @@ class VmafMeter:
         return {self._frames[number]: score for number, score in scores.by_picture.items()}
 
     def _wait(self) -> int:
-        """Exit status of the process, which has been told to end or is about to."""
+        """Exit status of the process, which was asked to end or is about to."""
         try:
             return self._process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
