@@ -292,7 +292,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         (
             "/cameras@cameras.rear",
             "/camera@cameras.rear",
-            "defaults: 'camera/compact_480p': no such file, "
+            "defaults: 'camera/compact_480p': no such file; "
             "expected one of the groups /vehicle, /cameras, /modes, /graph, /source, /pqos, /recording, /study, /link, /experiment",
         ),
         (
@@ -306,7 +306,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         (
             "  rear:\n",
             "  back:\n",
-            "cameras.back: no camera of that name is mounted, "
+            "cameras.back: no camera of that name is mounted; "
             "its kind is named in the defaults list: /cameras@cameras.back: KIND",
         ),
         ("  rear:\n", "  on:\n", "cameras.True: a key must be text, quote it"),

@@ -687,7 +687,7 @@ def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_told(chromium
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
         all_live(page, seconds=30)
         page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
-        told = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown, and LATE .*"
+        told = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
         assert re.fullmatch(told, page.locator("#warning").inner_text())
         until(lambda: "– ms" in page.locator("[data-camera=front] .form").inner_text())
         assert {camera["latency_ms"] for camera in page.evaluate("tod.sample")["cameras"].values()} == {None}

@@ -96,7 +96,7 @@ def test_a_property_that_may_change_though_the_element_does_not_say_so(conf):
 @pytest.mark.parametrize(
     ("declared", "problem"),
     [
-        ("", "vp8enc does not say that target-bitrate may change while playing; if it may, list it under mutable"),
+        ("", "vp8enc does not declare target-bitrate as mutable while playing; if it is, list it under mutable"),
         (MUTABLE.replace("target-bitrate", "deadline"), "mutable[0]: 'encoder.deadline': no knob sets this property"),
     ],
 )
