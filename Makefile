@@ -3,40 +3,46 @@
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
 # make soak   long repeats of what a drive must survive, 45 minutes; SOAK=0.1 make soak is a tenth of it
-# make setup  install what is missing; the command is then .venv/bin/tod-runner
+# make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
-.PHONY: demo test timed untimed golden units check lint javascript setup bench soak clean
+.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench soak clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
 
 # Tests that live by the clock leave the processors idle most of the time; all else runs beside them at the lowest
 # priority, which they hardly notice.
-test: $(READY) $(NODE_READY)
+test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
-timed: $(READY)
-	$(BIN)/pytest -m timed -n 3 --dist loadfile --durations=30
+timed: $(TEST_READY)
+	$(BIN)/pytest -m timed -n 3 --dist loadgroup --durations=30
 	$(BIN)/pytest -m alone --durations=10
 
-untimed: $(READY) $(NODE_READY)
+untimed: $(TEST_READY) $(NODE_READY)
 	nice -n 19 $(MAKE) --no-print-directory -j 1 lint javascript golden units
 
-golden: $(READY)
+golden: $(TEST_READY)
 	$(BIN)/tod-runner validate all=true
 	$(BIN)/python tests/golden
 
-units: $(READY)
+units: $(TEST_READY)
 	$(BIN)/pytest -m "not timed and not alone" -n auto --dist loadfile --durations=30
 
 check: lint javascript
-	$(BIN)/pytest -m "not gst" -n auto --dist loadfile
+	$(BIN)/pytest -m "not gst and not slow" -n auto --dist worksteal
 
-lint: $(READY)
+# Branches of what decides and of what reads configuration; make test runs far more of the rest.
+coverage: $(TEST_READY)
+	$(BIN)/pytest -m "not gst" -n auto --dist loadfile --cov --cov-report=
+	$(BIN)/coverage report --include='runner/core/*,runner/configuration/*,runner/graph.py' --fail-under=95
+
+lint: $(TEST_READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -48,7 +54,7 @@ javascript: $(NODE_READY)
 	node_modules/.bin/tsc --project .
 	node --test --test-reporter=spec tests/js/*.test.js
 
-bench: $(READY)
+bench: $(TEST_READY)
 	$(BIN)/python bench/live.py
 	$(BIN)/python bench/link.py
 	$(BIN)/python bench/page.py
@@ -56,7 +62,7 @@ bench: $(READY)
 	$(BIN)/python bench/validate.py
 	$(BIN)/python bench/pqos_map.py
 
-soak: $(READY)
+soak: $(TEST_READY)
 	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)
 
 setup: $(READY)
@@ -65,8 +71,12 @@ $(READY): pyproject.toml scripts/setup scripts/packages.apt
 	scripts/setup $(VENV)
 	touch $@
 
+$(TEST_READY): pyproject.toml scripts/setup scripts/packages.apt scripts/packages-test.apt
+	scripts/setup $(VENV) test
+	touch $(READY) $@
+
 # Checks only: the pages are plain modules, and nothing that drives needs Node.js.
-$(NODE_READY): package.json package-lock.json | $(READY)
+$(NODE_READY): package.json package-lock.json | $(TEST_READY)
 	npm ci --no-audit --no-fund
 	touch $@
 

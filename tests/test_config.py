@@ -293,7 +293,8 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
             "/cameras@cameras.rear",
             "/camera@cameras.rear",
             "defaults: 'camera/compact_480p': no such file; "
-            "expected one of the groups /vehicle, /cameras, /modes, /graph, /source, /pqos, /recording, /study, /link, /experiment",
+            "expected one of the groups /vehicle, /cameras, /modes, /graph, /source, /pqos, "
+            "/recording, /study, /link, /experiment",
         ),
         (
             "@cameras.rear",
