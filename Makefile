@@ -25,7 +25,7 @@ timed: $(TEST_READY)
 	$(BIN)/pytest -m alone --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
-	nice -n 19 $(MAKE) --no-print-directory -j 1 lint javascript golden units
+	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
 
 golden: $(TEST_READY)
 	$(BIN)/tod-runner validate all=true
