@@ -21,7 +21,7 @@ test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 timed: $(TEST_READY)
-	$(BIN)/pytest -m timed -n 2 --dist loadgroup --durations=30
+	$(BIN)/pytest -m timed -n 2 --dist loadfile --durations=30
 	$(BIN)/pytest -m alone --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)

@@ -1,12 +1,10 @@
 """Everything here needs GStreamer, and most of it lives by the clock.
 
-`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs two files at a time of what is marked `timed`, of
-the busy ones only one; then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs beside
-them on half of the cores.
+`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs two files at a time of what is marked `timed`;
+then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs beside them on half of the cores.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -16,17 +14,12 @@ from runner.mqtt.broker import private_broker
 
 UNTIMED = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
 
-BUSY = ("test_page", "test_live")  # a browser, or eight cameras
 
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        path = Path(item.fspath)
-        if path.parent.name == "integration":
-            item.add_marker("gst")
-            item.add_marker(pytest.mark.xdist_group("busy" if path.stem in BUSY else path.stem))
-            if path.stem not in UNTIMED and not item.get_closest_marker("alone"):
-                item.add_marker("timed")
+def pytest_itemcollected(item: pytest.Item) -> None:
+    name = item.path.stem
+    item.add_marker("gst")
+    if name not in UNTIMED and not item.get_closest_marker("alone"):
+        item.add_marker("timed")
 
 
 @pytest.fixture

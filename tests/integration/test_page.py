@@ -139,7 +139,10 @@ def all_live(page, seconds=30):
         waiting.difference_update(name for name, camera in measure(page).items() if camera["status"] == "live")
         return not waiting
 
-    until(seen, seconds)
+    if not rig.passes(seen, seconds):
+        assert {name: camera for name, camera in measure(page).items() if name in waiting} == {}, page.evaluate(
+            "[tod.state, tod.sample, tod.measure()]"
+        )
 
 
 def goes_on(page, counted, pictures=2, seconds=5):
