@@ -1,7 +1,8 @@
 """Everything here needs GStreamer, and most of it lives by the clock.
 
 `pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs two files at a time of what is marked `timed`;
-then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs beside them on half of the cores.
+then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs beside them on half of the
+cores.
 """
 
 from collections.abc import Iterator
