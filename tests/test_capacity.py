@@ -15,6 +15,8 @@ from runner.drive.capacity import CapacitySample, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
 
+pytestmark = pytest.mark.slow  # draws figures of drives
+
 
 def test_a_square_holds_the_percentile_of_its_samples() -> None:
     here = [CapacitySample(52.0, 11.0, kbps) for kbps in range(1000, 1100)]

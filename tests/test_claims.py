@@ -12,6 +12,8 @@ from runner.drive.claims import claims
 from runner.drive.read import read_drive
 from runner.drive.series import series
 
+pytestmark = pytest.mark.slow  # simulates whole drives
+
 TEST = ("experiment=driving_test",)
 
 

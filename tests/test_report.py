@@ -28,6 +28,8 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
 image = pytest.importorskip("PIL.Image")
 
+pytestmark = pytest.mark.slow  # draws figures
+
 FIGURES = ["bitrate_on_track", "bitrates", "scaling", "totals", "latency"]
 STATIC = Path(CONF).parent / "runner" / "page" / "static"
 

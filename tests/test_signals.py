@@ -14,6 +14,8 @@ import pytest
 
 from runner.system.signals import END_S, LIFELINE
 
+pytestmark = pytest.mark.slow  # starts and ends processes
+
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: for ever
 

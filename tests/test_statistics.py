@@ -29,6 +29,8 @@ from runner.drive.statistics import (
 from runner.drive.tables import camera_rows
 from runner.rate_quality.artefact import read_model
 
+pytestmark = pytest.mark.slow  # reads whole drives
+
 NAN = float("nan")
 ALWAYS = [(0.0, 1000.0)]
 

@@ -18,6 +18,8 @@ from runner.clips import View, clip_path
 from runner.core.model import Pose
 from runner.synthetic import render
 
+pytestmark = pytest.mark.slow  # renders pictures
+
 np = pytest.importorskip("numpy")
 
 SECONDS = 4.0

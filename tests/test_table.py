@@ -137,7 +137,7 @@ def test_number_refuses(value: object) -> None:
 
 def test_mistake_at_the_end_of_a_big_file_is_found_soon(tmp_path: Path) -> None:
     path = written(tmp_path, "lon,lat,kbps\n" + "11.5,48.25,3000\n" * 200_000 + "11.5,48.25,x\n")
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(ModelError, match=":200002: kbps 'x': must be a number"):
         read_table(path, (LON, LAT, RATE))
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5

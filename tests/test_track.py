@@ -102,12 +102,12 @@ def test_road_that_does_not_close() -> None:
 
 
 def test_order_is_found_at_once() -> None:
-    """Bounds with room for a busy machine."""
+    """Bounds of processor time."""
     random = np.random.default_rng(0)
     for points in (places(*random.uniform(0, 1000, (2, 3000))), random.permutation(oval(1_000_000, 2000, 9, 1.5))):
-        start = time.perf_counter()
+        start = time.process_time()
         route(points)
-        assert time.perf_counter() - start < 3
+        assert time.process_time() - start < 3
 
 
 def test_one_place_is_no_route() -> None:

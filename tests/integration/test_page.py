@@ -645,7 +645,7 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
     graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
     with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
-        counted, began = measure(page), time.monotonic()
+        counted = measure(page)
         for turn in range(turns):
             for camera in ("front", "rear", "mast"):
                 reply = send(page, event="camera_configured", camera=camera, scaling=(0.25, 0.5, 1.0)[turn % 3])
@@ -653,9 +653,12 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
             time.sleep(0.5)
             for camera in ("front", "rear", "mast"):
                 assert luma(page, camera)[0].mean() > 40, f"{camera} is black in turn {turn}"
-        measured, sent = measure(page), 15 * (time.monotonic() - began)
+        measured = measure(page)
         assert {name: camera["errors"] for name, camera in measured.items()} == {"front": 0, "rear": 0, "mast": 0}
-        assert all(camera["drawn"] - counted[name]["drawn"] > 0.9 * sent for name, camera in measured.items())
+        for name, camera in measured.items():
+            received, drawn = (camera[key] - counted[name][key] for key in ("received", "drawn"))
+            assert received > 5 * turns
+            assert drawn > 0.9 * received
 
 
 SHIFTED = """\
