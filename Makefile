@@ -22,7 +22,8 @@ test: $(TEST_READY) $(NODE_READY)
 
 timed: $(TEST_READY)
 	$(BIN)/pytest -m timed -n 2 --dist loadfile --durations=30
-	$(BIN)/pytest -m alone --durations=10
+	$(BIN)/pytest -m alone --durations=10 --ignore=tests/integration/test_page.py
+	$(BIN)/pytest --durations=10 tests/integration/test_page.py
 
 untimed: $(TEST_READY) $(NODE_READY)
 	taskset --cpu-list $$(($$(nproc) / 2))-$$(($$(nproc) - 1)) $(MAKE) --no-print-directory -j 1 lint javascript golden units

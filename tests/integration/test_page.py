@@ -532,7 +532,6 @@ def sides(*overrides, log="log.video=false"):
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
 
 
-@pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
@@ -556,7 +555,6 @@ def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
             assert page.locator("#banner").is_hidden()
 
 
-@pytest.mark.alone
 def test_a_station_that_stands_still_is_left_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
@@ -773,7 +771,7 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         assert not tile.locator(".rates").inner_text().startswith("–")  # its rates are those of what comes
         for camera in ("front", "mast"):
-            assert measure(page)[camera]["status"] == "live"
+            until(lambda camera=camera: measure(page)[camera]["status"] == "live")
             assert page.locator(f"[data-camera={camera}] .refused").is_hidden()
         assert measure(page)["rear"]["resyncs"] <= 1  # another burst would not help
         tile.locator(".head b").click()
