@@ -78,8 +78,7 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
         page = tab.new_page()
-        page.wrong = wrong = []
-        own = (url.partition("#")[0], "data:", "blob:")
+        wrong, own = [], (url.partition("#")[0], "data:", "blob:")
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
@@ -90,22 +89,14 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
         assert [text for text in wrong if not any(each in text for each in expected)] == []
 
 
-@pytest.fixture(scope="module")
-def one_page(chromium, demo):
-    with opened(chromium, demo) as page:
-        yield page
-
-
 @pytest.fixture
-def page(one_page):
-    """The page of the demo, in control; what a test has left behind is undone."""
-    all_live(one_page)
-    if one_page.evaluate("tod.control") != "you":
-        take_control(one_page)
-    yield one_page
-    one_page.set_viewport_size({"width": 1280, "height": 800})
-    choose(one_page, "automatic")
-    assert one_page.wrong == []
+def page(chromium, demo):
+    with opened(chromium, demo) as page:
+        all_live(page)
+        if page.evaluate("tod.control") != "you":
+            take_control(page)
+        yield page
+        choose(page, "automatic")
 
 
 def apart(coroutine):
