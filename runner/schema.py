@@ -88,11 +88,16 @@ def shortened(text: str) -> str:
 @cache
 def _compiled(reference: str) -> Any:
     """Validator of what a reference names, by jsonschema-rs; relative references need a base there."""
-    import jsonschema_rs
+    from jsonschema_rs import Draft202012Validator
 
-    resources = [(f"{_BASE}{name}.schema.json", schema_document(name)) for name in schema_names()]
-    registry = jsonschema_rs.Registry(resources)
-    return jsonschema_rs.Draft202012Validator({"$ref": f"{_BASE}{reference}"}, registry=registry)
+    return Draft202012Validator({"$ref": f"{_BASE}{reference}"}, registry=_compiled_registry())
+
+
+@cache
+def _compiled_registry() -> Any:
+    from jsonschema_rs import Registry
+
+    return Registry([(f"{_BASE}{name}.schema.json", schema_document(name)) for name in schema_names()])
 
 
 def _is_valid(reference: str, document: Any) -> bool:
@@ -109,6 +114,11 @@ def _errors(reference: str, document: Any) -> Iterator[ValidationError]:
 
 @cache
 def _validator(reference: str) -> Draft202012Validator:
+    return _draft()({"$ref": reference}, registry=_registry())
+
+
+@cache
+def _draft() -> type[Draft202012Validator]:
     """JSON Schema 2020-12, whose patterns are those of ECMA-262: $ is the end, and not also before a last newline."""
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
@@ -119,7 +129,7 @@ def _validator(reference: str) -> Draft202012Validator:
             yield ValidationError(f"{value!r} does not match {wanted!r}")
 
     draft: type[Draft202012Validator] = extend(Draft202012Validator, {"pattern": pattern})  # type: ignore[no-untyped-call]
-    return draft({"$ref": reference}, registry=_registry())
+    return draft
 
 
 def referred(reference: str, schema: str) -> tuple[Any, str]:

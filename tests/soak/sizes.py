@@ -11,9 +11,13 @@ TEST = Path(__file__).parents[1] / "integration" / "test_page.py"
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    """The test of the page, for a minute and a half."""
+    """The test of the page with 180 changes; each takes about a second, ten at most."""
     turns = max(20, round(180 * scale))
     command = [sys.executable, "-m", "pytest", str(TEST), "-k", "new_size"]
-    done = subprocess.run(command, env={**os.environ, "TOD_NEW_SIZES": str(turns)}, check=False)
+    environment = {**os.environ, "TOD_NEW_SIZES": str(turns)}
+    try:
+        done = subprocess.run(command, env=environment, check=False, timeout=60 + 10 * turns)
+    except subprocess.TimeoutExpired as late:
+        return [f"not done after {late.timeout:g} s"]
     print(f"{turns} new sizes of each camera")
     return ["see above"] if done.returncode else []
