@@ -8,21 +8,21 @@ count as IP packets: payload and 28 bytes (UDP), 52 bytes for each 1448 (TCP). R
 pass as wholes. The other way is free.
 
 Each line of input is a rate in kbit/s, answered with the counters; at its end the relay ends. A delay comes after the
-wait. Waits are those of select(), which are exact to 0.1 ms where epoll's are to 1 ms.
+wait.
 """
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import json
-import os
-import select
+import selectors
 import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -39,143 +39,106 @@ PAIR_TRIES = 200
 WAIT_S = 0.5  # for a server that has to accept
 
 SocketAddress = tuple[str, int]
-Handler = Callable[[], None]
+Cut = Callable[[bytes], Iterable[bytes]]
 Delivery = Callable[[], object]
+Serve = Callable[["Uplink", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
 
 
-class EventLoop:
-    """Everything that can happen, one after the other: sockets, departures, rates.
-
-    readers  called when their socket has something
-    gated    as readers, but only while the queue has room
-    writers  called when their socket takes something
-    """
+class Uplink:
+    """Everything from vehicle to operator: one queue with one rate, then the delay."""
 
     def __init__(self, kbps: float, queue_ms: float, delay_ms: float) -> None:
-        self.bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
-        self.readers: dict[Any, Handler] = {}
-        self.gated: dict[Any, Handler] = {}
-        self.writers: dict[Any, Handler] = {}
-        self.runs = True
+        self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
         self._delay_s = delay_ms / 1000
         self._delayed: deque[tuple[float, Delivery]] = deque()
+        self._timer: asyncio.TimerHandle | None = None
+        self._departed = asyncio.Event()
 
-    def run(self) -> None:
-        while self.runs:
-            gated = self.gated if self.bucket.has_room(SEGMENT + TCP_HEADERS) else {}
-            readable, writable, _ = select.select([*self.readers, *gated], [*self.writers], [], self._wait_s())
-            self.deliver()
-            for handlers, sockets in ((self.writers, writable), (self.readers, readable), (self.gated, readable)):
-                for sock in sockets:
-                    if handler := handlers.get(sock):  # it may be closed by now
-                        handler()
-            self.deliver()
+    def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
+        """Queue a packet of that many bytes; without `keep` a full queue drops it. `delivery` is called on arrival."""
+        self._bucket.put(size, delivery, time.monotonic(), keep=keep)
+        self._deliver()
 
-    def deliver(self) -> None:
-        """Pass on what has waited, and been delayed, long enough."""
+    def set_rate(self, kbps: float) -> dict[str, Any]:
+        """Change the rate. Returns the counters."""
         now = time.monotonic()
-        for left, delivery in self.bucket.take(now):
+        self._bucket.set_rate(kbps, now)
+        self._deliver()
+        return asdict(self._bucket.counters(now))
+
+    async def room(self) -> None:
+        """Wait until the queue has room for a segment of TCP."""
+        while not self._bucket.has_room(SEGMENT + TCP_HEADERS):
+            self._departed.clear()
+            await self._departed.wait()
+
+    def _deliver(self) -> None:
+        """Deliver what has been queued and delayed long enough, and come back for the rest."""
+        now = time.monotonic()
+        for left, delivery in self._bucket.take(now):
             self._delayed.append((left + self._delay_s, delivery))
         while self._delayed and self._delayed[0][0] <= now:
             self._delayed.popleft()[1]()
-
-    def forget(self, sock: Any) -> None:
-        for handlers in (self.readers, self.gated, self.writers):
-            handlers.pop(sock, None)
-
-    def _wait_s(self) -> float | None:
-        times = [self.bucket.due(), self._delayed[0][0] if self._delayed else None]
+        self._departed.set()
+        if self._timer:
+            self._timer.cancel()
+        times = [self._bucket.due(), self._delayed[0][0] if self._delayed else None]
         known = [when for when in times if when is not None]
-        return max(0.0, min(known) - time.monotonic()) if known else None
+        self._timer = asyncio.get_running_loop().call_at(min(known), self._deliver) if known else None
 
 
-class RelayedConnection:
-    """A TCP connection through the relay.
+async def join(uplink: Uplink, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
+    """Pass bytes between two connections until one ends.
 
-    near     accepted from the client
-    far      connected to the server
-    limited  whose bytes pass the limit: the vehicle's end
-    cut      by end, cuts its bytes into what passes as one
+    vehicle   the end whose bytes pass the limit
+    up, down  cut the bytes of each direction into units that pass as wholes
     """
+    arrived: asyncio.Queue[bytes] = asyncio.Queue()
+    for sock in (vehicle, other):
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    reading = asyncio.create_task(_pass_limited(uplink, vehicle, arrived, up))
+    ends = [asyncio.create_task(each) for each in (_write(arrived, other), _pass(other, vehicle, down))]
+    try:
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in (reading, *ends):
+            task.cancel()
+        ended = await asyncio.gather(reading, *ends, return_exceptions=True)
+    for error in ended:
+        if isinstance(error, Exception):
+            raise error
 
-    def __init__(
-        self,
-        loop: EventLoop,
-        near: socket.socket,
-        far: socket.socket,
-        limited: socket.socket,
-        cut: dict[socket.socket, Callable[[bytes], Iterable[bytes]]],
-    ) -> None:
-        self._loop, self._limited, self._cut = loop, limited, cut
-        self._other = {near: far, far: near}
-        self._unsent = {near: bytearray(), far: bytearray()}
-        self.at_end: list[Handler] = []
-        for sock in (near, far):
-            sock.setblocking(False)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            handlers = loop.gated if sock is limited else loop.readers
-            handlers[sock] = partial(self._read, sock)
 
-    def close(self) -> None:
-        for sock in self._other:
-            self._loop.forget(sock)
-            sock.close()
-        for handler in self.at_end:
-            handler()
-        self.at_end.clear()
+async def _pass_limited(uplink: Uplink, source: socket.socket, arrived: asyncio.Queue[bytes], cut: Cut) -> None:
+    loop = asyncio.get_running_loop()
+    with suppress(OSError, ValueError):
+        while True:
+            await arrived.join()  # a receiver that does not read is not sent more
+            await uplink.room()
+            if not (data := await loop.sock_recv(source, SEGMENT)):
+                break
+            for unit in cut(data):
+                size = len(unit) + TCP_HEADERS * -(-len(unit) // SEGMENT)
+                uplink.put(size, partial(arrived.put_nowait, unit), keep=True)
+    uplink.put(0, partial(arrived.put_nowait, b""), keep=True)  # what was sent before still passes
 
-    def _read(self, sock: socket.socket) -> None:
-        limited, other = sock is self._limited, self._other[sock]
-        try:
-            data = sock.recv(SEGMENT if limited else WINDOW)
-            units = list(self._cut[sock](data)) if data else []
-        except BlockingIOError:
-            return
-        except (OSError, ValueError):
-            data, units = b"", []
-        if limited:
-            self._pass_limited(other, units)
-        else:
-            for unit in units:
-                self._send(other, unit)
-        if not data:
-            self._end(sock)
 
-    def _pass_limited(self, other: socket.socket, units: list[bytes]) -> None:
-        now = time.monotonic()
-        for unit in units:
-            size = len(unit) + TCP_HEADERS * -(-len(unit) // SEGMENT)
-            self._loop.bucket.put(size, partial(self._send, other, unit), now, keep=True)
+async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
+    """Send units until the empty one, which stands for the end."""
+    loop = asyncio.get_running_loop()
+    with suppress(OSError):
+        while unit := await arrived.get():
+            await loop.sock_sendall(sink, unit)
+            arrived.task_done()
 
-    def _end(self, sock: socket.socket) -> None:
-        """One end has closed: data that it sent before still passes."""
-        if sock is not self._limited:
-            self.close()
-            return
-        self._loop.forget(sock)
-        self._loop.bucket.put(0, self.close, time.monotonic(), keep=True)
 
-    def _send(self, sock: socket.socket, data: bytes) -> None:
-        if sock.fileno() < 0:
-            return
-        self._unsent[sock] += data
-        self._flush(sock)
-
-    def _flush(self, sock: socket.socket) -> None:
-        unsent = self._unsent[sock]
-        try:
-            del unsent[: sock.send(unsent)]
-        except BlockingIOError:
-            pass
-        except OSError:
-            self.close()
-            return
-        if unsent:
-            self._loop.writers[sock] = partial(self._flush, sock)
-            # Whoever does not read is not sent more.
-            self._loop.gated.pop(self._other[sock], None)
-        elif self._loop.writers.pop(sock, None) and self._other[sock] is self._limited:
-            self._loop.gated[self._limited] = partial(self._read, self._limited)
+async def _pass(source: socket.socket, sink: socket.socket, cut: Cut) -> None:
+    loop = asyncio.get_running_loop()
+    with suppress(OSError, ValueError):
+        while data := await loop.sock_recv(source, WINDOW):
+            for unit in cut(data):
+                await loop.sock_sendall(sink, unit)
 
 
 class Ports:
@@ -185,14 +148,14 @@ class Ports:
     server    host of the vehicle's server; its ports are known when it has answered
     """
 
-    def __init__(self, loop: EventLoop, host: str, operator: SocketAddress, server: str) -> None:
-        self._loop, self._operator, self._server = loop, operator, server
+    def __init__(self, uplink: Uplink, host: str, operator: SocketAddress, server: str) -> None:
+        self._uplink, self._operator, self._server = uplink, operator, server
         self.server_port: int | None = None
         self._sockets = _bind_pair(host)
         self.port: int = self._sockets[0].getsockname()[1]
         for index, sock in enumerate(self._sockets):
             sock.setblocking(False)
-            loop.readers[sock] = partial(self._read, index, sock)
+            asyncio.get_running_loop().add_reader(sock, self._read, index, sock)
 
     @property
     def operator_port(self) -> int:
@@ -205,7 +168,7 @@ class Ports:
 
     def close(self) -> None:
         for sock in self._sockets:
-            self._loop.forget(sock)
+            asyncio.get_running_loop().remove_reader(sock)
             sock.close()
 
     def _read(self, index: int, sock: socket.socket) -> None:
@@ -219,8 +182,7 @@ class Ports:
             if self.server_port is None:
                 continue  # too early for anybody
             if source[1] - self.server_port in (0, 1):
-                deliver = _sender(sock, data, operator)
-                self._loop.bucket.put(len(data) + UDP_HEADERS, deliver, time.monotonic())
+                self._uplink.put(len(data) + UDP_HEADERS, _sender(sock, data, operator))
             else:
                 _sender(sock, data, (self._server, self.server_port + index))()
 
@@ -233,8 +195,8 @@ class Rtsp:
     server    host of that
     """
 
-    def __init__(self, loop: EventLoop, operator: str, far: socket.socket, server: str) -> None:
-        self._loop, self._operator = loop, operator
+    def __init__(self, uplink: Uplink, operator: str, far: socket.socket, server: str) -> None:
+        self._uplink, self._operator = uplink, operator
         self._host, self._server = far.getsockname()[0], server
         self._ports: list[Ports] = []
         self._requests, self._replies = rtsp.Units(), rtsp.Units()
@@ -263,7 +225,7 @@ class Rtsp:
         for ports in self._ports:
             if ports.operator_port == port:
                 return ports.port
-        self._ports.append(Ports(self._loop, self._host, (self._operator, port), self._server))
+        self._ports.append(Ports(self._uplink, self._host, (self._operator, port), self._server))
         return self._ports[-1].port
 
 
@@ -292,78 +254,88 @@ def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
     raise OSError(f"no two neighbouring UDP ports are free on {host}")
 
 
-def listen(loop: EventLoop, host: str, accept: Callable[[socket.socket, SocketAddress], None]) -> int:
-    """Take connections on a port of the system's choice, which is returned; ends the relay where it cannot."""
+async def serve_media(uplink: Uplink, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
+    """Join an operator's connection to the vehicle's RTSP server, whose side is limited."""
+    async with connected(server) as far:
+        if far:
+            passing = Rtsp(uplink, operator[0], far, server[0])
+            try:
+                await join(uplink, far, near, passing.replies, passing.requests)
+            finally:
+                passing.close()
+
+
+async def serve_control(uplink: Uplink, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
+    """Join the vehicle's connection, which is limited, to the broker."""
+    async with connected(broker) as far:
+        if far:
+            await join(uplink, near, far, lambda data: [data], lambda data: [data])
+
+
+@asynccontextmanager
+async def connected(address: SocketAddress) -> AsyncIterator[socket.socket | None]:
+    """None where nobody listens: the client then sees its own connection end, and tries again."""
+    with socket.socket() as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
+        sock.setblocking(False)
+        try:
+            await asyncio.wait_for(asyncio.get_running_loop().sock_connect(sock, address), WAIT_S)
+        except OSError:
+            yield None
+        else:
+            yield sock
+
+
+def listen(host: str) -> socket.socket:
+    """A socket that listens on a port of the system's choice; ends the relay where it cannot."""
     try:
         server = socket.create_server((host, 0))
     except OSError as error:
         sys.exit(f"cannot listen on {host}: {error.strerror}; with link=relay both sides and the broker are here")
-    loop.readers[server] = lambda: accept(*server.accept())
-    port: int = server.getsockname()[1]
-    return port
+    server.setblocking(False)
+    return server
 
 
-def serve_media(loop: EventLoop, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
-    """An operator has connected: to the vehicle's RTSP server, whose side is limited."""
-    far = _connected(server)
-    if far:
-        passing = Rtsp(loop, operator[0], far, server[0])
-        connection = RelayedConnection(loop, near, far, far, {near: passing.requests, far: passing.replies})
-        connection.at_end.append(passing.close)
-    else:
-        near.close()
+async def accept(server: socket.socket, uplink: Uplink, serve: Serve, address: SocketAddress) -> None:
+    """Serve each connection in a task of its own, without end."""
+    async with asyncio.TaskGroup() as tasks:
+        while True:
+            near, client = await asyncio.get_running_loop().sock_accept(server)
+            tasks.create_task(_served(serve(uplink, address, near, client), near))
 
 
-def serve_control(loop: EventLoop, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
-    """The vehicle has connected, and is limited: to the broker."""
-    far = _connected(broker)
-    if far:
-        RelayedConnection(loop, near, far, near, {near: lambda data: [data], far: lambda data: [data]})
-    else:
-        near.close()
+async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> None:
+    with near:
+        await serving
 
 
-def _connected(address: SocketAddress) -> socket.socket | None:
-    """None where nobody listens: the client then sees its own connection end, and tries again."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
-    sock.settimeout(WAIT_S)
-    try:
-        sock.connect(address)
-    except OSError:
-        sock.close()
-        return None
-    return sock
+async def take_rates(uplink: Uplink) -> None:
+    """Follow rates from standard input, each answered with the counters, until it ends."""
+    lines = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    while line := await lines.readline():
+        print(json.dumps(uplink.set_rate(float(line))), flush=True)
 
 
-def take_rates(loop: EventLoop, taken: bytearray) -> None:
-    """Rates from standard input, each answered with the counters."""
-    data = os.read(0, 65_536)
-    loop.runs = bool(data)
-    taken += data
-    *lines, rest = taken.split(b"\n")
-    taken[:] = rest
-    for line in lines:
-        now = time.monotonic()
-        loop.bucket.set_rate(float(line), now)
-        print(json.dumps(asdict(loop.bucket.counters(now))), flush=True)
-
-
-def main() -> None:
+async def main() -> None:
     settings = json.loads(sys.argv[1])
     media, control = ((socket.gethostbyname(host), port) for host, port in (settings["media"], settings["control"]))
-    loop = EventLoop(settings["kbps"], settings["queue_ms"], settings["delay_ms"])
-    listens = {
-        "media": listen(loop, media[0], partial(serve_media, loop, media)),
-        "control": listen(loop, control[0], partial(serve_control, loop, control)),
-    }
-    taken = bytearray()
-    loop.readers[0] = lambda: take_rates(loop, taken)
+    uplink = Uplink(settings["kbps"], settings["queue_ms"], settings["delay_ms"])
+    listening = {"media": listen(media[0]), "control": listen(control[0])}
+    print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)
     gc.freeze()
     gc.disable()  # nothing here is a ring for long; a collection would hold up packets
-    print(json.dumps(listens), flush=True)
-    loop.run()
+    async with asyncio.TaskGroup() as tasks:
+        serving = [
+            tasks.create_task(accept(listening["media"], uplink, serve_media, media)),
+            tasks.create_task(accept(listening["control"], uplink, serve_control, control)),
+        ]
+        await take_rates(uplink)
+        for task in serving:
+            task.cancel()
 
 
 if __name__ == "__main__":
-    main()
+    # epoll's waits are exact to 1 ms, select's to 0.1 ms
+    with asyncio.Runner(loop_factory=partial(asyncio.SelectorEventLoop, selectors.SelectSelector())) as runner:
+        runner.run(main())
