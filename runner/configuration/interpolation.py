@@ -31,13 +31,16 @@ def stays_inside(content: Any, path: Path = ()) -> bool:
     return len(found) == content.count("${") and all(0 < len(dots) <= len(path) for dots, _ in found)
 
 
-def value_at(document: Any, path: Path) -> Any:
-    """The value at a path of a document; None where there is none."""
+def value_at(document: Any, path: Path, otherwise: Any = None) -> Any:
+    """The value at a path of a document, or else what is given for none."""
     for key in path:
-        try:
-            document = document[key]
-        except (KeyError, IndexError, TypeError):
-            return None
+        if isinstance(document, dict):
+            known = next((each for each in (key, str(key)) if each in document), None)  # overrides name an entry a.0
+        else:
+            known = key if isinstance(document, list) and isinstance(key, int) and key < len(document) else None
+        if known is None:
+            return otherwise
+        document = document[known]
     return document
 
 

@@ -124,22 +124,11 @@ def _locality(part: Part) -> int:
 def _held(part: Part, path: schema.Path) -> Any:
     """The value of a part at a path of the whole document; None: it has none."""
     inside = path[: len(part.package)] == part.package
-    return _value(part.content, path[len(part.package) :]) if inside else None
+    return value_at(part.content, path[len(part.package) :]) if inside else None
 
 
 def _holds(content: Any, path: schema.Path) -> bool:
-    return _value(content, path, _NOTHING) is not _NOTHING
-
-
-def _value(content: Any, path: schema.Path, otherwise: Any = None) -> Any:
-    for part in path:
-        # An override names the first entry of a list as a.0, a file has a list there.
-        key = str(part) if isinstance(content, dict) else part
-        try:
-            content = content[key]
-        except (KeyError, IndexError, TypeError):
-            return otherwise
-    return content
+    return value_at(content, path, _NOTHING) is not _NOTHING
 
 
 def nested(key: str, value: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import math
 import os
 import re
@@ -18,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from runner.errors import RunError, UserError
@@ -42,6 +42,22 @@ class Scores(NamedTuple):
 
     version: str
     by_picture: dict[int, float]
+
+
+class VmafOfPicture(msgspec.Struct):
+    vmaf: float
+
+
+class LoggedPicture(msgspec.Struct):
+    number: int = msgspec.field(name="frameNum")
+    metrics: VmafOfPicture
+
+
+class VmafLog(msgspec.Struct):
+    """What is read of libvmaf's log."""
+
+    version: str
+    pictures: list[LoggedPicture] = msgspec.field(name="frames")
 
 
 def metric(model: str) -> Metric:
@@ -155,9 +171,9 @@ def read_log(directory: Path, status: int) -> Scores:
     if status:
         raise complaint(directory, status)
     try:
-        log = json.loads((directory / LOG).read_text())
-        return Scores(log["version"], {entry["frameNum"]: entry["metrics"]["vmaf"] for entry in log["frames"]})
-    except (OSError, ValueError, KeyError):
+        log = msgspec.json.decode((directory / LOG).read_bytes(), type=VmafLog)
+        return Scores(log.version, {picture.number: picture.metrics.vmaf for picture in log.pictures})
+    except (OSError, msgspec.ValidationError, msgspec.DecodeError):
         raise complaint(directory, status) from None
 
 
