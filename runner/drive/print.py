@@ -81,6 +81,7 @@ def write_figures(figures: Sequence[Figure], directory: Path, progress: Progress
         sheet = drawn(figure)
         for form in FORMATS:
             write_whole(directory / f"{figure.name}.{form}", _rendered(sheet, form))
+            sheet.set_layout_engine("none")  # the first has laid it out
     progress("figures", 1.0)
 
 
