@@ -40,6 +40,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(path, seconds=20, freezes={"top_rear": [(6.0, 1.5)]}, congested=0.5)
 
 
+@pytest.fixture
+def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the page and report.json: figures for print take most of a report's time."""
+    monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)
+
+
 def defined(path: Path) -> dict[str, Figure]:
     """The figures of a drive, by name."""
     return {figure.name: figure for figure in figures([statistics(series(read_drive(path)))])[0]}
@@ -109,6 +115,7 @@ def test_with_models_quality_is_estimated(tod: Command, drive: Path, tmp_path: P
     assert [camera["name"] for camera in one["cameras"] if camera["quality"] is None] == ["top_left"]
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_model_that_the_configuration_names(tod: Command, tmp_path: Path) -> None:
     def named(side: str, lines: Lines) -> Lines:
         return lines
@@ -170,6 +177,7 @@ def test_one_camera_and_no_positions(tod: Command, tmp_path: Path) -> None:
     assert "bitrate_on_track: left out, no positions were logged" in document(tmp_path / "out")["left_out"]
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_camera_that_is_off_all_the_time(tod: Command, tmp_path: Path) -> None:
     off = CameraSwitched(t=0.0, camera="rear_center", on=False)
     path = write_drive(tmp_path / "drive", seconds=5, events=(off,))
@@ -181,6 +189,7 @@ def test_a_camera_that_is_off_all_the_time(tod: Command, tmp_path: Path) -> None
     assert rear["factors"][0]["scaling"] == 0
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_claims_are_held_against_the_drive(
     drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +210,7 @@ def test_claims_are_held_against_the_drive(
     assert "the total varies" in capfd.readouterr().out
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
     evil = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{data}}"
 
@@ -282,6 +292,7 @@ def test_one_camera_is_called_by_its_name(tmp_path: Path) -> None:
     assert [curve.label for curve in found["latency"].rows[1][0].curves] == ["front_left"]
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_note_stands_once_and_figures_above_versions(tod: Command, drive: Path, tmp_path: Path) -> None:
     other = write_drive(tmp_path / "other", seconds=5)
     assert tod("report", str(drive), str(other), f"output={tmp_path / 'out'}").status == 0
@@ -342,6 +353,7 @@ def test_a_model_that_is_none(tod: Command, drive: Path, tmp_path: Path) -> None
     assert err.splitlines()[-1].startswith(f"{tmp_path}/front_left.model.json: is not a model file: ")
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_path_may_hold_an_equals_sign(tod: Command, tmp_path: Path) -> None:
     path = write_drive(tmp_path / "rate=6000", ["vehicle"], seconds=3)
     assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
@@ -351,6 +363,7 @@ def test_no_verb_that_takes_none_gets_words(tod: Command) -> None:
     assert tod("print", "drive").err == "command line: drive: must be NAME=VALUE\n"
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_without_its_libraries(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch, tod: Command) -> None:
     import importlib.util
 

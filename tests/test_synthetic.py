@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
@@ -56,12 +57,21 @@ def see(world: Path) -> Callable[[View], Any]:
     return luma
 
 
+@contextmanager
+def built(world: Path) -> Iterator[None]:
+    """Building the street takes seconds: what is rendered takes the one that has been built."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("runner.synthetic.world.build_world", lambda seconds, file: shutil.copy(world, file))
+        yield
+
+
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[tuple[str, float]]]]:
+def cache(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[tuple[str, float]]]]:
     """A cache with two clips, and what was reported while they were rendered; FORWARD is asked for twice."""
     folder, reports = tmp_path_factory.mktemp("cache"), []
     (folder / "drive-0.mp4.part").write_bytes(b"half a clip")
-    render([FORWARD, TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
+    with built(world):
+        render([FORWARD, TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
     yield folder, reports
 
 
@@ -126,19 +136,20 @@ def test_numba_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.gst
-def test_interrupt_ends_the_workers_and_keeps_no_half_clip(tmp_path: Path) -> None:
+def test_interrupt_ends_the_workers_and_keeps_no_half_clip(world: Path, tmp_path: Path) -> None:
     import multiprocessing
 
     def interrupt(what: str, share: float) -> None:
         if share > 0:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with built(world), pytest.raises(KeyboardInterrupt):
         render([FORWARD, LEFT], SECONDS, tmp_path, interrupt)
     assert not multiprocessing.active_children()
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]
     (tmp_path / "drive-0.mp4.part").write_bytes(b"of a run that was killed")
-    render([TOP], SECONDS, tmp_path, nothing)
+    with built(world):
+        render([TOP], SECONDS, tmp_path, nothing)
     assert {path.name for path in tmp_path.iterdir()} == {"lock", clip_path(TOP, SECONDS, tmp_path).name}
 
 
@@ -223,7 +234,7 @@ def test_side_view_needs_more_bits(tmp_path: Path) -> None:
     from runner.synthetic.world import build_world
 
     build_world(12, tmp_path / "world")
-    ahead = replace(FORWARD, width=480, height=260, fps=Fraction(20))
+    ahead = replace(FORWARD, width=480, height=260, fps=Fraction(10))
     sizes = []
     for yaw in (0.0, 55.0, -55.0):
         view = replace(ahead, pose=replace(ahead.pose, yaw_deg=yaw))

@@ -21,7 +21,6 @@ import json
 import lzma
 import os
 import random
-import subprocess
 import sys
 import tempfile
 import time
@@ -140,7 +139,7 @@ def validate(pool: ProcessPoolExecutor) -> Texts:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(text)
         words = [["validate", f"conf={name}"] for name in names]
-        outputs = [text.replace(directory, "") for text in pool.map(_process, words, [directory] * len(names))]
+        outputs = [text.replace(directory, "") for text in pool.map(_here, words, [directory] * len(names))]
         return dict(zip(names, outputs, strict=True))
 
 
@@ -182,23 +181,14 @@ def _outputs(pool: ProcessPoolExecutor, words: list[list[str]]) -> Texts:
     return dict(zip(names, pool.map(_here, words, chunksize=4), strict=True))
 
 
-def _here(words: list[str]) -> str:
-    """Status and output of a verb, in this process: the start of Python would take longer."""
+def _here(words: list[str], directory: str = ".") -> str:
+    """Status and output of a verb in a directory, in this process: the start of Python would take longer."""
     from runner.__main__ import main
 
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with contextlib.chdir(directory), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = main(words)
     return _shown(status, *(stream.buffer.getvalue().decode() for stream in (out, err)))  # type: ignore[attr-defined]
-
-
-def _process(words: list[str], directory: str) -> str:
-    command = [sys.executable, "-m", "runner", *words]
-    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, check=False, timeout=120
-    )
-    return _shown(done.returncode, done.stdout, done.stderr)
 
 
 def _problems(mutation: mutated.Mutation) -> str:
