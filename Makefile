@@ -15,25 +15,23 @@ NODE_READY := node_modules/.ready
 demo: $(READY)
 	$(BIN)/tod-runner demo
 
-# Tests that live by the clock leave the processors idle most of the time; all else runs beside them on half of the cores,
-# which leaves them the others. (nice would not do: Linux shares out by session first, and many tests start sessions.)
+# Tests that live by the clock leave the processors idle half of the time; all else runs on what they leave over.
 test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 timed: $(TEST_READY)
-	$(BIN)/pytest -m timed -n 2 --dist loadfile --durations=30
-	$(BIN)/pytest -m alone --durations=10 --ignore=tests/integration/test_page.py
-	$(BIN)/pytest --durations=10 tests/integration/test_page.py
+	$(BIN)/pytest -m timed -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
+	$(BIN)/pytest -m alone --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
-	taskset --cpu-list $$(($$(nproc) / 2))-$$(($$(nproc) - 1)) $(MAKE) --no-print-directory -j 1 lint javascript golden units
+	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
 
 golden: $(TEST_READY)
 	$(BIN)/tod-runner validate all=true
 	$(BIN)/python tests/golden
 
 units: $(TEST_READY)
-	$(BIN)/pytest -m "not timed and not alone" -n auto --dist loadfile --durations=30
+	$(BIN)/pytest -m "not timed and not alone" -n auto --dist worksteal --durations=30
 
 check: lint javascript
 	$(BIN)/pytest -m "not gst and not slow" -n auto --dist worksteal

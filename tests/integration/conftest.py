@@ -1,8 +1,8 @@
 """Everything here needs GStreamer, and most of it lives by the clock.
 
-`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs two files at a time of what is marked `timed`;
-then, one by one, the tests marked `alone`, whose limits are tight, and last those of the page: a browser and eight
-cameras leave nothing idle. Everything else runs beside them on half of the cores.
+`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs a few files at a time of what is marked `timed`,
+then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs on the processor time that
+these leave over.
 """
 
 from collections.abc import Iterator
@@ -17,11 +17,8 @@ UNTIMED = ("test_keyframe", "test_model", "test_report_page", "test_video_files"
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    name = item.path.stem
     item.add_marker("gst")
-    if name == "test_page":
-        item.add_marker("alone")
-    elif name not in UNTIMED and not item.get_closest_marker("alone"):
+    if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
         item.add_marker("timed")
 
 
