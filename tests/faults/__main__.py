@@ -1,0 +1,151 @@
+"""usage: python tests/faults [PACKAGE ...]
+
+Puts one fault after the other, two in each package, into a copy of the checkout and runs the tests that must fail.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+class Fault(NamedTuple):
+    """What to replace in which file below runner/, and which tests must notice."""
+
+    file: str
+    right: str
+    wrong: str
+    tests: str
+
+    @property
+    def package(self) -> str:
+        return self.file.partition("/")[0]
+
+
+FAULTS = [
+    Fault("core/allocation.py", "if share * weights[name] < 1:", "if share * weights[name] <= 2:", "test_allocation"),
+    Fault(
+        "core/scaling.py",
+        "bisect_right(model.b_min, bitrate) - 1",
+        "bisect_right(model.b_min, bitrate)",
+        "test_scaling",
+    ),
+    Fault("configuration/overrides.py", "if str(override.value) not in known:", "if False:", "test_config"),
+    Fault(
+        "configuration/interpolation.py",
+        "all(0 < len(dots) <= len(path)",
+        "all(0 <= len(dots) <= len(path)",
+        "test_validate",
+    ),
+    Fault(
+        "vehicle/operators.py", "t - o.last_message > SILENT_S", "t - o.last_message > 9 * SILENT_S", "test_operators"
+    ),
+    Fault("vehicle/inbox.py", "len(waiting) >= WAITING", "len(waiting) > WAITING", "test_inbox"),
+    Fault("operator/meter.py", "* 8 / 1000 /", "/ 1000 /", "test_meter"),
+    Fault("operator/notes.py", "if factors[0] != factors[1]", "if True", "test_notes"),
+    Fault("mqtt/messages.py", "if len(payload) > limit:", "if len(payload) > 99 * limit:", "integration/test_control"),
+    Fault(
+        "mqtt/link.py",
+        "if self._listening.is_set():\n            self._send",
+        "if True:\n            self._send",
+        "integration/test_station",
+    ),
+    Fault("h264/access_unit.py", "kind == IDR, recovery)", "kind == SLICE, recovery)", "test_units"),
+    Fault(
+        "h264/keyframe.py", "frame_num_bits = read.ue() + 4", "frame_num_bits = read.ue()", "integration/test_keyframe"
+    ),
+    Fault("gst/knobs.py", "if element.get_property(key) != wanted:", "if False:", "integration/test_apply"),
+    Fault(
+        "gst/sender_filter.py",
+        "IPV4_SOURCE, IPV6_SOURCE = NET + 12",
+        "IPV4_SOURCE, IPV6_SOURCE = NET + 16",
+        "test_sender_filter",
+    ),
+    Fault("pqos/track.py", "now = t % self.duration_s if self._loop else", "now =", "test_track"),
+    Fault("pqos/table.py", 'if "" in names:', "if False:", "test_table"),
+    Fault("link/bucket.py", "self._tokens -= size", "self._tokens -= size / 2", "test_link_parts"),
+    Fault(
+        "link/relay.py", "uplink.put(len(data) + UDP_HEADERS,", "uplink.put(len(data) // 2,", "integration/test_link"
+    ),
+    Fault("drive/statistics.py", "FREEZE_FACTOR * means, means + FREEZE_MORE_S", "means, means", "test_statistics"),
+    Fault(
+        "drive/series.py",
+        'np.searchsorted(line.t, at, "right") - 1',
+        'np.searchsorted(line.t, at, "left") - 1',
+        "test_series",
+    ),
+    Fault("rate_quality/curves.py", "if at in (0, len(gain)):", "if at < 0:", "test_curves"),
+    Fault("rate_quality/choice.py", "if len(points) == len(groups)", "if points", "integration/test_model"),
+    Fault(
+        "synthetic/picture.py",
+        "right, down = np.array([math.sin(yaw), -math.cos(yaw), 0.0])",
+        "right, down = np.array([-math.sin(yaw), math.cos(yaw), 0.0])",
+        "test_synthetic",
+    ),
+    Fault(
+        "synthetic/__init__.py",
+        "missing = [view for view in dict.fromkeys(views) if not",
+        "missing = [view for view in dict.fromkeys(views) if True or not",
+        "test_synthetic",
+    ),
+    Fault("page/viewer.py", "if len(waiting.live) > WAITING_UNITS:", "if False:", "test_page_parts"),
+    Fault(
+        "page/control.py",
+        "if token == self._holder:\n            self._holder, self._left = ",
+        "if True:\n            self._holder, self._left = ",
+        "test_page_parts",
+    ),
+    Fault("verbs/replay.py", 'if document["t"] < last:', "if False:", "test_replay"),
+    Fault(
+        "graph.py",
+        "right, bottom = native_width - left - value.width",
+        "right, bottom = native_width - value.width",
+        "test_graph",
+    ),
+]
+
+
+def main(words: list[str]) -> int:
+    chosen = [fault for fault in FAULTS if not words or fault.package in words]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        missed = 0
+        for fault, caught in zip(chosen, pool.map(_caught, chosen), strict=True):
+            print("caught" if caught else "MISSED", fault.file, "->", caught or fault.tests, flush=True)
+            missed += not caught
+    print(f"{len(chosen)} faults, {missed} missed")
+    return 1 if missed else 0
+
+
+def _caught(fault: Fault) -> str:
+    """The first test that fails with the fault; "" where none does."""
+    with tempfile.TemporaryDirectory() as directory:
+        copy = Path(directory, "checkout")
+        left_out = shutil.ignore_patterns(".*", "node_modules", "__pycache__", "bench", "docs")
+        shutil.copytree(CHECKOUT, copy, symlinks=True, ignore=left_out)
+        file = copy / "runner" / fault.file
+        text = file.read_text()
+        assert text.count(fault.right) == 1, (
+            f"{fault.file}: {fault.right!r} stands there {text.count(fault.right)} times"
+        )
+        file.write_text(text.replace(fault.right, fault.wrong))
+        environment = {
+            **os.environ,
+            "PYTHONPATH": str(copy),
+            "TOD_SHARED_DATA": str(CHECKOUT.parent / "shared" / "data"),
+        }
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"tests/{fault.tests}.py"]
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+        failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        return failed[0].split(" ")[1] if failed else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

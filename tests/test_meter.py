@@ -1,0 +1,81 @@
+"""Rates over the last second, and how well what comes follows what was decided, by hand-made counters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from runner.operator.meter import ReceptionMeter, middle, percentile
+
+
+@dataclass
+class Counters:
+    frames: int
+    bytes: int
+    width: int = 480
+    height: int = 260
+    latency_ms: float | None = 12.0
+    lost: int = 0
+    foreign: int = 0
+    rebuilt: int = 0
+
+
+@dataclass
+class Decided:
+    sending: bool = True
+    kbps: int = 800
+    width: int = 480
+    height: int = 260
+
+
+def fed(meter: ReceptionMeter, seconds: float, fps: int = 20, kbps: int = 800, decided: Decided | None = None) -> None:
+    """Four samples a second of a steady stream."""
+    for sample in range(int(4 * seconds) + 1):
+        t = sample / 4
+        rates = meter.add(t, Counters(int(fps * t), int(kbps * 1000 / 8 * t)), decided)
+        if sample:
+            assert (rates.fps, rates.kbps) == (pytest.approx(fps), pytest.approx(kbps))
+
+
+def test_rates_are_those_of_the_last_second() -> None:
+    meter = ReceptionMeter(fps=20)
+    assert meter.add(0.0, Counters(0, 0), None).kbps == 0
+    fed(meter, 3)
+    for sample in range(1, 5):  # then nothing comes
+        rates = meter.add(3 + sample / 4, Counters(60, 300_000), None)
+    assert (rates.fps, rates.kbps) == (0, 0)
+
+
+def test_windows_count_once_the_decision_is_settled() -> None:
+    meter = ReceptionMeter(fps=20)
+    fed(meter, 5, decided=Decided())
+    assert meter.windows == 4  # at 1.5, 2.5, 3.5 and 4.5 s
+    assert meter.followed == [pytest.approx(1.0)] * 4
+    assert (meter.short, meter.sizes, meter.latencies_ms) == (0, {(480, 260): 4}, [12.0] * 4)
+
+
+def test_what_falls_short_of_the_decision_is_counted() -> None:
+    meter = ReceptionMeter(fps=40)
+    fed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
+    assert meter.followed == [pytest.approx(0.5)] * 4
+    assert (meter.short, meter.sizes) == (4, {})
+
+
+def test_nothing_is_compared_while_nothing_is_to_be_sent() -> None:
+    meter = ReceptionMeter(fps=20)
+    fed(meter, 5, decided=Decided(sending=False))
+    assert meter.windows == 0
+
+
+def test_a_new_decision_has_time_to_settle() -> None:
+    meter = ReceptionMeter(fps=20)
+    for sample in range(13):
+        meter.add(sample / 4, Counters(5 * sample, 25_000 * sample), Decided(kbps=800 + sample // 4))
+    assert meter.windows == 0
+
+
+def test_percentiles() -> None:
+    assert (percentile([], 0.5), middle([])) == (None, None)
+    assert percentile(range(100), 0.95) == 95
+    assert (percentile([7.0], 0.95), middle([3.0, 1.0, 2.0])) == (7.0, 2.0)
