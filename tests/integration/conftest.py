@@ -5,11 +5,13 @@ then, one by one, the tests marked `alone`, whose limits are tight. Everything e
 these leave over.
 """
 
+import shutil
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
-from rig import free_port
+from rig import CHROMIUM_FLAGS, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
@@ -20,6 +22,16 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("gst")
     if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
         item.add_marker("timed")
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A browser; its pages are opened by `browser.opened`."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        yield started
+        started.close()
 
 
 @pytest.fixture

@@ -5,49 +5,37 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
-import os
 import re
 import shutil
-import signal
 import socket
 import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import rig
-from rig import CHECKOUT, CHROMIUM_FLAGS, answers, free_port, process
-from runner.core.model import Endpoint
-from runner.mqtt.broker import private_broker
+from browser import all_live, luma, measure, opened, send, shot, state, state_when, take_control, until
+from rig import answers, free_port, process
 from runner.page.server import EVENTS
 
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
 aiohttp = pytest.importorskip("aiohttp")
-sync_api = pytest.importorskip("playwright.sync_api")
 
-SCREENSHOTS = Path(os.environ.get("TOD_SCREENSHOTS", "/tmp/tod-runner-screenshots"))
-TUM = ("front_left", "front_center", "front_right", "rear_center", "top_front", "top_left", "top_right", "top_rear")
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
+
+SIZES = {  # half of each side: the processor has time to spare for the tests
+    **dict.fromkeys(("front_left", "front_center", "front_right"), (960, 520)),
+    "rear_center": (960, 600),
+    **dict.fromkeys(("top_front", "top_left", "top_right", "top_rear"), (640, 400)),
+}
+TUM = tuple(SIZES)
+
+
 HEADER = np.dtype(
     [("camera", "u1"), ("flags", "u1"), ("zero", "<u2"), ("sequence", "<u4"), ("captured", "<f8"), ("arrived", "<f8")]
 )
-
-
-until = partial(rig.until, every_s=0.1)  # asking a browser costs it time
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -59,34 +47,16 @@ def demo():
         f"media.port={free_port()}",
         f"control.port={free_port()}",
         "duration_s=1200",
-        "fps_max=5",
+        "fps_max=5",  # so that counts say something on two cores that also run the tests
+        *(f"cameras.{name}.width_px={width}" for name, (width, _) in SIZES.items()),
+        *(f"cameras.{name}.height_px={height}" for name, (_, height) in SIZES.items()),
         "pqos.position.speed_mps=16",  # the loop in half a minute
     )
-    # 5 Hz: two cores that also run the tests have time to spare, so that counts say something
     with process("demo", *words, stdout=subprocess.DEVNULL) as child:
         until(lambda: answers(port) or child.poll() is not None, seconds=300)  # the drive may have to be rendered
         yield f"http://127.0.0.1:{port}/"
         child.terminate()
         child.wait(timeout=15)
-
-
-@contextmanager
-def opened(browser, url, width=1280, height=800, refused=False, **context):
-    """A page in a browser of its own, which must stay free of errors and ask no other host.
-
-    refused  the station goes away meanwhile, which the browser tells for each request
-    """
-    with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
-        page = tab.new_page()
-        wrong, own = [], (url.partition("#")[0], "data:", "blob:")
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
-        page.goto(url)
-        until(lambda: page.evaluate("window.tod !== undefined"))
-        yield page
-        expected = ("WebSocket connection", *(["net::ERR_CONNECTION_REFUSED"] if refused else []))
-        assert [text for text in wrong if not any(each in text for each in expected)] == []
 
 
 @pytest.fixture
@@ -105,37 +75,6 @@ def apart(coroutine):
         return pool.submit(asyncio.run, coroutine).result(timeout=60)
 
 
-def take_control(page):
-    def taken():
-        """A person would click again where the page was just connecting."""
-        if (holder := page.evaluate("tod.control")) == "you":
-            return True
-        page.locator("#take-control").click()
-        if holder == "another":  # asked once more
-            page.locator("#confirm-yes").click()
-        return rig.passes(lambda: page.evaluate("tod.control === 'you'"), seconds=2)
-
-    until(taken)
-
-
-def measure(page):
-    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before the introduction
-
-
-def all_live(page, seconds=30):
-    """Every camera has been live; on a busy machine hardly ever all at the very same moment."""
-    waiting = set(measure(page))
-
-    def seen():
-        waiting.difference_update(name for name, camera in measure(page).items() if camera["status"] == "live")
-        return not waiting
-
-    if not rig.passes(seen, seconds):
-        assert {name: camera for name, camera in measure(page).items() if name in waiting} == {}, page.evaluate(
-            "[tod.state, tod.sample, tod.measure()]"
-        )
-
-
 def goes_on(page, counted, pictures=2, seconds=5):
     """Every camera draws more than so many pictures after it was counted, and no decoder fails."""
 
@@ -151,35 +90,9 @@ def goes_on(page, counted, pictures=2, seconds=5):
     assert waiting() == {}
 
 
-def state(page):
-    return page.evaluate("tod.state")
-
-
-def state_when(page, wanted, seconds=15):
-    return until(lambda: (now := state(page)) and now["online"] and wanted(now) and now, seconds)
-
-
 def choose(page, mode):
     page.locator(f"#mode-{mode}").click()
     return state_when(page, lambda now: now["mode"] == mode)
-
-
-def luma(page, camera):
-    """The picture that was drawn last: its luma, and when it was captured, ms."""
-    picture = page.evaluate(f"tod.picture('{camera}')")
-    width, height = picture["width"], picture["height"]
-    data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
-    return data.reshape(height, width), picture["captured"]
-
-
-def shot(page, name):
-    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=SCREENSHOTS / f"{name}.png")
-
-
-def send(page, **event):
-    """A request as the page sends it; its answer."""
-    return page.evaluate("event => tod.request(event)", event)
 
 
 def test_eight_pictures_move(page):
@@ -206,9 +119,9 @@ def test_single_a_dragged_region_changes_what_is_received(page):
     page.mouse.up()
     camera = state_when(page, lambda now: now["cameras"]["front_center"]["roi"]["x"] > 0)["cameras"]["front_center"]
     roi = camera["roi"]
-    assert abs(roi["x"] - 480) < 30
-    assert abs(roi["width"] - 960) < 40
-    assert abs(roi["height"] - 520) < 40
+    assert abs(roi["x"] - 240) < 15
+    assert abs(roi["width"] - 480) < 20
+    assert abs(roi["height"] - 260) < 20
     size = (camera["height"], camera["width"])
     assert size[0] < full.shape[0]
     until(lambda: luma(page, "front_center")[0].shape == size)
@@ -218,7 +131,7 @@ def test_single_a_dragged_region_changes_what_is_received(page):
     assert middle.shape[0] == pytest.approx(size[0], abs=16)
     applied = state_when(page, lambda now: now["cameras"]["front_center"]["applied"]["roi"] == roi)
     assert applied["cameras"]["front_center"]["applied"]["size"] == {"width": size[1], "height": size[0]}
-    reply = send(page, event="roi_set", camera="front_center", x=0, y=0, width=1920, height=1040)
+    reply = send(page, event="roi_set", camera="front_center", x=0, y=0, width=960, height=520)
     assert reply["result"] == "applied"
     until(lambda: luma(page, "front_center")[0].shape == full.shape)
 
@@ -383,9 +296,9 @@ def test_requests_that_are_wrong_are_refused_with_the_reason(page):
         reply = send(page, **event)
         assert (reply["result"], reply["reason"]) == ("refused", reason)
     choose(page, "single")
-    reply = send(page, event="roi_set", camera="front_left", x=1900, y=0, width=100, height=100)
+    reply = send(page, event="roi_set", camera="front_left", x=900, y=0, width=100, height=100)
     assert reply["result"] == "refused"
-    assert "ROI 100x100 at 1900,0" in reply["reason"]
+    assert "ROI 100x100 at 900,0" in reply["reason"]
 
 
 def test_whatever_a_socket_sends_the_streams_go_on(page, demo):
@@ -510,74 +423,6 @@ def test_keys_choose_modes_cameras_and_help(page):
     page.wait_for_selector("dialog[open]", state="hidden")
 
 
-@contextmanager
-def sides(*overrides, log="log.video=false"):
-    """Vehicle and operator as two processes. Yields the page's address, a way to start the vehicle, the operator.
-
-    log  argument of the operator's side
-    """
-    control, media, port = (free_port() for _ in range(3))
-    words = (*ROBOT, *overrides, f"control.port={control}", f"media.port={media}", f"page.port={port}")
-    with private_broker(Endpoint("127.0.0.1", control)), process("operator", *words, log) as operator:
-        until(lambda: answers(port))
-        yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
-
-
-def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
-    with sides() as (url, vehicle, _), opened(chromium, url) as page:
-        with vehicle() as first:
-            all_live(page, seconds=30)
-            time.sleep(1)
-            first.kill()
-            killed = time.time() * 1000
-            page.wait_for_selector("#banner:not([hidden])", timeout=1000)
-            shot(page, "vehicle-gone")
-        log = page.evaluate("tod.measure()")["status_log"]
-        for camera in ("front", "rear", "mast"):
-            at = next(
-                ms for ms, name, status in log if name == camera and ms > killed - 100 and status in ("frozen", "lost")
-            )
-            assert at - killed < 150, f"{camera}: {at - killed} ms"
-        with vehicle():
-            state_when(page, lambda now: True, seconds=30)
-            online = time.monotonic()
-            all_live(page)
-            assert time.monotonic() - online < 3
-            assert page.locator("#banner").is_hidden()
-
-
-def test_a_station_that_stands_still_is_left_and_found_again(chromium):
-    with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
-        all_live(page, seconds=30)
-        operator.send_signal(signal.SIGSTOP)
-        stopped = time.monotonic()
-        page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
-        assert time.monotonic() - stopped < 3  # 2 s without a word
-        assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4, seconds=12)  # each gives up after 1 s
-        shot(page, "station-gone")
-        operator.send_signal(signal.SIGCONT)
-        found_again(page)
-
-
-def test_a_station_that_starts_again_is_found_at_once(chromium):
-    """However many attempts have failed: browsers delay WebSockets that failed often."""
-    with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
-        all_live(page, seconds=30)
-        operator.kill()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 25, seconds=40)
-        with process(*operator.args[3:]):
-            until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
-            found_again(page)
-
-
-def found_again(page):
-    back = time.monotonic()
-    until(lambda: page.locator("#banner").is_hidden())
-    all_live(page)
-    assert time.monotonic() - back < 5
-
-
 def test_a_viewer_that_answers_no_ping_is_dropped(demo):
     with upgraded(demo, "silent") as viewer:
         began = time.monotonic()
@@ -615,162 +460,6 @@ def upgraded(url, viewer):
             "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
         )
         yield line
-
-
-def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
-    """Such a stream has no IDR to start from."""
-    from runner.operator.frames import live_frames
-
-    with sides() as (url, vehicle, _), vehicle() as running:
-        media = next(word for word in running.args if word.startswith("media.port="))
-        with live_frames([*ROBOT, media]) as frames, opened(chromium, url) as page:
-            all_live(page, seconds=30)
-            assert frames.next(5)
-
-
-def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
-    """`make soak` does it for longer."""
-    turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
-    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
-    with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
-        all_live(page, seconds=30)
-        counted = measure(page)
-        for turn in range(turns):
-            for camera in ("front", "rear", "mast"):
-                reply = send(page, event="camera_configured", camera=camera, scaling=(0.25, 0.5, 1.0)[turn % 3])
-                assert reply["result"] == "applied", reply
-            time.sleep(0.5)
-            for camera in ("front", "rear", "mast"):
-                assert luma(page, camera)[0].mean() > 40, f"{camera} is black in turn {turn}"
-        measured = measure(page)
-        assert {name: camera["errors"] for name, camera in measured.items()} == {"front": 0, "rear": 0, "mast": 0}
-        for name, camera in measured.items():
-            received, drawn = (camera[key] - counted[name][key] for key in ("received", "drawn"))
-            assert received > 5 * turns
-            assert drawn > 0.9 * received
-
-
-SHIFTED = """\
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <sys/time.h>
-#include <time.h>
-#define AHEAD_S 4
-int clock_gettime(clockid_t id, struct timespec *t) {
-  static int (*own)(clockid_t, struct timespec *);
-  if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
-  int failed = own(id, t);
-  if (!failed && id == CLOCK_REALTIME) t->tv_sec += AHEAD_S;
-  return failed;
-}
-int gettimeofday(struct timeval *t, void *zone) {
-  struct timespec now;
-  clock_gettime(CLOCK_REALTIME, &now);
-  t->tv_sec = now.tv_sec, t->tv_usec = now.tv_nsec / 1000;
-  return 0;
-}
-time_t time(time_t *at) {
-  struct timespec now;
-  clock_gettime(CLOCK_REALTIME, &now);
-  if (at) *at = now.tv_sec;
-  return now.tv_sec;
-}
-"""
-
-
-@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_told(chromium, tmp_path):
-    (tmp_path / "shifted.c").write_text(SHIFTED)
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", "shifted.so", "shifted.c", "-ldl"], cwd=tmp_path, check=True)
-    ahead = {"LD_PRELOAD": str(tmp_path / "shifted.so")}
-    log = f"log={tmp_path / 'drive'}"
-    with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
-        all_live(page, seconds=30)
-        page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
-        told = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
-        assert re.fullmatch(told, page.locator("#warning").inner_text())
-        until(lambda: "– ms" in page.locator("[data-camera=front] .form").inner_text())
-        assert {camera["latency_ms"] for camera in page.evaluate("tod.sample")["cameras"].values()} == {None}
-        assert "late" not in {status for _, _, status in page.evaluate("tod.measure()")["status_log"]}
-        shot(page, "clock-ahead")
-        operator.terminate()
-        said, _ = operator.communicate(timeout=20)
-    assert "the vehicle's clock is ahead by at least " in said
-    lines = [json.loads(line) for line in (tmp_path / "drive" / "operator.jsonl").read_text().splitlines()]
-    samples = [line for line in lines if line.get("log") == "sample"]
-    assert 3500 < samples[-1]["clock_ahead_ms"] < 4001
-    known = {camera["latency_ms"] for sample in samples for camera in sample["cameras"].values()}
-    assert known == {None}
-
-
-def test_nothing_old_is_shown_of_a_camera_that_is_off_or_lost(chromium):
-    with sides() as (url, vehicle, _), opened(chromium, url) as page:
-        with vehicle() as running:
-            all_live(page, seconds=30)
-            until(lambda: "– fps" not in caption(page, "rear"))
-            page.locator("[data-camera=rear] .switch").click()
-            until(lambda: measure(page)["rear"]["status"] == "off")
-            until(lambda: caption(page, "rear") == "– fps · –/0/0 kbit/s – · ×– · – ms")
-            page.locator("[data-camera=rear] .head b").click()
-            _, decided, applied = page.locator("#camera-panel .facts tbody tr").nth(1).inner_text().split("\t")
-            assert decided == "0"
-            assert re.fullmatch(r"– \(keeps \d+\)", applied)
-            assert page.locator("#camera-panel [data-differs]").count() == 0
-            shot(page, "off")
-            running.kill()
-        until(lambda: measure(page)["front"]["status"] == "lost")
-        until(lambda: caption(page, "front") == "– fps · –/–/– kbit/s – · ×– · – ms")
-        shot(page, "lost")
-
-
-def caption(page, camera):
-    parts = (page.locator(f"[data-camera={camera}] .{part}").inner_text() for part in ("rates", "form"))
-    return " ".join(parts).replace("\u2009", "")
-
-
-X265 = """\
-element: x265enc
-    properties: {tune: zerolatency, speed-preset: ultrafast, key-int-max: "{key_interval_frames}"}
-"""
-
-
-@pytest.fixture
-def h265(tmp_path):
-    """A user's directory with a graph of H.265, made of the packaged one by element swap."""
-    text = (CHECKOUT / "conf" / "graph" / "h264_rtsp.yaml").read_text()
-    text = re.sub(r"element: x264enc\n    properties:\n(      .*\n)+", X265, text)
-    for old, new in {"h264depay": "h265depay", "h264pay": "h265pay", "x-h264": "x-h265", "=H264": "=H265"}.items():
-        text = text.replace(old, new)
-    text = text.replace("avdec_h264, properties: {max-threads: 1}", "avdec_h265").replace("vbv_frames: 1.5", "")
-    graph = tmp_path / "conf" / "graph" / "h265.yaml"
-    graph.parent.mkdir(parents=True)
-    graph.write_text(text)
-    return f"conf={tmp_path / 'conf'}"
-
-
-def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
-    with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
-        until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()}, seconds=30)
-        until(lambda: page.evaluate("tod.sample").get("cameras", {}).get("rear", {}).get("fps", 0) > 5)
-        supported = "VideoDecoder.isConfigSupported({codec: 'hev1.1.6.L90.90'}).then(({supported}) => supported)"
-        if page.evaluate(supported):
-            all_live(page)
-            return
-        tile = page.locator("[data-camera=rear]")
-        told = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Choose a graph of H\.264, or .*"
-        until(lambda: re.fullmatch(told, tile.locator(".refused").inner_text()))
-        assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
-        assert not tile.locator(".rates").inner_text().startswith("–")  # its rates are those of what comes
-        for camera in ("front", "mast"):
-            until(lambda camera=camera: measure(page)[camera]["status"] == "live")
-            assert page.locator(f"[data-camera={camera}] .refused").is_hidden()
-        assert measure(page)["rear"]["resyncs"] <= 1  # another burst would not help
-        tile.locator(".head b").click()
-        assert "no decoder for H.265" in page.locator("#camera-panel .why-decided").inner_text()
-        received = measure(page)["rear"]["received"]
-        until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts other key pictures
-        assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
-        shot(page, "h265")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from drives import write_drive, write_models
 
-from rig import CHROMIUM_FLAGS
 from runner.configuration.compose import compose
 from runner.verbs.report import report
 
@@ -36,14 +35,6 @@ SINGLE = {
 DRAWN = "[...document.querySelectorAll('.chart')].every(chart => chart.dataset.drawn)"
 TRACES = """[...document.querySelectorAll('.chart')].map(chart =>
     [chart.dataset.figure, Number(chart.dataset.drive), Number(chart.dataset.part), chart.data.length])"""
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

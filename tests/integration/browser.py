@@ -1,0 +1,94 @@
+"""What the tests of the operator's page share: a browser's page, and what it shows."""
+
+from __future__ import annotations
+
+import base64
+import os
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import rig
+
+SCREENSHOTS = Path(os.environ.get("TOD_SCREENSHOTS", "/tmp/tod-runner-screenshots"))
+
+
+until = partial(rig.until, every_s=0.1)  # asking a browser costs it time
+
+
+@contextmanager
+def opened(browser, url, width=1280, height=800, refused=False, **context):
+    """A page in a browser of its own, which must stay free of errors and ask no other host.
+
+    refused  the station goes away meanwhile, which the browser tells for each request
+    """
+    with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
+        page = tab.new_page()
+        wrong, own = [], (url.partition("#")[0], "data:", "blob:")
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
+        page.goto(url)
+        until(lambda: page.evaluate("window.tod !== undefined"))
+        yield page
+        expected = ("WebSocket connection", *(["net::ERR_CONNECTION_REFUSED"] if refused else []))
+        assert [text for text in wrong if not any(each in text for each in expected)] == []
+
+
+def take_control(page):
+    def taken():
+        """A person would click again where the page was just connecting."""
+        if (holder := page.evaluate("tod.control")) == "you":
+            return True
+        page.locator("#take-control").click()
+        if holder == "another":  # asked once more
+            page.locator("#confirm-yes").click()
+        return rig.passes(lambda: page.evaluate("tod.control === 'you'"), seconds=2)
+
+    until(taken)
+
+
+def measure(page):
+    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before the introduction
+
+
+def all_live(page, seconds=30):
+    """Every camera has been live; on a busy machine hardly ever all at the very same moment."""
+    waiting = set(measure(page))
+
+    def seen():
+        waiting.difference_update(name for name, camera in measure(page).items() if camera["status"] == "live")
+        return not waiting
+
+    if not rig.passes(seen, seconds):
+        assert {name: camera for name, camera in measure(page).items() if name in waiting} == {}, page.evaluate(
+            "[tod.state, tod.sample, tod.measure()]"
+        )
+
+
+def state(page):
+    return page.evaluate("tod.state")
+
+
+def state_when(page, wanted, seconds=15):
+    return until(lambda: (now := state(page)) and now["online"] and wanted(now) and now, seconds)
+
+
+def luma(page, camera):
+    """The picture that was drawn last: its luma, and when it was captured, ms."""
+    picture = page.evaluate(f"tod.picture('{camera}')")
+    width, height = picture["width"], picture["height"]
+    data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
+    return data.reshape(height, width), picture["captured"]
+
+
+def shot(page, name):
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / f"{name}.png")
+
+
+def send(page, **event):
+    """A request as the page sends it; its answer."""
+    return page.evaluate("event => tod.request(event)", event)

@@ -1,0 +1,249 @@
+"""The operator's page in a real browser, when a vehicle or an operator's process fails or differs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+from functools import partial
+
+import pytest
+
+from browser import all_live, luma, measure, opened, send, shot, state_when, until
+from rig import CHECKOUT, answers, free_port, process
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
+
+
+@contextmanager
+def sides(*overrides, log="log.video=false"):
+    """Vehicle and operator as two processes. Yields the page's address, a way to start the vehicle, the operator.
+
+    log  argument of the operator's side
+    """
+    control, media, port = (free_port() for _ in range(3))
+    words = (*ROBOT, *overrides, f"control.port={control}", f"media.port={media}", f"page.port={port}")
+    with private_broker(Endpoint("127.0.0.1", control)), process("operator", *words, log) as operator:
+        until(lambda: answers(port))
+        yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
+
+
+def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
+    with sides() as (url, vehicle, _), opened(chromium, url) as page:
+        with vehicle() as first:
+            all_live(page, seconds=30)
+            time.sleep(1)
+            first.kill()
+            killed = time.time() * 1000
+            page.wait_for_selector("#banner:not([hidden])", timeout=1000)
+            shot(page, "vehicle-gone")
+        log = page.evaluate("tod.measure()")["status_log"]
+        for camera in ("front", "rear", "mast"):
+            at = next(
+                ms for ms, name, status in log if name == camera and ms > killed - 100 and status in ("frozen", "lost")
+            )
+            assert at - killed < 150, f"{camera}: {at - killed} ms"
+        with vehicle():
+            state_when(page, lambda now: True, seconds=30)
+            online = time.monotonic()
+            all_live(page)
+            assert time.monotonic() - online < 3
+            assert page.locator("#banner").is_hidden()
+
+
+def test_a_station_that_stands_still_is_left_and_found_again(chromium):
+    with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
+        all_live(page, seconds=30)
+        operator.send_signal(signal.SIGSTOP)
+        stopped = time.monotonic()
+        page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
+        assert time.monotonic() - stopped < 3  # 2 s without a word
+        assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4, seconds=12)  # each gives up after 1 s
+        shot(page, "station-gone")
+        operator.send_signal(signal.SIGCONT)
+        found_again(page)
+
+
+def test_a_station_that_starts_again_is_found_at_once(chromium):
+    """However many attempts have failed: browsers delay WebSockets that failed often."""
+    with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
+        all_live(page, seconds=30)
+        operator.kill()
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 25, seconds=40)
+        with process(*operator.args[3:]):
+            until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
+            found_again(page)
+
+
+def found_again(page):
+    back = time.monotonic()
+    until(lambda: page.locator("#banner").is_hidden())
+    all_live(page)
+    assert time.monotonic() - back < 5
+
+
+def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
+    """Such a stream has no IDR to start from."""
+    from runner.operator.frames import live_frames
+
+    with sides() as (url, vehicle, _), vehicle() as running:
+        media = next(word for word in running.args if word.startswith("media.port="))
+        with live_frames([*ROBOT, media]) as frames, opened(chromium, url) as page:
+            all_live(page, seconds=30)
+            assert frames.next(5)
+
+
+def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
+    """`make soak` does it for longer."""
+    turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
+    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
+    with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
+        all_live(page, seconds=30)
+        counted = measure(page)
+        for turn in range(turns):
+            for camera in ("front", "rear", "mast"):
+                reply = send(page, event="camera_configured", camera=camera, scaling=(0.25, 0.5, 1.0)[turn % 3])
+                assert reply["result"] == "applied", reply
+            time.sleep(0.5)
+            for camera in ("front", "rear", "mast"):
+                assert luma(page, camera)[0].mean() > 40, f"{camera} is black in turn {turn}"
+        measured = measure(page)
+        assert {name: camera["errors"] for name, camera in measured.items()} == {"front": 0, "rear": 0, "mast": 0}
+        for name, camera in measured.items():
+            received, drawn = (camera[key] - counted[name][key] for key in ("received", "drawn"))
+            assert received > 5 * turns
+            assert drawn > 0.9 * received
+
+
+SHIFTED = """\
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <sys/time.h>
+#include <time.h>
+#define AHEAD_S 4
+int clock_gettime(clockid_t id, struct timespec *t) {
+  static int (*own)(clockid_t, struct timespec *);
+  if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
+  int failed = own(id, t);
+  if (!failed && id == CLOCK_REALTIME) t->tv_sec += AHEAD_S;
+  return failed;
+}
+int gettimeofday(struct timeval *t, void *zone) {
+  struct timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  t->tv_sec = now.tv_sec, t->tv_usec = now.tv_nsec / 1000;
+  return 0;
+}
+time_t time(time_t *at) {
+  struct timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  if (at) *at = now.tv_sec;
+  return now.tv_sec;
+}
+"""
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_told(chromium, tmp_path):
+    (tmp_path / "shifted.c").write_text(SHIFTED)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", "shifted.so", "shifted.c", "-ldl"], cwd=tmp_path, check=True)
+    ahead = {"LD_PRELOAD": str(tmp_path / "shifted.so")}
+    log = f"log={tmp_path / 'drive'}"
+    with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
+        all_live(page, seconds=30)
+        page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
+        told = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
+        assert re.fullmatch(told, page.locator("#warning").inner_text())
+        until(lambda: "– ms" in page.locator("[data-camera=front] .form").inner_text())
+        assert {camera["latency_ms"] for camera in page.evaluate("tod.sample")["cameras"].values()} == {None}
+        assert "late" not in {status for _, _, status in page.evaluate("tod.measure()")["status_log"]}
+        shot(page, "clock-ahead")
+        operator.terminate()
+        said, _ = operator.communicate(timeout=20)
+    assert "the vehicle's clock is ahead by at least " in said
+    lines = [json.loads(line) for line in (tmp_path / "drive" / "operator.jsonl").read_text().splitlines()]
+    samples = [line for line in lines if line.get("log") == "sample"]
+    assert 3500 < samples[-1]["clock_ahead_ms"] < 4001
+    known = {camera["latency_ms"] for sample in samples for camera in sample["cameras"].values()}
+    assert known == {None}
+
+
+def test_nothing_old_is_shown_of_a_camera_that_is_off_or_lost(chromium):
+    with sides() as (url, vehicle, _), opened(chromium, url) as page:
+        with vehicle() as running:
+            all_live(page, seconds=30)
+            until(lambda: "– fps" not in caption(page, "rear"))
+            page.locator("[data-camera=rear] .switch").click()
+            until(lambda: measure(page)["rear"]["status"] == "off")
+            until(lambda: caption(page, "rear") == "– fps · –/0/0 kbit/s – · ×– · – ms")
+            page.locator("[data-camera=rear] .head b").click()
+            _, decided, applied = page.locator("#camera-panel .facts tbody tr").nth(1).inner_text().split("\t")
+            assert decided == "0"
+            assert re.fullmatch(r"– \(keeps \d+\)", applied)
+            assert page.locator("#camera-panel [data-differs]").count() == 0
+            shot(page, "off")
+            running.kill()
+        until(lambda: measure(page)["front"]["status"] == "lost")
+        until(lambda: caption(page, "front") == "– fps · –/–/– kbit/s – · ×– · – ms")
+        shot(page, "lost")
+
+
+def caption(page, camera):
+    parts = (page.locator(f"[data-camera={camera}] .{part}").inner_text() for part in ("rates", "form"))
+    return " ".join(parts).replace("\u2009", "")
+
+
+X265 = """\
+element: x265enc
+    properties: {tune: zerolatency, speed-preset: ultrafast, key-int-max: "{key_interval_frames}"}
+"""
+
+
+@pytest.fixture
+def h265(tmp_path):
+    """A user's directory with a graph of H.265, made of the packaged one by element swap."""
+    text = (CHECKOUT / "conf" / "graph" / "h264_rtsp.yaml").read_text()
+    text = re.sub(r"element: x264enc\n    properties:\n(      .*\n)+", X265, text)
+    for old, new in {"h264depay": "h265depay", "h264pay": "h265pay", "x-h264": "x-h265", "=H264": "=H265"}.items():
+        text = text.replace(old, new)
+    text = text.replace("avdec_h264, properties: {max-threads: 1}", "avdec_h265").replace("vbv_frames: 1.5", "")
+    graph = tmp_path / "conf" / "graph" / "h265.yaml"
+    graph.parent.mkdir(parents=True)
+    graph.write_text(text)
+    return f"conf={tmp_path / 'conf'}"
+
+
+def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
+    with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
+        until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()}, seconds=30)
+        until(lambda: page.evaluate("tod.sample").get("cameras", {}).get("rear", {}).get("fps", 0) > 5)
+        supported = "VideoDecoder.isConfigSupported({codec: 'hev1.1.6.L90.90'}).then(({supported}) => supported)"
+        if page.evaluate(supported):
+            all_live(page)
+            return
+        tile = page.locator("[data-camera=rear]")
+        told = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Choose a graph of H\.264, or .*"
+        until(lambda: re.fullmatch(told, tile.locator(".refused").inner_text()))
+        assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
+        assert not tile.locator(".rates").inner_text().startswith("–")  # its rates are those of what comes
+        for camera in ("front", "mast"):
+            until(lambda camera=camera: measure(page)[camera]["status"] == "live")
+            assert page.locator(f"[data-camera={camera}] .refused").is_hidden()
+        assert measure(page)["rear"]["resyncs"] <= 1  # another burst would not help
+        tile.locator(".head b").click()
+        assert "no decoder for H.265" in page.locator("#camera-panel .why-decided").inner_text()
+        received = measure(page)["rear"]["received"]
+        until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts other key pictures
+        assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
+        shot(page, "h265")
