@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import queue
+import random
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +36,19 @@ CHROMIUM_FLAGS = [
 ]
 
 
+# Below those that Linux gives to clients: one of these may be taken before a side under test has bound it.
+_PORTS = itertools.cycle(range(10_000, 30_000))
+next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes begin elsewhere
+
+
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A port that nothing is bound to, UDP or TCP, and that this process has not handed out."""
+    for port in _PORTS:
+        with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp, suppress(OSError):
+            tcp.bind(("127.0.0.1", port))
+            udp.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("unreachable")
 
 
 def answers(port: int) -> bool:

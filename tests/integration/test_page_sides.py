@@ -38,6 +38,7 @@ def sides(*overrides, log="log.video=false"):
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
 
 
+@pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
