@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,17 +25,26 @@ automatic:
 """
 
 
-def run(*command: str, **variables: str) -> str:
+def run(*command: str, cwd: Path | None = None, **variables: str) -> str:
     environment = {**os.environ, **variables}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=120, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
+def built(source: Path, made: Path) -> Path:
+    """Directory that the wheel of a package is installed into, without what it depends on."""
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+    run(*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(made), str(source))
+    (wheel,) = made.glob("*.whl")
+    run(*pip, "install", "--no-deps", "--no-index", "--target", str(made / "site"), str(wheel))
+    return made / "site"
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory that the package's wheel is installed into."""
-    made, site = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("site")
+    """The package of rules."""
+    made = tmp_path_factory.mktemp("wheel")
     copy = made / "source"
     copy.mkdir()
     for path in PACKAGE.rglob("*"):
@@ -42,11 +52,25 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
             target = copy / path.relative_to(PACKAGE)
             target.parent.mkdir(exist_ok=True)
             target.write_bytes(path.read_bytes())
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
-    run(*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(made), str(copy))
-    (wheel,) = made.glob("*.whl")
-    run(*pip, "install", "--no-deps", "--no-index", "--target", str(site), str(wheel))
-    return site
+    return built(copy, made)
+
+
+def test_the_projects_own_wheel_runs_in_an_empty_directory(tmp_path: Path) -> None:
+    copy, empty = tmp_path / "source", tmp_path / "empty"
+    empty.mkdir()
+    copy.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(CHECKOUT / name, copy)
+    for name in ("runner", "conf", "schemas"):
+        shutil.copytree(CHECKOUT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    site = built(copy, tmp_path / "made")
+    sources = (path for name in ("runner", "runner/conf", "runner/schemas") for path in (copy / name).rglob("*"))
+    files = {path.relative_to(copy) for path in sources if path.is_file() and "__pycache__" not in path.parts}
+    assert {path for path in files if not (site / path).is_file()} == set()
+    command = (sys.executable, "-m", "runner")
+    for words in (("print", "source=test", "total_kbps=3000"), ("validate",), ("--version",)):
+        run(*command, *words, cwd=empty, PYTHONPATH=str(site))
+    assert list(empty.iterdir()) == []
 
 
 def test_a_rule_of_an_installed_package_decides(installed: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rig import CHROMIUM_FLAGS, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
-UNTIMED = ("test_keyframe", "test_model", "test_report_page", "test_video_files")
+UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:

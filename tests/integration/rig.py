@@ -155,9 +155,8 @@ def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """The command line in a process of its own."""
     command = [sys.executable, "-m", "runner", *words]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **options.pop("env", {})}
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=False, env=environment, cwd=CHECKOUT, **options
-    )
+    options = {"cwd": CHECKOUT, "timeout": 120, **options}
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, **options)
 
 
 @contextmanager
@@ -167,12 +166,13 @@ def process(
     stdout: int = subprocess.PIPE,
     env: Mapping[str, str] | None = None,
     before: Sequence[str] = (),
+    cwd: Path = CHECKOUT,
 ) -> Iterator[subprocess.Popen[str]]:
     """A verb in a process of its own, killed at the end; `before` comes before its command line."""
     command = [*before, sys.executable, "-m", "runner", verb, *words]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **(env or {})}
     with subprocess.Popen(
-        command, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment, cwd=CHECKOUT
+        command, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment, cwd=cwd
     ) as child:
         try:
             yield child

@@ -210,6 +210,7 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
                 assert counted(written) == (len(units), len(units))
 
 
+@pytest.mark.alone
 def test_what_was_received_has_the_times_at_which_it_was_sent(filmed, tmp_path):
     drive, _ = filmed
     run("export", str(drive), f"output={tmp_path / 'out.mcap'}")

@@ -185,6 +185,7 @@ def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
 def test_the_demo_runs_over_every_transport(graph, tmp_path):
     words = (
         *ROBOT[:2],
+        "fps_max=15",
         "page.serve=false",
         f"graph={graph}",
         f"media.port={free_port()}",
@@ -244,13 +245,14 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
 def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     words = (
         "page.serve=false",
+        "fps_max=5",
         "source=file",
         f"source.clip={SHARED / 'video' / 'forward_highway_day_540p25_A.mp4'}",
         f"pqos.file={SHARED / 'traces' / 'raw' / 'tum_bandwidth_map.yaml'}",
         f"media.port={free_port()}",
         f"control.port={free_port()}",
     )
-    done = run("demo", *words, "duration_s=10", f"log={tmp_path}")
+    done = run("demo", *words, "duration_s=6", f"log={tmp_path}")
     assert done.returncode == 0, done.stderr
     assert "front_left" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "drive.jsonl").read_text().splitlines()]

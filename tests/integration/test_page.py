@@ -47,10 +47,11 @@ def demo():
         f"media.port={free_port()}",
         f"control.port={free_port()}",
         "duration_s=1200",
+        "source.render.seconds=6",
         "fps_max=5",  # so that counts say something on two cores that also run the tests
         *(f"cameras.{name}.width_px={width}" for name, (width, _) in SIZES.items()),
         *(f"cameras.{name}.height_px={height}" for name, (_, height) in SIZES.items()),
-        "pqos.position.speed_mps=16",  # the loop in half a minute
+        "pqos.position.speed_mps=32",  # the loop in 25 s
     )
     with process("demo", *words, stdout=subprocess.DEVNULL) as child:
         until(lambda: answers(port) or child.poll() is not None, seconds=300)  # the drive may have to be rendered
@@ -270,10 +271,9 @@ def test_a_reload_loses_nothing(page):
 def test_charts_and_map_are_drawn(page):
     page.set_viewport_size({"width": 1920, "height": 1080})
     until(lambda: page.evaluate("document.querySelectorAll('.js-plotly-plot').length >= 4"), seconds=30)
-    time.sleep(3)
     shot(page, "wide")
     page.locator("#theme").click()
-    time.sleep(1.5)
+    time.sleep(1.0)  # drawn anew
     shot(page, "wide-other-theme")
     page.locator("#theme").click()
 

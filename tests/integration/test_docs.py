@@ -1,0 +1,152 @@
+"""The commands of README and docs run as they stand there, but for the length of drives and the size of pictures."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import signal
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from drives import write_drive
+
+from rig import CHECKOUT, answers, free_port, process, run, until
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
+# `make test` runs this; test_api.py installs the wheel; a player takes a screen, and test_lines.py plays without one
+NOT_RUN = ("make", "pip", "ffplay")
+SIDES = {
+    **dict.fromkeys(("front_left", "front_center", "front_right"), (480, 260)),
+    "rear_center": (480, 300),
+    **dict.fromkeys(("top_front", "top_left", "top_right", "top_rear"), (320, 200)),
+}
+SMALL = [f"cameras.{name}.width_px={width}" for name, (width, _) in SIDES.items()]
+SMALL += [f"cameras.{name}.height_px={height}" for name, (_, height) in SIDES.items()]
+LOOP = "source.render.seconds=4"
+SHORT = {  # by verb: words that make it shorter
+    "demo": ["duration_s=2", "fps_max=5", "page.serve=false"],
+    "vehicle": ["fps_max=5"],
+    "operator": ["fps_max=5", "page.serve=false"],
+    "record": ["duration_s=1.2", "fps_max=25"],
+    "model": ["scalings=[1.0]", "bitrates_kbps=[100,400]", "plan=full"],
+}
+STANDS_FOR = {
+    "CLIP.mp4": "clip.mp4",
+    "DRIVE...": "kept other",
+    "DRIVE": "kept",
+    "/tmp/rec": "robot",
+    "newer/": "models/",
+    "source=v4l2": "source=test",
+}
+
+
+def commands(document: Path) -> list[str]:
+    """The command lines of a document: in blocks of no stated language."""
+    found, fence = [], None
+    for line in document.read_text().splitlines():
+        if line.startswith("```"):
+            fence = line if fence is None else None
+        elif fence == "```" and line.startswith(PROGRAMS):
+            found.append(line.partition("  #")[0].strip())
+    return found
+
+
+# What two documents say is run for the first.
+COMMANDS = {line: document for document in reversed(DOCUMENTS) for line in commands(document)}
+
+
+def test_commands_are_found() -> None:
+    assert len(COMMANDS) > 40
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with what the documents speak of: clips, maps, vehicles, drives."""
+    directory = tmp_path_factory.mktemp("docs")
+    frames = "videotestsrc num-buffers=30 ! video/x-raw,width=320,height=192,framerate=25/1"
+    line = [*f"{frames} ! x264enc ! mp4mux ! filesink location={directory / 'clip.mp4'}".split()]
+    subprocess.run(["gst-launch-1.0", "-q", *line], check=True, timeout=60)
+    shutil.copy(directory / "clip.mp4", directory / "drive.mp4")
+    _, *rows = (CHECKOUT / "conf" / "maps" / "driving_test.csv").read_text().split()
+    matrix = (
+        f"bandwidth_map: !!opencv-matrix\n   rows: {len(rows)}\n   cols: 3\n   dt: d\n   data: [ {', '.join(rows)} ]\n"
+    )
+    (directory / "tum_bandwidth_map.yaml").write_text(f"%YAML:1.0\n---\n{matrix}")
+    cameras = directory / "my_vehicles" / "cameras"
+    cameras.mkdir(parents=True)
+    text = (CHECKOUT / "conf" / "cameras" / "rear_center.yaml").read_text()
+    (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
+    assert run("demo", *SHORT["demo"], *SMALL, LOOP, *ports(), f"log={directory / 'kept'}").returncode == 0
+    write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
+    shutil.copytree(directory / "other", directory / "drives" / "monday")
+    return directory
+
+
+def ports() -> tuple[str, str]:
+    return f"media.port={free_port()}", f"control.port={free_port()}"
+
+
+def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
+    """A command line of tod-runner, cut short. words: further ones of those verbs that stream."""
+    for text, meaning in STANDS_FOR.items():
+        line = line.replace(text, meaning)
+    _, verb, *rest = shlex.split(line)
+    if verb not in SHORT or rest[:1] == ["compare"]:
+        return [verb, *rest]
+    rest = [word for word in rest if not word.startswith("duration_s=")]
+    robot = "vehicle=delivery_robot" in rest
+    own = [word for word in SHORT[verb] if not any(given.startswith(word.partition("=")[0]) for given in rest)]
+    if robot:  # its pictures are large
+        own = ["fps_max=5" if word.startswith("fps_max=") else word for word in own]
+    rendered = not any(word.startswith("source=") for word in rest) or "source=synthetic" in rest
+    own += [LOOP] if rendered and verb != "operator" else []
+    small = SMALL if not robot and (verb != "model" or "source=synthetic" in rest) else []
+    small = [word for word in small if "~cameras.rear_center" not in rest or "rear_center" not in word]
+    return [verb, *rest, *own, *small, *(words if verb in ("demo", "vehicle", "operator") else ())]
+
+
+def check_sides(line: str, place: Path) -> None:
+    """Vehicle, operator or both, beside a broker, until each has printed something; then Ctrl-C."""
+    words = ports()
+    with private_broker(Endpoint("127.0.0.1", int(words[1].partition("=")[2]))), ExitStack() as stack:
+        running = []
+        for number, part in enumerate(line.split(";")):
+            verb, *rest = adapted(part, words)
+            said = stack.enter_context((place / f"said.{number}").open("w+"))
+            running.append(stack.enter_context(process(verb, *rest, stdout=said.fileno(), cwd=place)))
+        until(lambda: all((place / f"said.{number}").stat().st_size for number in range(len(running))), seconds=30)
+        for child in running:
+            child.send_signal(signal.SIGINT)
+            assert child.wait(timeout=30) in (0, 130), line
+
+
+def check_shell(lines: list[str], place: Path) -> None:
+    """Lines for a shell, beside a demo whose broker they speak to."""
+    words = ports()
+    port = words[1].partition("=")[2]
+    with process("demo", *SHORT["demo"], "duration_s=60", *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL):
+        until(lambda: answers(int(port)), seconds=60)
+        script = "\n".join(["set -e", *lines]).replace("-p 1884", f"-p {port}")
+        subprocess.run(["bash", "-c", script], cwd=place, check=True, timeout=60)
+
+
+@pytest.mark.parametrize("document", dict.fromkeys(reversed(COMMANDS.values())), ids=lambda path: path.stem)
+def test_commands_run(document: Path, place: Path) -> None:
+    lines = [line for line in commands(document) if COMMANDS[line] == document and not line.startswith(NOT_RUN)]
+    if shell := [line for line in lines if not line.startswith("tod-runner")]:
+        check_shell(shell, place)
+    for number, line in enumerate(lines):
+        if line.startswith(("tod-runner vehicle", "tod-runner operator")):
+            check_sides(line, place)
+        elif line.startswith("tod-runner"):
+            verb, *rest = adapted(line.replace("OUT", f"{document.stem}.{number}"), ports())
+            done = run(verb, *rest, cwd=place)
+            if "conf=my_vehicles" in rest:
+                assert (done.returncode, done.stderr in document.read_text()) == (2, True)
+            else:
+                assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
