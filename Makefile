@@ -20,8 +20,8 @@ test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 timed: $(TEST_READY)
-	$(BIN)/pytest -m timed -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
-	$(BIN)/pytest -m alone --durations=10
+	$(BIN)/pytest -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
+	$(BIN)/pytest -m alone -n 2 --dist loadfile --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
@@ -31,14 +31,14 @@ golden: $(TEST_READY)
 	$(BIN)/python tests/golden
 
 units: $(TEST_READY)
-	$(BIN)/pytest -m "not timed and not alone" -n auto --dist worksteal --durations=30
+	$(BIN)/pytest -m "not timed and not alone and not soak" -n auto --dist worksteal --durations=30
 
 check: lint javascript
-	$(BIN)/pytest -m "not gst and not slow" -n auto --dist worksteal
+	$(BIN)/pytest -m "not gst and not slow and not soak" -n auto --dist worksteal
 
 # Branches of what decides and of what reads configuration; make test runs far more of the rest.
 coverage: $(TEST_READY)
-	$(BIN)/pytest -m "not gst" -n auto --dist loadfile --cov --cov-report=
+	$(BIN)/pytest -m "not gst and not soak" -n auto --dist loadfile --cov --cov-report=
 	$(BIN)/coverage report --include='runner/core/*,runner/configuration/*,runner/graph.py' --fail-under=95
 
 lint: $(TEST_READY)
@@ -62,6 +62,7 @@ bench: $(TEST_READY)
 	$(BIN)/python bench/pqos_map.py
 
 soak: $(TEST_READY)
+	$(if $(PARTS),,$(BIN)/pytest -m soak)
 	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)
 
 setup: $(READY)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from drives import write_drive
+from helpers import Command
 
 from rig import CHECKOUT, answers, free_port, process, run, until
 from runner.core.model import Endpoint
@@ -20,13 +21,12 @@ DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
 # `make test` runs this; test_api.py installs the wheel; a player takes a screen, and test_lines.py plays without one
 NOT_RUN = ("make", "pip", "ffplay")
-SIDES = {
-    **dict.fromkeys(("front_left", "front_center", "front_right"), (480, 260)),
-    "rear_center": (480, 300),
-    **dict.fromkeys(("top_front", "top_left", "top_right", "top_rear"), (320, 200)),
-}
-SMALL = [f"cameras.{name}.width_px={width}" for name, (width, _) in SIDES.items()]
-SMALL += [f"cameras.{name}.height_px={height}" for name, (_, height) in SIDES.items()]
+FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
+SMALL = [
+    f"cameras.{name}.{key}"
+    for name in ("front_left", "front_center", "front_right", "rear_center")
+    for key in ("width_px=480", "height_px=260")
+]
 LOOP = "source.render.seconds=4"
 SHORT = {  # by verb: words that make it shorter
     "demo": ["duration_s=2", "fps_max=5", "page.serve=false"],
@@ -81,7 +81,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras.mkdir(parents=True)
     text = (CHECKOUT / "conf" / "cameras" / "rear_center.yaml").read_text()
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
-    assert run("demo", *SHORT["demo"], *SMALL, LOOP, *ports(), f"log={directory / 'kept'}").returncode == 0
+    assert run("demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}").returncode == 0
     write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
     shutil.copytree(directory / "other", directory / "drives" / "monday")
     return directory
@@ -92,7 +92,7 @@ def ports() -> tuple[str, str]:
 
 
 def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
-    """A command line of tod-runner, cut short. words: further ones of those verbs that stream."""
+    """A command line of tod-runner, cut short, of four cameras. words: further ones of those verbs that stream."""
     for text, meaning in STANDS_FOR.items():
         line = line.replace(text, meaning)
     _, verb, *rest = shlex.split(line)
@@ -103,11 +103,15 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     own = [word for word in SHORT[verb] if not any(given.startswith(word.partition("=")[0]) for given in rest)]
     if robot:  # its pictures are large
         own = ["fps_max=5" if word.startswith("fps_max=") else word for word in own]
-    rendered = not any(word.startswith("source=") for word in rest) or "source=synthetic" in rest
-    own += [LOOP] if rendered and verb != "operator" else []
-    small = SMALL if not robot and (verb != "model" or "source=synthetic" in rest) else []
-    small = [word for word in small if "~cameras.rear_center" not in rest or "rear_center" not in word]
-    return [verb, *rest, *own, *small, *(words if verb in ("demo", "vehicle", "operator") else ())]
+    if "source=synthetic" in rest:
+        own.append(LOOP)
+    elif verb != "model" and not any(word.startswith("source=") for word in rest):
+        own.append("source=test")  # a drive is rendered for `kept` once
+    if not robot:
+        own += FEWER
+        small = SMALL if verb != "model" or "source=synthetic" in rest else []
+        own += [word for word in small if "~cameras.rear_center" not in rest or "rear_center" not in word]
+    return [verb, *rest, *own, *(words if verb in ("demo", "vehicle", "operator") else ())]
 
 
 def check_sides(line: str, place: Path) -> None:
@@ -129,24 +133,30 @@ def check_shell(lines: list[str], place: Path) -> None:
     """Lines for a shell, beside a demo whose broker they speak to."""
     words = ports()
     port = words[1].partition("=")[2]
-    with process("demo", *SHORT["demo"], "duration_s=60", *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL):
+    with process(
+        "demo", *SHORT["demo"], "duration_s=60", *FEWER, *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL
+    ):
         until(lambda: answers(int(port)), seconds=60)
         script = "\n".join(["set -e", *lines]).replace("-p 1884", f"-p {port}")
         subprocess.run(["bash", "-c", script], cwd=place, check=True, timeout=60)
 
 
 @pytest.mark.parametrize("document", dict.fromkeys(reversed(COMMANDS.values())), ids=lambda path: path.stem)
-def test_commands_run(document: Path, place: Path) -> None:
+def test_commands_run(document: Path, place: Path, tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
     lines = [line for line in commands(document) if COMMANDS[line] == document and not line.startswith(NOT_RUN)]
     if shell := [line for line in lines if not line.startswith("tod-runner")]:
         check_shell(shell, place)
     for number, line in enumerate(lines):
         if line.startswith(("tod-runner vehicle", "tod-runner operator")):
             check_sides(line, place)
+        elif line.startswith(("tod-runner demo", "tod-runner record")):
+            done = run(*adapted(line.replace("OUT", f"{document.stem}.{number}"), ports()), cwd=place)
+            assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
         elif line.startswith("tod-runner"):
-            verb, *rest = adapted(line.replace("OUT", f"{document.stem}.{number}"), ports())
-            done = run(verb, *rest, cwd=place)
-            if "conf=my_vehicles" in rest:
-                assert (done.returncode, done.stderr in document.read_text()) == (2, True)
+            words = adapted(line.replace("OUT", f"{document.stem}.{number}"))
+            status, out, err = tod(*words)
+            if "conf=my_vehicles" in words:
+                assert (status, err in document.read_text()) == (2, True)
             else:
-                assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+                assert status == 0, f"{line}\n{out}{err}"

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TEST = Path(__file__).parents[1] / "integration" / "test_page.py"
+TEST = Path(__file__).parents[1] / "integration" / "test_page_sides.py"
 
 
 def soak(seed: int, scale: float) -> list[str]:
