@@ -18,6 +18,14 @@ from runner.mqtt.broker import private_broker
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
 
+LONGEST = ("test_docs", "test_page", "test_live", "test_ends", "test_page_sides", "test_control")  # begun first
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
 def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("gst")
     if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
