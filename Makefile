@@ -31,7 +31,7 @@ golden: $(TEST_READY)
 	$(BIN)/python tests/golden
 
 units: $(TEST_READY)
-	$(BIN)/pytest -m "not timed and not alone and not soak" -n auto --dist worksteal --durations=30
+	$(BIN)/pytest -m "not timed and not alone and not soak" -n auto --dist loadfile --durations=30
 
 check: lint javascript
 	$(BIN)/pytest -m "not gst and not slow and not soak" -n auto --dist worksteal

@@ -21,6 +21,7 @@ DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
 # `make test` runs this; test_api.py installs the wheel; a player takes a screen, and test_lines.py plays without one
 NOT_RUN = ("make", "pip", "ffplay")
+LONG = ("tod-runner demo experiment=bottleneck", "tod-runner model vehicle=")  # `make soak` runs these
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
 SMALL = [
     f"cameras.{name}.{key}"
@@ -142,9 +143,12 @@ def check_shell(lines: list[str], place: Path) -> None:
 
 
 @pytest.mark.parametrize("document", dict.fromkeys(reversed(COMMANDS.values())), ids=lambda path: path.stem)
-def test_commands_run(document: Path, place: Path, tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("long", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["short", "long"])
+def test_commands_run(document: Path, long: bool, place: Path, tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
     lines = [line for line in commands(document) if COMMANDS[line] == document and not line.startswith(NOT_RUN)]
+    if not long:
+        lines = [line for line in lines if not line.startswith(LONG)]
     if shell := [line for line in lines if not line.startswith("tod-runner")]:
         check_shell(shell, place)
     for number, line in enumerate(lines):

@@ -105,9 +105,10 @@ def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
             assert frames.next(5)
 
 
+@pytest.mark.soak
 def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
     """`make soak` does it for longer."""
-    turns = int(os.environ.get("TOD_NEW_SIZES", "12"))
+    turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
     graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
     with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
