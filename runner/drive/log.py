@@ -48,7 +48,7 @@ class Log:
     directory  None: nothing is kept
     config     the composed configuration; passwords in addresses are not kept
     versions   of what the drive is made with, by name
-    report     called, from a thread of the log, when the file cannot be written, and when it can again
+    on_report  called, from a thread of the log, when the file cannot be written, and when it can again
     raises     UserError where the directory holds a drive already, or cannot be written
 
     Lines wait in a bounded queue for a thread that writes each with one system call, so that a killed process loses at
@@ -62,10 +62,10 @@ class Log:
         side: str,
         config: Mapping[str, Any],
         versions: Mapping[str, str],
-        report: Callable[[str], None],
+        on_report: Callable[[str], None],
     ) -> None:
         self._file = None if directory is None else _File(directory / FILES[side], _create(directory, side))
-        self._side, self._config, self._versions, self._report = side, config, versions, report
+        self._side, self._config, self._versions, self._on_report = side, config, versions, on_report
         self._lock = threading.Lock()
         self._began: float | None = None
         self._past: float | None = None  # of a drive of the past, the time of its last line
@@ -84,7 +84,7 @@ class Log:
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
             if self._file and at is None:
-                self._writer = _Writer(self._file, self._dropped, self._report)
+                self._writer = _Writer(self._file, self._dropped, self._on_report)
             for line in (line_to_json(first), *self._early):
                 self._put(line)
 
@@ -187,12 +187,12 @@ class _File:
 class _Writer:
     """Writes lines in a thread of its own, so that no disk holds up the thread that has something to log.
 
-    dropped  makes the line that counts lines which found the queue full
-    report   called when the file cannot be written, and when it can again
+    dropped    makes the line that counts lines which found the queue full
+    on_report  called when the file cannot be written, and when it can again
     """
 
-    def __init__(self, file: _File, dropped: Callable[[int], bytes], report: Callable[[str], None]) -> None:
-        self._file, self._dropped, self._report = file, dropped, report
+    def __init__(self, file: _File, dropped: Callable[[int], bytes], on_report: Callable[[str], None]) -> None:
+        self._file, self._dropped, self._on_report = file, dropped, on_report
         self._queue: queue.Queue[bytes | None] = queue.Queue(QUEUED_LINES)
         self._lost = 0
         self._closing = threading.Event()
@@ -218,7 +218,7 @@ class _Writer:
                 self._queue.put(data, timeout=max(0.0, until - time.monotonic()))
         self._thread.join(max(0.0, until - time.monotonic()))
         if waiting := sum(bool(data) for data in self._queue.queue):
-            self._report(f"{self._file.path.name}: {waiting} lines were not written")
+            self._on_report(f"{self._file.path.name}: {waiting} lines were not written")
 
     def _run(self) -> None:
         while (data := self._queue.get()) is not None:
@@ -231,11 +231,11 @@ class _Writer:
         why = self._file.append(data)
         if why is None:
             return True
-        self._report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
+        self._on_report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
         while self._file.append(data):
             if self._closing.wait(RETRY_S):
                 return False
-        self._report(f"the log continues: {self._file.path.name}")
+        self._on_report(f"the log continues: {self._file.path.name}")
         return True
 
 

@@ -53,14 +53,14 @@ def write_mcap(
     drive: Drive,
     file: BinaryIO,
     read_video: ReadVideo,
-    warn: Callable[[str], None],
+    on_warning: Callable[[str], None],
     progress: Callable[[float], None] = lambda done: None,
 ) -> int:
     """All of a drive in the order of time, in compressed chunks with checksums.
 
     file        takes the bytes
     read_video  gives the pictures of a file
-    warn        called with a line on what is left out
+    on_warning  called with a line on what is left out
     progress    called now and then with the share that is done
     returns     number of messages
     raises      RunError where the file cannot be written
@@ -76,7 +76,7 @@ def write_mcap(
         for name, side in drive.sides.items():
             writer.write_metadata(f"{name} began", _texts(line_to_json(side.began)))
         first, last = _span(drive)
-        for message in heapq.merge(*_streams(drive, channels, read_video, warn), key=lambda m: m.ns):
+        for message in heapq.merge(*_streams(drive, channels, read_video, on_warning), key=lambda m: m.ns):
             message.write()
             out.check()
             count += 1
@@ -196,7 +196,7 @@ def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
 
 
 def _streams(
-    drive: Drive, channels: _Channels, read_video: ReadVideo, warn: Callable[[str], None]
+    drive: Drive, channels: _Channels, read_video: ReadVideo, on_warning: Callable[[str], None]
 ) -> Iterator[Iterator[McapMessage]]:
     """Messages by where they come from, each in the order of time."""
     for name, side in drive.sides.items():
@@ -204,7 +204,7 @@ def _streams(
         yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
         for camera, files in _files(side).items():
             known = _captures(side, camera)
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, warn)
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, on_warning)
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
@@ -250,7 +250,7 @@ def _pictures(
     known: Sequence[int],
     channels: _Channels,
     read_video: ReadVideo,
-    warn: Callable[[str], None],
+    on_warning: Callable[[str], None],
 ) -> Iterator[McapMessage]:
     """The frames of one camera on one side, at the times of their capture.
 
@@ -261,7 +261,7 @@ def _pictures(
     for line in files:
         first = round(line.captured * SECOND_NS)
         if Path(line.file).is_absolute() or ".." in Path(line.file).parts:
-            warn(f"{line.file}: lies outside the drive and was left out")
+            on_warning(f"{line.file}: lies outside the drive and was left out")
             continue
         try:
             offset = 0
@@ -271,7 +271,7 @@ def _pictures(
                 last = max(first + unit.after_ns + offset, last + 1)
                 yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
-            warn(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
+            on_warning(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
 
 
 def _captures(side: Side, camera: str) -> list[int]:

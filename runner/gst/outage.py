@@ -13,11 +13,11 @@ GATHER_MS = 300
 class Outage:
     """The present outage of one camera. Times are s by the monotonic clock.
 
-    report  called with a sentence for each new reason, and one at the end
+    on_report  called with a sentence for each new reason, and one at the end
     """
 
-    def __init__(self, report: Callable[[str], None]) -> None:
-        self._report = report
+    def __init__(self, on_report: Callable[[str], None]) -> None:
+        self._on_report = on_report
         self._reasons: list[str] = []
         self._began = 0.0
 
@@ -35,23 +35,23 @@ class Outage:
             self._began = since
         if why not in self._reasons:
             self._reasons.append(why)
-            self._report(why)
+            self._on_report(why)
 
     def over(self, now: float) -> None:
         """The camera works."""
         if self._reasons:
-            self._report(f"works again after {now - self._began:.0f} s")
+            self._on_report(f"works again after {now - self._began:.0f} s")
         self._reasons.clear()
 
 
 class Gathered:
     """Reports of several cameras that say the same at about the same time, made one: `front, rear: no frame for 2 s`.
 
-    report  called from GLib's thread: cameras, what happened to them
+    on_report  called from GLib's thread: cameras, what happened to them
     """
 
-    def __init__(self, report: Callable[[str, str], None]) -> None:
-        self._report = report
+    def __init__(self, on_report: Callable[[str, str], None]) -> None:
+        self._on_report = on_report
         self._lock = threading.Lock()
         self._cameras: dict[str, list[str]] = {}  # by report
 
@@ -69,5 +69,5 @@ class Gathered:
         with self._lock:
             gathered, self._cameras = self._cameras, {}
         for what, cameras in gathered.items():
-            self._report(", ".join(cameras), what)
+            self._on_report(", ".join(cameras), what)
         return False

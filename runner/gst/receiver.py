@@ -72,21 +72,21 @@ class Receiver:
     def __init__(
         self,
         plan: Plan,
-        report: Callable[[str, str], None],
+        on_report: Callable[[str, str], None],
         on_unit: OnUnit | None = None,
         on_picture: OnPicture | None = None,
         arrivals: bool = False,
         video: VideoFiles | None = None,
         operator: str = "",
     ) -> None:
-        self._report, self._video, self._operator = report, video, operator
+        self._on_report, self._video, self._operator = on_report, video, operator
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
-        self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: report(name, what))
+        self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # what earlier pipelines have counted
         self._latency_ms: float | None = None
         self._foreign_reported = False
@@ -108,7 +108,7 @@ class Receiver:
         received = replace(self._count(), arrivals=self._arrived())
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
-            self._report(self._name, "packets from other hosts than the vehicle are dropped")
+            self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
         now = time.monotonic()
         if not self.should_send:
             self._silent = now
@@ -140,7 +140,7 @@ class Receiver:
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
-            VideoFile(self._video, self._name, "operator", _came, self._report).follow(pipeline)
+            VideoFile(self._video, self._name, "operator", _came, self._on_report).follow(pipeline)
         if self._on_unit or self._arrivals is not None:
             self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
         if self._on_picture:
@@ -170,7 +170,7 @@ class Receiver:
                 self._filter = SenderFilter(Gst.Uri.from_string(location).get_host())
             self._filter.attach(taken.get_fd())
         except OSError as error:
-            self._report(self._name, f"packets from other hosts than the vehicle are not dropped: {error}")
+            self._on_report(self._name, f"packets from other hosts than the vehicle are not dropped: {error}")
 
     def _close_filter(self) -> None:
         if self._filter:

@@ -25,13 +25,15 @@ class SupervisedPipeline:
     All methods are called in the thread of GLib's main loop. State changes run in threads of their own: an element that
     locks up holds up nobody else.
 
-    on_built  called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
-    report    called with each reason once, until the pipeline works again
-    rebuilt   how often a pipeline that had worked was built anew
+    on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
+    on_report  called with each reason once, until the pipeline works again
+    rebuilt    how often a pipeline that had worked was built anew
     """
 
-    def __init__(self, launch: str, on_built: Callable[[Gst.Pipeline], Gst.Pad], report: Callable[[str], None]) -> None:
-        self._launch, self._on_built, self._report = launch, on_built, report
+    def __init__(
+        self, launch: str, on_built: Callable[[Gst.Pipeline], Gst.Pad], on_report: Callable[[str], None]
+    ) -> None:
+        self._launch, self._on_built, self._on_report = launch, on_built, on_report
         self._pipeline: Gst.Pipeline | None = None
         self._change: threading.Thread | None = None  # the last change of state of the last pipeline
         self._retry = 0
@@ -39,7 +41,7 @@ class SupervisedPipeline:
         self._begun = time.monotonic()  # the last attempt
         self._lost = self._begun  # since when nothing has worked
         self._works = self._worked = False  # this pipeline, any pipeline
-        self._outage = Outage(report)
+        self._outage = Outage(on_report)
         self.rebuilt = 0
 
     def start(self) -> None:
@@ -62,7 +64,7 @@ class SupervisedPipeline:
             self._retry = 0
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
-            self._change = set_state_aside(self._pipeline, Gst.State.NULL, lambda: self._report(HUNG), self._change)
+            self._change = set_state_aside(self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change)
             self._pipeline = None
 
     def restart(self, why: str) -> None:
@@ -108,11 +110,11 @@ class CameraCaller:
     build  makes a `CameraPipeline` of each that was built
     """
 
-    def __init__(self, plan: Plan, build: Build, report: Callable[[str, str], None]) -> None:
+    def __init__(self, plan: Plan, build: Build, on_report: Callable[[str, str], None]) -> None:
         self._plan, self._build = plan, build
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
-        self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: report(name, what))
+        self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: on_report(name, what))
 
     def start(self) -> None:
         self._supervised.start()

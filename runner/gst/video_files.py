@@ -38,16 +38,16 @@ class VideoFile:
     Whatever fails here ends the file, is reported once, and leaves the stream alone. After the first frame no Python
     runs. Elements are looked up when they are needed: whom a probe keeps alive must not keep alive the pipeline.
 
-    side      vehicle or operator
-    captured  when a frame was captured; asked between queue and parser
-    report    called with camera and what failed
+    side       vehicle or operator
+    captured   when a frame was captured; asked between queue and parser
+    on_report  called with camera and what failed
     """
 
     def __init__(
-        self, files: VideoFiles, camera: str, side: str, captured: Captured, report: Callable[[str, str], None]
+        self, files: VideoFiles, camera: str, side: str, captured: Captured, on_report: Callable[[str, str], None]
     ) -> None:
         self._files, self._camera, self._side = files, camera, side
-        self._captured, self._report = captured, report
+        self._captured, self._on_report = captured, on_report
         self._came: dict[int, float] = {}  # by time in the stream, ns: when it was captured
         self._begun = self._failed = self._late = False
 
@@ -100,14 +100,14 @@ class VideoFile:
         parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
         if not self._failed:
             self._failed = True
-            self._report(self._camera, f"no video is kept: {why}")
+            self._on_report(self._camera, f"no video is kept: {why}")
 
     def _on_overrun(self, queue: Gst.Element) -> None:
         """From the stream's thread, when the queue is full for the first time."""
         queue.set_property("silent", True)  # it need not say so again
         if not (self._late or self._failed):
             self._late = True
-            self._report(self._camera, "the disk is too slow: frames are missing in the video file")
+            self._on_report(self._camera, "the disk is too slow: frames are missing in the video file")
 
 
 def concerns_file(message: Gst.Message) -> bool:

@@ -28,16 +28,16 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     Until the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
-    report  called with what happened
+    on_report  called with what happened
     """
 
-    def __init__(self, plan: Plan, report: Callable[[str], None]) -> None:
+    def __init__(self, plan: Plan, on_report: Callable[[str], None]) -> None:
         super().__init__(name="watched-source")
         assert plan.frozen_s is not None
         self._frozen_s = plan.frozen_s
         self._launch, self._last = launch(plan.source), plan.source[-1].name
-        self._report = report
-        self.outage = Outage(report)
+        self._on_report = on_report
+        self.outage = Outage(on_report)
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
@@ -70,7 +70,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
                 GLib.source_remove(self._timer)
                 self._timer = 0
                 self._empty()
-                self.outage, self._attempts = Outage(self._report), 0
+                self.outage, self._attempts = Outage(self._on_report), 0
         return Gst.Bin.do_change_state(self, transition)
 
     def do_handle_message(self, message: Gst.Message) -> None:
@@ -151,7 +151,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child, self._child = self._child, None
         if child is not None:
             self.remove(child)
-            set_state_aside(child, Gst.State.NULL, lambda: self._report(f"source: {HUNG}"))
+            set_state_aside(child, Gst.State.NULL, lambda: self._on_report(f"source: {HUNG}"))
 
     # ------------------------------------------------------------------------------------------------------------------
 

@@ -54,7 +54,7 @@ class ControlLink:
     will          topic and message that the broker publishes when this side is lost
     listen        by topic filter, what takes its messages
     on_connected  called with True when messages for this side will reach it, with False when the connection is lost
-    report        called with one line when the broker cannot be reached, once for each reason, and when it can again
+    on_report     called with one line when the broker cannot be reached, once for each reason, and when it can again
 
     A message whose callback raises is reported, counted in `dropped`, and ends nothing.
     """
@@ -65,10 +65,10 @@ class ControlLink:
         will: tuple[str, JsonObject],
         listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
-        report: Callable[[str], None],
+        on_report: Callable[[str], None],
     ) -> None:
         self._broker, self._will, self._listen = broker, will, listen
-        self._on_connected, self._report = on_connected, report
+        self._on_connected, self._on_report = on_connected, on_report
         self._connection_fault: str | None = None  # why there is no connection, as reported
         self._faults: set[str] = set()  # as reported
         self.dropped = 0
@@ -135,7 +135,7 @@ class ControlLink:
         fault = f"a message on {message.topic} was dropped: {why}"
         if fault not in self._faults and len(self._faults) < FAULTS:
             self._faults.add(fault)
-            self._report(fault)
+            self._on_report(fault)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if topic.endswith("/telemetry") else 1
@@ -153,7 +153,7 @@ class ControlLink:
             return
         if self._connection_fault:
             self._connection_fault = None
-            self._report(f"connected to the MQTT broker at {self._broker}")
+            self._on_report(f"connected to the MQTT broker at {self._broker}")
         self._listening.set()
         self._on_connected(True)
 
@@ -170,7 +170,7 @@ class ControlLink:
         why = str(getattr(error, "strerror", None) or error).lower()
         if why != self._connection_fault and not self._closing.is_set():
             self._connection_fault = why
-            self._report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
+            self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
 
 
 def _kept(topic: str) -> bool:

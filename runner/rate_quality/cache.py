@@ -26,11 +26,11 @@ def file_digest(path: Path) -> str:
 class Cache:
     """JSON documents by digest, one small file each, written at once or not at all.
 
-    warn  called with a line on a file that cannot be used; it is made again
+    on_warning  called with a line on a file that cannot be used; it is made again
     """
 
-    def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
-        self._directory, self._warn = directory, warn
+    def __init__(self, directory: Path, on_warning: Callable[[str], None]) -> None:
+        self._directory, self._on_warning = directory, on_warning
 
     def load(self, key: str) -> dict[str, Any] | None:
         path = self._path(key)
@@ -39,10 +39,10 @@ class Cache:
         except FileNotFoundError:
             return None
         except (ValueError, OSError) as error:
-            self._warn(f"{path}: cannot be read ({error}), measured again")
+            self._on_warning(f"{path}: cannot be read ({error}), measured again")
             return None
         if not isinstance(document, dict):
-            self._warn(f"{path}: is not a cache file, measured again")
+            self._on_warning(f"{path}: is not a cache file, measured again")
             return None
         return document
 

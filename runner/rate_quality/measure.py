@@ -39,7 +39,7 @@ def measure(
     sequences: Mapping[str, Path],
     output: Path,
     progress: Progress,
-    say: Callable[[str], None],
+    on_note: Callable[[str], None],
 ) -> Iterator[str]:
     """Measure and write models; yields a line for each.
 
@@ -47,11 +47,11 @@ def measure(
     raises     UserError for what cannot be measured, RunError where a run fails; finished models stay
     """
     metrics = tuple(_metric(study, name) for name in study.metrics)
-    cache = Cache(cache_directory() / "points", say)
+    cache = Cache(cache_directory() / "points", on_note)
     alone = {name: (name,) for name in sequences if not any(name in members for members in study.pool.values())}
     models = {**alone, **study.pool}
     _check_output(output, models)
-    clips = {name: survey(path, cache, say) for name, path in sequences.items()}
+    clips = {name: survey(path, cache, on_note) for name, path in sequences.items()}
     parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
         for model, members in models.items():

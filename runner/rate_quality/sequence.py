@@ -61,11 +61,11 @@ def decoding(path: str, fps: Fraction) -> str:
     return f'filesrc location="{quoted}" ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}'
 
 
-def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
+def survey(path: Path, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
     """Look a clip through.
 
-    say     called with a line: this takes a while
-    raises  UserError where it cannot be used
+    on_note  called with a line: this takes a while
+    raises   UserError where it cannot be used
     """
     from runner.apply import discover
 
@@ -75,7 +75,7 @@ def survey(path: Path, cache: Cache, say: Callable[[str], None]) -> Sequence:
     key = digest("survey", SURVEY_VERSION, sha256)
     known = cache.load(key)
     if known is None:
-        say(f"looking through {path}")
+        on_note(f"looking through {path}")
         known = _look_through(path, form.fps)
         cache.store(key, known)
     properties = asdict(form) | {"lossless": form.lossless or _recorded(path)}

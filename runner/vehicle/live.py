@@ -79,7 +79,7 @@ class LiveVehicle:
             self.run()
         except RunError as error:
             self.failure = error
-            self.loop.report(str(error))
+            self.loop.on_report(str(error))
 
     def push(self, camera: str, frame: Any) -> bool:
         """One frame of a camera whose source is `appsrc`, captured now.
@@ -108,7 +108,7 @@ class LiveVehicle:
             if (silent > STUCK_S) != stuck:
                 stuck = not stuck
                 doing = self.loop.busy_with or "nothing"
-                self.loop.report(f"the control loop hangs in {doing}" if stuck else "the control loop runs again")
+                self.loop.on_report(f"the control loop hangs in {doing}" if stuck else "the control loop runs again")
 
 
 class _Console:
@@ -140,8 +140,8 @@ class _VehicleControl:
     Nothing is published before it is known that no other vehicle of this name is at the broker.
     """
 
-    def __init__(self, vehicle: Vehicle, document: Mapping[str, Any], report: Callable[[str], None]) -> None:
-        self._name, self._report = vehicle.name, report
+    def __init__(self, vehicle: Vehicle, document: Mapping[str, Any], on_report: Callable[[str], None]) -> None:
+        self._name, self._on_report = vehicle.name, on_report
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._alone = threading.Event()
@@ -152,7 +152,9 @@ class _VehicleControl:
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        self._link = ControlLink(vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, report)
+        self._link = ControlLink(
+            vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, on_report
+        )
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -216,7 +218,7 @@ class _VehicleControl:
         own = run == self._settings.run
         if self._alone.is_set() and not message.retained and not own and run not in self._others:
             self._others.add(run)
-            self._report(f"another vehicle named {self._name} connected to the broker: operators see both")
+            self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
 @contextmanager

@@ -65,8 +65,8 @@ class _PendingReply(NamedTuple):
 class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` what they have.
 
-    publish  called with the state (decided and applied) whenever it changed, and telemetry a few times a second
-    report   called with one line on what happened and what came of it
+    publish    called with the state (decided and applied) whenever it changed, and telemetry a few times a second
+    on_report  called with one line on what happened and what came of it
 
     An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
     something (time.monotonic), `busy_with` what it is doing.
@@ -78,7 +78,7 @@ class ControlLoop:
     track: Track | None
     log: Log
     publish: Callable[[VehicleState | Telemetry], None]
-    report: Callable[[str], None]
+    on_report: Callable[[str], None]
     refused: int = 0
     errors: int = 0
     beat: float = 0.0
@@ -177,7 +177,7 @@ class ControlLoop:
         now = self._now()
         if now - self._reported.get(text, -REPEAT_S) >= REPEAT_S:
             self._reported = {t: at for t, at in self._reported.items() if now - at < REPEAT_S} | {text: now}
-            self.report(text)
+            self.on_report(text)
 
     def _now(self) -> float:
         return round(time.monotonic() - self._began, 6)
@@ -190,7 +190,7 @@ class ControlLoop:
             self._take(replace(self.track.at(t), t=t))
         self._take(ClockAdvanced(t=t))
         for fault in self.applier.faults():
-            self.report(fault)
+            self.on_report(fault)
         self._ticks += 1
         if self._ticks % TELEMETRY_TICKS == 0:
             self._publish_measured(t)
@@ -243,9 +243,9 @@ class ControlLoop:
         if now != before:
             self.applier.give_control(self._operators.in_control)
         for name in sorted(now - before):
-            self.report(f"operator {name} is present")
+            self.on_report(f"operator {name} is present")
         for name in sorted(before - now):
-            self.report(f"operator {name} {why}")
+            self.on_report(f"operator {name} {why}")
         if now and not before:
             self._take(OperatorConnected(t=t))
         elif before and not now:
@@ -264,7 +264,7 @@ class ControlLoop:
         prediction = self.pqos.observe(event)
         for warning in self.pqos.warnings[self._warned :]:
             self._warned += 1
-            self.report(warning)
+            self.on_report(warning)
         if prediction is not None:
             self._take_run(step(self.vehicle, self._run, prediction), prediction)
 
@@ -281,7 +281,7 @@ class ControlLoop:
         if after.fault:
             self._report_once(f"{after.fault}; the decision before stays in force")
         elif before.fault:
-            self.report("the rules decide again")
+            self.on_report("the rules decide again")
         if after.refused:
             self.refused += 1
             self._report_once(f"refused: {after.refused}")
@@ -297,7 +297,7 @@ class ControlLoop:
         for name, now in self._run.decision.settings.items():
             was = before.decision.settings[name]
             if (was.scaling, was.sending) != (now.scaling, now.sending):
-                self.report(f"{self._cause} -> {name}: {now.reason}")
+                self.on_report(f"{self._cause} -> {name}: {now.reason}")
 
     def _publish_state(self) -> None:
         """Publish what is decided and what is applied, where either changed; answer requests that are applied now."""
