@@ -14,7 +14,7 @@ import pytest
 
 from runner.system.signals import END_S, LIFELINE
 
-pytestmark = pytest.mark.slow  # starts and ends processes
+pytestmark = [pytest.mark.slow, pytest.mark.timed]  # starts and ends processes, within a limit
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: for ever

@@ -82,6 +82,7 @@ class Receiver:
         self._on_report, self._video, self._operator = on_report, video, operator
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
+        self._sampled = 0  # arrivals that have been read
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
@@ -105,7 +106,8 @@ class Receiver:
 
     def sample(self) -> Reception:
         """What has come so far; asks for the latency of the next frame."""
-        received = replace(self._count(), arrivals=self._arrived())
+        received = self._count()
+        received = replace(received, arrivals=self._arrived(received.frames))
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
             self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
@@ -217,10 +219,13 @@ class Receiver:
         if unit := read_unit(data, captured, arrived, damaged=damaged, codec=self._codec):
             on_unit(self._name, unit)
 
-    def _arrived(self) -> tuple[tuple[float, float | None], ...]:
-        """What has arrived since the last call; more may come meanwhile."""
-        arrivals = self._arrivals or ()
-        return tuple(self._arrivals.popleft() for _ in range(len(arrivals)))  # type: ignore[union-attr]
+    def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
+        """Arrivals since the last call, of those frames that have been counted; more may come meanwhile."""
+        if self._arrivals is None:
+            return ()
+        new = tuple(self._arrivals.popleft() for _ in range(min(len(self._arrivals), frames - self._sampled)))
+        self._sampled += len(new)
+        return new
 
     def _on_sample(self, sink: Gst.Element) -> Gst.FlowReturn:
         sample = sink.emit("pull-sample")
