@@ -126,3 +126,10 @@ def test_a_model_is_valid_once_built(parts: tuple[str, str, str], message: str) 
     with pytest.raises(ModelError) as refused:
         model(*parts)
     assert str(refused.value) == message
+
+
+@pytest.mark.parametrize(
+    "bitrate, factor", [("299.9", "0.125"), ("300.5", "0.25"), ("950.24", "0.25"), ("950.25", "0.5")]
+)
+def test_bounds_need_not_be_whole(bitrate: str, factor: str) -> None:
+    assert select_scaling(model(b_min="0 300.5 950.25"), Fraction(bitrate))[0] == Fraction(factor)

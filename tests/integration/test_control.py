@@ -16,6 +16,8 @@ from rig import CHECKOUT, Heard, Operator, free_port, process, run, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import find_mosquitto, private_broker
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.station import Station
 from runner.vehicle.operators import SILENT_S
 
@@ -377,3 +379,25 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
     replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
     faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}
     assert len(faults) == 4, replayed.stderr
+
+
+def test_nothing_waits_for_a_broker_that_is_away():
+    """After a reconnection the present counts, not the past."""
+    endpoint = Endpoint("127.0.0.1", free_port())
+    told, seen = [], []
+    own = {topic("x", "request", "+"): lambda message: None}
+    link = ControlLink(endpoint, (topic("x", "state"), OFFLINE), own, lambda here: None, told.append)
+    link.connect()
+    until(lambda: told)
+    link.publish(topic("x", "state"), {"online": "past"})
+    with private_broker(endpoint):
+        assert link.wait_connected(15)
+        listen = {topic("x", "+"): lambda message: seen.append(json.loads(message.payload))}
+        watcher = ControlLink(endpoint, (topic("y", "state"), OFFLINE), listen, lambda here: None, told.append)
+        watcher.connect()
+        assert watcher.wait_connected(15)
+        link.publish(topic("x", "state"), {"online": "present"})
+        until(lambda: seen)
+        link.close()
+        watcher.close()
+    assert seen[0] == {"online": "present"}
