@@ -12,9 +12,10 @@ import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+LIMIT_S = 600  # ten times what the tests of one file take
 
 
 class Fault(NamedTuple):
@@ -142,7 +143,11 @@ def _caught(fault: Fault) -> str:
             "TOD_SHARED_DATA": str(CHECKOUT.parent / "shared" / "data"),
         }
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"tests/{fault.tests}.py"]
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+        options: dict[str, Any] = {"cwd": copy, "env": environment, "capture_output": True, "text": True}
+        try:
+            done = subprocess.run(command, check=False, timeout=LIMIT_S, **options)
+        except subprocess.TimeoutExpired:
+            return f"{fault.tests}: not done after {LIMIT_S} s"
         failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
         return failed[0].split(" ")[1] if failed else ""
 

@@ -1,8 +1,8 @@
 """Everything here needs GStreamer, and most of it lives by the clock.
 
 `pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs a few files at a time of what is marked `timed`,
-then, one by one, the tests marked `alone`, whose limits are tight. Everything else runs on the processor time that
-these leave over.
+then, two files at a time, the tests marked `alone`, whose limits are tight. Everything else runs on the processor time
+that these leave over.
 """
 
 import shutil
