@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import cache, lru_cache
 
 from gi.repository import GLib, GObject, Gst
 
 from runner.core.commands import KnobValue
 from runner.core.model import Element, ModelError, Value, suggest
-from runner.graph import Plan, assignments, text
+from runner.graph import Plan, assignments, launch, text
 
 PACKAGES = {  # Debian package that brings an element; `doctor` and missing plugins name it
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
@@ -124,14 +125,27 @@ def _may_change(element: Gst.Element, key: str) -> bool:
 
 def _check_links(plan: Plan) -> list[ModelError]:
     """Whether neighbours can be linked at all."""
-    errors = []
-    lines = [] if missing_plugins(plan) else [("graph.vehicle", plan.pipeline), ("graph.operator", plan.receiver)]
-    if plan.recorder and not missing_recorders(plan):
-        lines.append(("recording.elements", plan.recording("/dev/null")))
-    for where, line in lines:
-        if message := _unlinkable(line):
-            errors.append(ModelError(where, None, message))
-    return errors
+    errors: dict[str, str] = {}
+    for where, line in _lines(plan):
+        if where not in errors and (message := _unlinkable(line)):
+            errors[where] = message
+    return [ModelError(where, None, message) for where, message in errors.items()]
+
+
+def _lines(plan: Plan) -> Iterator[tuple[str, str]]:
+    """The plan's pipelines as GStreamer parses them, without those that this machine lacks an element for.
+
+    Behind a filter all sources are alike: the source is a line of its own, which many graphs share, and so is the rest.
+    """
+    filtered = bool(plan.source) and plan.source[-1].factory == "capsfilter"
+    rest = replace(plan, source=plan.source[-1:]) if filtered else plan
+    streams, records = not missing_plugins(plan), plan.recorder and not missing_recorders(plan)
+    if filtered and (streams or records):
+        yield "graph.vehicle" if streams else "recording.elements", launch(plan.source)
+    if streams:
+        yield from (("graph.vehicle", rest.pipeline), ("graph.operator", plan.receiver))
+    if records:
+        yield "recording.elements", rest.recording("/dev/null")
 
 
 @cache

@@ -26,6 +26,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ def _difference(name: str, kept: str, now: str) -> Iterator[str]:
 
 
 def plans(pool: ProcessPoolExecutor) -> Texts:
-    choices = list(product(("text", "json"), *map(_files, ("vehicle", "graph", "source"))))
+    choices = list(product(*map(_files, ("vehicle", "graph", "source")), ("text", "json")))
     words = [
         [
             "print",
@@ -100,7 +101,7 @@ def plans(pool: ProcessPoolExecutor) -> Texts:
             "total_kbps=3000",
             *_inputs(vehicle, source),
         ]
-        for form, vehicle, graph, source in choices
+        for vehicle, graph, source, form in choices
     ]
     return _outputs(pool, words)
 
@@ -184,11 +185,21 @@ def _outputs(pool: ProcessPoolExecutor, words: list[list[str]]) -> Texts:
 def _here(words: list[str], directory: str = ".") -> str:
     """Status and output of a verb in a directory, in this process: the start of Python would take longer."""
     from runner.__main__ import main
+    from runner.configuration import config
 
+    config.compose = lambda overrides, user=None: _composed(tuple(overrides), user)
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with contextlib.chdir(directory), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = main(words)
     return _shown(status, *(stream.buffer.getvalue().decode() for stream in (out, err)))  # type: ignore[attr-defined]
+
+
+@lru_cache(maxsize=8)
+def _composed(overrides: tuple[str, ...], user: Path | None = None) -> Any:
+    """Composing takes longer than all else, and text and JSON of a plan come from the same."""
+    from runner.configuration.compose import compose
+
+    return compose(overrides, user)
 
 
 def _problems(mutation: mutated.Mutation) -> str:
