@@ -64,20 +64,6 @@ class CameraDecision:
 
 
 @dataclass(frozen=True, slots=True)
-class InForce:
-    """The decision in force."""
-
-    mode: Mode
-    total_kbps: Number
-    cameras: Mapping[str, CameraDecision]
-
-    @classmethod
-    def of(cls, decision: Decision) -> InForce:
-        cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
-        return cls(decision.mode, plain(decision.total), cameras)
-
-
-@dataclass(frozen=True, slots=True)
 class DecisionMade:
     """Line of a log: a decision, what caused it, and the commands that followed from it."""
 
@@ -90,8 +76,9 @@ class DecisionMade:
 
     @classmethod
     def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
-        made = InForce.of(decision)
-        return cls(t, cause, made.mode, made.total_kbps, made.cameras, [command.to_json() for command in commands])
+        cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
+        turned = [command.to_json() for command in commands]
+        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned)
 
 
 # --- from the vehicle -------------------------------------------------------------------------------------------------
@@ -357,6 +344,12 @@ def line_from_json(document: Mapping[str, Any]) -> Record:
 
 
 _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if kind is not Offline}
+
+
+def decision_to_json(decision: Decision) -> Json:
+    """The JSON object of a decision; no record in between, since a replay writes thousands in a second."""
+    cameras = {name: _decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
+    return {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
 
 
 def applied_to_json(camera: str, knobs: KnobValues) -> Applied:

@@ -29,7 +29,7 @@ class Command:
     def to_json(self) -> dict[str, Any]:
         value: Any = self.value
         if isinstance(value, Roi):
-            value = {"x": value.x, "y": value.y, "width": value.width, "height": value.height}
+            value = value.to_json()
         elif isinstance(value, tuple):
             value = {"width": value[0], "height": value[1]}
         return {"camera": self.camera, "knob": self.knob, "value": value}

@@ -89,6 +89,9 @@ class Roi:
     def pixels(self) -> int:
         return self.width * self.height
 
+    def to_json(self) -> dict[str, int]:
+        return {"x": self.x, "y": self.y, "width": self.width, "height": self.height}
+
 
 @dataclass(frozen=True, slots=True)
 class RateQualityModel:

@@ -290,6 +290,8 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
             continue
         if not isinstance(values, Mapping):
             return f"{part} {values!r}: must be a mapping by camera"
+        if values.keys() == state.on.keys() and all(map(fits, values.values())):
+            continue
         for name, on in state.on.items():
             if on and not fits(values.get(name)):
                 return f"{part} of {name} {values.get(name)!r}: {rule}"
@@ -329,7 +331,8 @@ def _setting(state: State, draft: Draft, name: str) -> Setting:
     reason = draft.reasons.get(name, "")
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
-    reason = "; ".join((reason, *draft.notes))
+    if draft.notes:
+        reason = "; ".join((reason, *draft.notes))
     return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
 
 

@@ -31,7 +31,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from runner import records
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, parse, to_json
@@ -40,7 +39,7 @@ from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, log_run
 from runner.drive.read import check_began, is_log, read_line, read_lines
 from runner.errors import UserError
-from runner.records import Began, InForce
+from runner.records import Began, decision_to_json
 from runner.schema import log_problem
 from runner.system.files import whole_file
 from runner.verbs import Arguments
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
 
-_encode = json.JSONEncoder(ensure_ascii=False).encode
+_encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
 
 def run(arguments: Arguments) -> int:
@@ -134,24 +133,29 @@ class _Answers:
 
     def __init__(self) -> None:
         self._decision: Decision | None = None
-        self._text = ""  # of that decision; most events change nothing
+        self._text = ""  # of that decision, once an event changes nothing, as most do
 
     def line(self, document: dict[str, Any], now: Run) -> str:
-        heard = {"t": document["t"], "event": document["event"]}
-        if "source" in document:
-            heard["source"] = document["source"]
-        heard["accepted"] = not now.refused
-        if now.refused:
-            heard["reason"] = now.refused
-        if now.fault:
-            heard["fault"] = now.fault
-        commands = _encode([command.to_json() for command in now.commands])
-        return f'{_encode(heard)[:-1]}, {self._in_force(now.decision)}, "commands": {commands}}}\n'
+        heard = _heard(document, now)
+        commands = [command.to_json() for command in now.commands]
+        if self._decision is None or not now.decision.equals_with_reasons(self._decision):
+            self._decision, self._text = now.decision, ""
+            return f"{_encode(heard | decision_to_json(now.decision) | {'commands': commands})}\n"
+        self._text = self._text or _encode(decision_to_json(self._decision))[1:-1]
+        return f'{_encode(heard)[:-1]}, {self._text}, "commands": {_encode(commands)}}}\n'
 
-    def _in_force(self, decision: Decision) -> str:
-        if self._decision is None or not decision.equals_with_reasons(self._decision):
-            self._decision, self._text = decision, _encode(records.to_json(InForce.of(decision)))[1:-1]
-        return self._text
+
+def _heard(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
+    """The event, and whether it was accepted."""
+    heard = {"t": document["t"], "event": document["event"]}
+    if "source" in document:
+        heard["source"] = document["source"]
+    heard["accepted"] = not now.refused
+    if now.refused:
+        heard["reason"] = now.refused
+    if now.fault:
+        heard["fault"] = now.fault
+    return heard
 
 
 def events(lines: Iterable[str], name: str) -> Iterator[InputEvent]:
@@ -204,8 +208,8 @@ def _output(arguments: Arguments) -> Iterator[TextIO]:
     if path is None and arguments.path("log"):
         path = Path(os.devnull)
     if path is None:
-        # Someone may wait for each answer before sending the next event.
-        sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)  # type: ignore[union-attr]
+        # Whoever writes the events may wait for each answer before sending the next one.
+        sys.stdout.reconfigure(encoding="utf-8", line_buffering=arguments.path("input") is None)  # type: ignore[union-attr]
         yield sys.stdout
         return
     with whole_file(path, partly=True) as file:
