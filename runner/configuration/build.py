@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from runner import schema
 from runner.clips import view
 from runner.configuration.origin import GRAPH_PARTS, Composed, Part
-from runner.configuration.resolve import without
+from runner.configuration.resolve import is_determined, without
 from runner.configuration.rule_lists import call_rule, check_order
 from runner.core.commands import KnobValue
 from runner.core.model import (
@@ -173,10 +174,14 @@ class Builder:
                     self.problems = [blamed if one == problem else one for one in self.problems]
                     break
 
+    @cached_property
+    def _is_determined(self) -> bool:
+        return is_determined(self.composed)
+
     def _without(self, part: Part) -> Builder | None:
         """The builder of the configuration without a part."""
         if id(part) not in self.others:
-            composed = without(self.composed, part)
+            composed = without(self.composed, part) if self._is_determined else None
             other = Builder(composed, self.runnable, self.check) if composed else None
             if other:
                 other._vehicle()

@@ -39,13 +39,21 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
     return Composed(cast("dict[str, Any]", document), list(parts), moved).without_graph_parts()
 
 
+def is_determined(composed: Composed) -> bool:
+    """Whether its parts, merged one after the other, are the configuration."""
+    whole = _merged(composed.parts)
+    return whole is not None and whole.document == composed.document
+
+
 def without(composed: Composed, part: Part) -> Composed | None:
-    """The configuration without a part; None where the parts do not determine it."""
+    """A configuration that its parts determine, without one of them; None where the others alone are not valid."""
+    return _merged([other for other in composed.parts if other is not part])
+
+
+def _merged(parts: Sequence[Part]) -> Composed | None:
     from omegaconf import OmegaConf
 
-    others = [other for other in composed.parts if other is not part]
     try:
-        whole, other = (resolved(OmegaConf.create(merged(parts)), parts) for parts in (composed.parts, others))
+        return resolved(OmegaConf.create(merged(parts)), parts)
     except ConfigError:
         return None
-    return other if whole.document == composed.document else None
