@@ -91,6 +91,7 @@ def without_gstreamer(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
+@pytest.mark.slow
 def test_print_replay_and_validate_need_no_gstreamer(without_gstreamer: dict[str, str]) -> None:
     result = process("print", "source=test", "format=json", env=without_gstreamer)
     assert (result.status, result.err) == (0, "")
@@ -114,6 +115,7 @@ def test_they_do_not_import_it_where_it_is(verb: str) -> None:
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gi, told",
     [

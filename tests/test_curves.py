@@ -141,6 +141,7 @@ def test_confidence_holds_the_crossing_and_grows_with_the_noise():
     assert widths[1] > 5
 
 
+@pytest.mark.slow
 def test_the_same_points_give_the_same_confidence():
     points = grid(noise=0.002)
     ladder, _ = best_ladder(draw_curves(points, SCORE), 5e-4, 1.25)
@@ -228,6 +229,7 @@ def run_adaptive(**how):
     raise AssertionError("the plan does not end")
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.floats(0.3, 4.0))
 def test_the_adaptive_plan_chooses_as_the_full_one_with_a_third_of_the_encodings(hard):

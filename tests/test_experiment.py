@@ -24,6 +24,7 @@ NARROW = (
 TAIL = "experiment: {about: x, duration_s: 5}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
     experiment, link = configuration([f"experiment={name}"], runnable=False).experiment()

@@ -10,6 +10,8 @@ import pytest
 
 from runner.verbs import VERBS
 
+pytestmark = pytest.mark.slow  # starts a process for each verb
+
 HEAVY = ("aiohttp", "antlr4", "asyncio", "cv2", "gi", "hydra", "jsonschema", "matplotlib", "multiprocessing", "numba",
          "numpy", "omegaconf", "paho", "plotly", "rich", "scipy")  # fmt: skip
 COMPOSING = {"antlr4", "hydra", "omegaconf", "jsonschema"}

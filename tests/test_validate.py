@@ -31,6 +31,7 @@ def count(group: str) -> int:
     return len(list((CONF / group).glob("*.yaml")))
 
 
+@pytest.mark.slow
 def test_what_is_packaged_is_valid() -> None:
     """All graphs, vehicles, experiments and links; every combination is a step of its own in `make test`."""
     result = process("validate", "all=true", "source=test", "modes=paper")
@@ -92,6 +93,7 @@ def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> 
     )
 
 
+@pytest.mark.slow
 def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
     conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
@@ -115,6 +117,7 @@ def test_each_file_is_tried_and_each_vehicle_with_each_graph_and_source(tod: Com
     assert (result.status, result.out.splitlines()[0]) == (0, "valid: 5 files, 4 configurations")
 
 
+@pytest.mark.slow
 def test_a_kind_of_camera_that_no_vehicle_mounts_is_tried(tod: Command, conf: UserConf) -> None:
     conf.change("cameras/top_view.yaml", {"3000": "400"})
     (conf.path / "cameras/top_view.yaml").rename(conf.path / "cameras/mine.yaml")
@@ -231,6 +234,7 @@ def test_files_that_keep_to_themselves_are_composed_and_read_once(
     assert len(read) == len(set(read)) <= 20 + sum(map(count, (".", *GROUPS)))
 
 
+@pytest.mark.slow
 def test_what_is_put_together_is_what_hydra_composes() -> None:
     combinations = Combinations([], FLEET, chain(*FILES.values()))
     crossed = product(*(FILES[group] for group in ("vehicle", "graph", "source")))
