@@ -1,4 +1,4 @@
-"""What the control link adds on loopback: half the time from a request to its answer, through a real broker.
+"""Delay of the control link on loopback: half the time from a request to its reply, through a real broker.
 
 python bench/link.py
 """
@@ -27,8 +27,8 @@ def main() -> None:
     with private_broker(broker):
         state, request, reply = (topic("bench", *parts) for parts in (("state",), ("request", "op"), ("reply", "op")))
 
-        def answer(asked: MqttMessage) -> None:
-            vehicle.publish(reply, {"id": json.loads(asked.payload)["id"], "result": "applied", "reason": ""})
+        def answer(message: MqttMessage) -> None:
+            vehicle.publish(reply, {"id": json.loads(message.payload)["id"], "result": "applied", "reason": ""})
 
         vehicle = ControlLink(broker, (state, OFFLINE), {request: answer}, lambda here: None, print)
         operator = ControlLink(

@@ -1,7 +1,7 @@
-"""What a change costs while playing: figures for commands, resolution changes and bitrate steps over real RTSP.
+"""Cost of a change while playing: figures for commands, resolution changes and bitrate steps over real RTSP.
 
   python bench/live.py                       everything, about two minutes
-  python bench/live.py --clip CLIP.mp4       steps on a clip of yours; else on the synthetic drive
+  python bench/live.py --clip CLIP.mp4       steps on your own clip; by default on the synthetic drive
 
 Run it on an otherwise idle machine; both sides share it.
 """
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def command_latency(source: Sequence[str], rounds: int) -> None:
-    """From a decision for all cameras to the last encoder that has it; eight cameras as the demo runs them."""
+    """From a decision for all cameras to the last encoder that applies it; eight cameras as the demo runs them."""
     vehicle = _vehicle([*source, "fps_max=15"])
     with _streaming(vehicle) as side, _operator([*source, "fps_max=15"]):
         _until(lambda: all(sent[0] > 30 for sent in side.sent().values()))
@@ -90,7 +90,7 @@ def size_change(source: Sequence[str], rounds: int) -> None:
 
 
 def bitrate_step(source: Sequence[str], fps: int) -> None:
-    """4000 -> 1000 kbit/s, with and without a change of factor: what is on the wire, as a multiple of the new rate."""
+    """4000 -> 1000 kbit/s, with and without a change of factor: bitrate on the wire, as a multiple of the new one."""
     vehicle = _one_camera(source, fps)
     for what, size in (("same factor", (960, 520)), ("factor 0.5 -> 0.25", (480, 260))):
         with _streaming(vehicle) as side, _client(vehicle) as (samples, _):
@@ -130,7 +130,7 @@ def _streaming(vehicle: Vehicle) -> Iterator[VehicleSide]:
 
 @contextmanager
 def _operator(overrides: Sequence[str]) -> Iterator[None]:
-    """Receives and decodes all cameras in a process of its own, as the operator does."""
+    """Receives and decodes all cameras in its own process, as the operator does."""
     code = (
         "import sys, time; from runner.apply import OperatorSide;"
         "from runner.configuration.config import configuration;"
@@ -147,7 +147,7 @@ def _operator(overrides: Sequence[str]) -> Iterator[None]:
 
 @contextmanager
 def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
-    """Decodes the one camera and writes down each frame; bytes are those of the access unit before it."""
+    """Decodes the one camera and records each frame; bytes are those of the access unit before it."""
     (plan,) = compile_plans(vehicle)
     pipeline = Gst.parse_launch(plan.receiver)
     samples: list[Sample] = []
@@ -202,7 +202,7 @@ def _until(done: Any, seconds: float = 10) -> None:
     until = time.monotonic() + seconds
     while not done():
         if time.monotonic() > until:
-            raise SystemExit("it did not come to pass; is the machine idle?")
+            raise SystemExit("timed out; is the machine idle?")
         time.sleep(0.0005)
 
 

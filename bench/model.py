@@ -1,11 +1,11 @@
-"""How long a rate-quality model takes against the obvious ways, each as a ratio in one run.
+"""Time that a rate-quality model takes, against the obvious alternatives, as ratios in one run.
 
   python bench/model.py CLIP
 
-Timed are whole processes that know no point yet, the adaptive plan of `tod-runner model` first. Against it: the full
-plan; the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales up
-and has its ssim filter compare; and the full grid with scikit-image's MSSIM on every frame, extrapolated from one point
-and some frames. Beside the times: what either plan chose.
+Whole processes are timed, with an empty cache, the adaptive plan of `tod-runner model` first. It is compared with the
+full plan; the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales
+up and compares with its ssim filter; and the full grid with scikit-image's MSSIM on every frame, extrapolated from one
+point and some frames. Also printed: the choice of either plan.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def memory_mb() -> float:
 
 
 def two_processes(clip: Path, directory: Path) -> float:
-    """The full grid as a script would do it, one point after the other; ffmpeg takes all cores that it can use."""
+    """The full grid as a script would do it, one point at a time; ffmpeg takes all cores that it can use."""
     began = time.perf_counter()
     for factor in STUDY["scalings"]:
         for kbps in STUDY["bitrates_kbps"]:

@@ -1,10 +1,10 @@
-"""From source to screen: what a frame costs on its way into the browser, by stage, and whether eight tiles keep up.
+"""From source to screen: delay of a frame on its way into the browser, by stage, and whether eight tiles keep up.
 
   python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each
   python bench/page.py --seconds 60 --show  with a window instead of headless
 
 The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
-display's own delay is not in it. Needs chromium. Run it on an otherwise idle machine.
+display's own delay is not included. Needs chromium. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float) -> None:
-    """Drive a vehicle of some equal cameras and look at its page."""
+    """Drive a vehicle of some equal cameras and measure its page."""
     with tempfile.TemporaryDirectory() as directory:
         words = _configuration(Path(directory), count, *form, kbps)
         render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
@@ -72,7 +72,7 @@ def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int],
 
 
 class Round(NamedTuple):
-    """One page, opened and looked at: frames by camera as times of each stage, ms."""
+    """Measurements of one page: frames by camera as times of each stage, ms."""
 
     frames: list[list[list[float]]]
     rates: list[float]
@@ -82,9 +82,9 @@ class Round(NamedTuple):
 
 
 def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
-    """Start both sides, open a page in a context of its own and look at it.
+    """Start both sides, open a page in its own context and measure it.
 
-    Cameras and screen keep their phase to each other for a whole drive, so one drive alone says little.
+    The phase between cameras and screen is constant during a drive, so one drive alone says little.
     """
     with _station(words) as (url, operator), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page = context.new_page()
@@ -112,7 +112,7 @@ def _print(what: str, values: list[float]) -> None:
 
 
 def _configuration(directory: Path, count: int, width: int, height: int, fps: int, kbps: int) -> list[str]:
-    """A vehicle of equal cameras in a conf directory of its own; the overrides that choose it."""
+    """A vehicle of equal cameras in its own conf directory; returns the overrides that choose it."""
     (directory / "cameras").mkdir()
     (directory / "vehicle").mkdir()
     model = f"{{scaling: [1.0], b_min_kbps: [0], b_full_kbps: {kbps}}}"

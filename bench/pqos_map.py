@@ -1,4 +1,4 @@
-"""How long a look-up in a bandwidth map of a million points takes, and how long building it.
+"""Time of a look-up in a bandwidth map of a million points, and of building it.
 
 python bench/pqos_map.py [points]
 """

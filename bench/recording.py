@@ -1,10 +1,10 @@
-"""How fast lossless encoders record and decode, and how much they need; docs/models.md quotes it.
+"""Speed of lossless encoders in recording and decoding, and size of their files; docs/models.md quotes it.
 
 python bench/recording.py CLIP ...
 
-The first frames of each clip are decoded into memory before; what is timed is the encoder with its muxer alone, and the
-demuxer with its decoder alone. The best of three runs, and the processor time of a frame, which others on the machine
-disturb less. FFVHuff has no place in GStreamer's Matroska muxer: it is timed without a container, its decoder as the
+The first frames of each clip are decoded into memory beforehand; only the encoder with its muxer, and the demuxer with
+its decoder, are timed. Printed are the best of three runs, and the processor time per frame, which other processes
+disturb less. GStreamer's Matroska muxer does not take FFVHuff: it is timed without a container, its decoder as the
 difference between encoding with and without decoding.
 """
 

@@ -1,10 +1,10 @@
-"""Events a second that `tod-runner replay` decides for the eight cameras of the paper's vehicle.
+"""Events per second that `tod-runner replay` decides for the eight cameras of the paper's vehicle.
 
 python bench/replay.py [events]
 
-Counted is the whole process: start, composition of the configuration, reading, deciding, writing. Two stories: one in
-which every event is a prediction that changes all bitrates, and a drive as it is logged, in which time, positions and
-link measurements come between the predictions.
+The whole process is timed: start, composition of the configuration, reading, deciding, writing. Two scenarios: one in
+which every event is a prediction that changes all bitrates, and a drive as it is logged, with time, positions and link
+measurements between the predictions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-WANTED = 7000  # events a second
+WANTED = 7000  # events per second
 RUNS = 3
 
 

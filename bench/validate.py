@@ -2,8 +2,8 @@
 
 python bench/validate.py [runs]
 
-The directory is tests/fleet: 2 vehicles, 6 kinds of camera, 4 modes, 3 graphs, 3 sources, 2 pqos. Counted is the whole
-process; the median of five runs is compared with what it may take on two idle cores.
+The directory is tests/fleet: 2 vehicles, 6 kinds of camera, 4 modes, 3 graphs, 3 sources, 2 pqos. The whole process
+is timed; the median of five runs is compared with the limit for two idle cores.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every test runs in: no configuration and no cache of the person who runs it."""
+"""The environment of every test: neither the configuration nor the cache of the user who runs it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from helpers import Command, UserConf
 
 
 @pytest.fixture(autouse=True)
-def nobodys_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.fixture
 def tod(capfd: pytest.CaptureFixture[str]) -> Command:
-    """The command line without a process of its own."""
+    """The command line, run in this process."""
     return Command(capfd)
 
 
 @pytest.fixture
 def conf(tmp_path: Path) -> UserConf:
-    """A configuration directory of the user's own, empty, at a place that is awkward to quote."""
+    """An empty user configuration directory, at a path that is awkward to quote."""
     return UserConf(tmp_path / "my conf ü")

@@ -1,4 +1,4 @@
-"""Drives as the two sides would have logged them: the real core decides, noise stands for encoder and network."""
+"""Drives as the two sides would have logged them: the real core decides, noise stands in for encoder and network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from runner.records import (
 )
 
 EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
-OPERATOR_LATER_S = 1.5  # the operator begins to log later than the vehicle
+OPERATOR_LATER_S = 1.5  # the operator starts logging later than the vehicle
 TICK_S, TELEMETRY_S, SAMPLE_S, LINK_S = 0.1, 0.2, 0.25, 0.1
 FOLLOWS_S = 0.4  # time constant of the encoder's rate control
 VERSIONS = {"tod-runner": "0.1.0", "Python": "3.11.2", "GStreamer": "1.22.0"}
@@ -54,11 +54,11 @@ def write_drive(
     """Write a drive.
 
     seconds    length
-    overrides  of the configuration; without any the paper's vehicle on the demo's map
+    overrides  of the configuration; by default the paper's vehicle on the demo's map
     events     of the operator, with their times
-    freezes    by camera, (from s, how long s) without arrivals
-    congested  how much the network adds to latency and loss where little was predicted; 0: a good one
-    change     what becomes of each side's lines after the first
+    freezes    by camera, (start s, length s) without arrivals
+    congested  how much latency and loss the network adds where the predicted bitrate is low; 0: none
+    change     transforms each side's lines after the first
     """
     config, lines = _drive(tuple(overrides), seconds, seed, tuple(events), congested, _frozen(freezes))
     directory.mkdir(parents=True, exist_ok=True)
@@ -66,10 +66,10 @@ def write_drive(
         shift = OPERATOR_LATER_S if side == "operator" else 0.0
         began = {"t": 0.0, "log": "began", "side": side, "format": 1, "time": EPOCH + shift}
         began |= {"versions": VERSIONS, "config": config}
-        told = [began, *change(side, json.loads(json.dumps(lines[side])))]
+        logged = [began, *change(side, json.loads(json.dumps(lines[side])))]
         if ended:
-            told.append({"t": round(seconds - shift, 6), "log": "ended"})
-        text = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in told)
+            logged.append({"t": round(seconds - shift, 6), "log": "ended"})
+        text = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in logged)
         (directory / FILES[side]).write_text(text, encoding="utf-8")
     return directory
 
@@ -97,7 +97,7 @@ def _drive(
 
 @dataclass
 class _Made:
-    """A drive in the making."""
+    """A drive being generated."""
 
     random: np.random.Generator
     vehicle: Any
@@ -116,7 +116,7 @@ class _Made:
     def __post_init__(self) -> None:
         names = list(self.vehicle.cameras)
         self.now = start(self.vehicle)
-        self.rate = dict.fromkeys(names, 0.0)  # kbit/s that comes out of each encoder
+        self.rate = dict.fromkeys(names, 0.0)  # kbit/s out of each encoder
         self.count = {
             name: dict.fromkeys(("frames", "bytes", "got", "got_bytes", "lost", "rebuilt"), 0) for name in names
         }
@@ -168,7 +168,7 @@ class _Made:
         return float(prediction.kbps) if prediction else 3000.0
 
     def _encode(self, t: float) -> None:
-        """Frames of the last tick, and when they come."""
+        """The frames of the last tick and their arrivals."""
         load = self.congested * max(0.0, (5500.0 - self._predicted()) / 2500.0)
         for name, setting in self.now.decision.settings.items():
             count = self.count[name]
@@ -296,7 +296,7 @@ def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: floa
 
 
 def write_models(directory: Path, config: Mapping[str, Any]) -> Path:
-    """One for each camera of a configuration."""
+    """A model for each camera of a configuration."""
     for name, camera in config["cameras"].items():
         ladder = camera["rate_quality"]
         write_model(directory / f"{name}.model.json", name, ladder["scaling"], ladder["b_full_kbps"])

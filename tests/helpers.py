@@ -28,18 +28,18 @@ def vehicle(*overrides: str) -> Vehicle:
 
 
 class Drive:
-    """A run that events are told to, as JSON says them; time stands still unless `t` says otherwise."""
+    """A run that takes events by the keys of their JSON; time does not advance unless `t` is given."""
 
     def __init__(self, *overrides: str) -> None:
         self.vehicle = vehicle(*overrides)
         self.run = start(self.vehicle)
 
-    def tell(self, event: str, **keys: Any) -> Run:
+    def feed(self, event: str, **keys: Any) -> Run:
         self.run = step(self.vehicle, self.run, parse({"t": self.run.state.t, "event": event} | keys))
         return self.run
 
     def accept(self, event: str, **keys: Any) -> Run:
-        run = self.tell(event, **keys)
+        run = self.feed(event, **keys)
         assert run.refused is None
         return run
 
@@ -51,7 +51,7 @@ class Drive:
         return self.run.decision.settings[camera]
 
     def sent(self, camera: str) -> tuple[int, float | None]:
-        """What a camera is sent with: whole kbit/s, factor."""
+        """The bitrate in whole kbit/s and the factor that a camera is sent with."""
         setting = self[camera]
         return setting.kbps, None if setting.scaling is None else float(setting.scaling)
 
@@ -63,7 +63,7 @@ class Result(NamedTuple):
 
     @property
     def problems(self) -> list[str]:
-        """The problems told, after checking that everything else is as it is for wrong input."""
+        """The reported problems, after checking that everything else is as usual for wrong input."""
         *problems, summary = self.err.splitlines()
         count = len(problems)
         assert self.status == 2, self.err
@@ -91,7 +91,7 @@ def process(*words: str, stdin: str | bytes = b"", **options: Any) -> Result:
 
 
 class UserConf:
-    """A user's configuration directory, made when something is written to it."""
+    """A user's configuration directory, created by the first write."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -107,7 +107,7 @@ class UserConf:
         return self
 
     def change(self, name: str, changes: Mapping[str, str]) -> UserConf:
-        """A copy of a packaged file, or of one written before, with some texts replaced, the first of each."""
+        """A copy of a packaged file, or of one written before, with the first occurrence of each text replaced."""
         own = self.path / name
         text = (own if own.exists() else CONF / name).read_text()
         for old, new in changes.items():

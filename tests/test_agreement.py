@@ -1,4 +1,4 @@
-"""What the configurations of both sides differ in."""
+"""Differences between the configurations of both sides."""
 
 from __future__ import annotations
 

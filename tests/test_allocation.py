@@ -69,7 +69,7 @@ def test_it_spends_what_it_may_and_gives_nobody_more_than_the_demand(
     assert all(0 <= allocated[name] <= demands[name] for name in demands)
     assert all(allocated[name] == 0 for name in demands if weights[name] == 0)
     assert sum(map(floor, allocated.values())) <= total
-    # One lambda for all: whoever is not filled gets lambda * w * d, and whoever is filled would get more.
+    # One lambda for all: a camera below its demand gets lambda * w * d, one at its demand would get more.
     shares = {n: b / (weights[n] * demands[n]) for n, b in allocated.items() if 0 < b < demands[n]}
     assert len(set(shares.values())) <= 1
     for share in shares.values():

@@ -33,7 +33,7 @@ def run(*command: str, cwd: Path | None = None, **variables: str) -> str:
 
 
 def built(source: Path, made: Path) -> Path:
-    """Directory that the wheel of a package is installed into, without what it depends on."""
+    """Directory that the wheel of a package is installed into, without its dependencies."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
     run(*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(made), str(source))
     (wheel,) = made.glob("*.whl")
@@ -87,7 +87,7 @@ def test_the_package_is_well_typed(tmp_path: Path) -> None:
     run(sys.executable, "-m", "mypy", *words, MYPYPATH=f"{PACKAGE}{os.pathsep}{CHECKOUT}")
 
 
-def test_the_documented_names_are_there() -> None:
+def test_the_documented_names_exist() -> None:
     from runner.frames import Frame, live_frames
     from runner.live import LiveVehicle, live_vehicle
     from runner.model import Camera, Kbps, Mode, RateQualityModel, Roi, Vehicle

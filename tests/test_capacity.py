@@ -39,7 +39,7 @@ def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() ->
 
 
 def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None:
-    """Frames that wait from 4 to 6 s, packets that are lost from 8 s to 9 s; else there was room."""
+    """Frames wait from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has room."""
 
     def change(side: str, lines: Lines) -> Lines:
         for line in lines:
@@ -75,7 +75,7 @@ def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> 
     assert '"source": "pqos"' in replayed.out
 
 
-def test_what_cannot_give_a_map_is_told(tod: Command, tmp_path: Path) -> None:
+def test_drives_that_cannot_give_a_map_are_reported(tod: Command, tmp_path: Path) -> None:
     def roomy(side: str, lines: Lines) -> Lines:
         for line in lines:
             for camera in line["cameras"].values() if line.get("log") == "sample" else ():
@@ -84,7 +84,7 @@ def test_what_cannot_give_a_map_is_told(tod: Command, tmp_path: Path) -> None:
 
     good = write_drive(tmp_path / "good", seconds=5, change=roomy)
     output = f"output={tmp_path / 'map.csv'}"
-    for words, status, told in (
+    for words, status, expected in (
         ((output,), 2, "command line: must name a drive: a directory that log= wrote"),
         ((str(good),), 2, "command line: output: must be given, the map's file"),
         ((str(good), output, "percentile=101"), 2, "command line: percentile: 101: must be at most 100"),
@@ -94,7 +94,7 @@ def test_what_cannot_give_a_map_is_told(tod: Command, tmp_path: Path) -> None:
     ):
         result = tod("map", *words)
         assert result.status == status, result.err
-        assert result.err.startswith(told) and result.err.count("\n") == 1
+        assert result.err.startswith(expected) and result.err.count("\n") == 1
     alone = write_drive(tmp_path / "alone", ["vehicle"], seconds=5)
     assert tod("map", str(alone), output).err == f"no map: {alone} has no operator's log\n"
     assert tod("map", str(good), output, "percentil=5").err.startswith("command line: percentil=5: unknown argument")

@@ -1,4 +1,4 @@
-"""What the paper reports of its driving test, held against drives that have it and drives that have not."""
+"""The paper's claims about its driving test, checked against drives that meet them and drives that do not."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def test_the_driving_test_does_what_the_paper_reports(tmp_path: Path) -> None:
     checks = claims(series(read_drive(write_drive(tmp_path / "drive", seconds=100, overrides=TEST))))
     assert len(checks) == 9
     assert [check.claim for check in checks if not check.holds] == []
-    told = {check.claim: check.outcome for check in checks}
-    assert told["The total bitrate ranges from 3000 to 8000 kbit/s (predicted)"] == "3030 to 7690 kbit/s"
+    outcomes = {check.claim: check.outcome for check in checks}
+    assert outcomes["The total bitrate ranges from 3000 to 8000 kbit/s (predicted)"] == "3030 to 7690 kbit/s"
     dip = "Around {} s lower resolutions are selected for all cameras except front center"
-    assert told[dip.format(15)] == "from 10.7 to 18.9 s for 7 cameras, not for front_center"
-    assert told[dip.format(55)] == "from 51.2 to 59.4 s for 7 cameras, not for front_center"
+    assert outcomes[dip.format(15)] == "from 10.7 to 18.9 s for 7 cameras, not for front_center"
+    assert outcomes[dip.format(55)] == "from 51.2 to 59.4 s for 7 cameras, not for front_center"
     last = "Between 70 and 90 s less is predicted, and no resolution is changed"
-    assert told[last].endswith("changes of no camera")
+    assert outcomes[last].endswith("changes of no camera")
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_the_driving_test_does_what_the_paper_reports(tmp_path: Path) -> None:
     ],
 )
 def test_another_drive_breaks_the_claims_that_it_should(tmp_path: Path, overrides: list[str], broken: set[str]) -> None:
-    """A check that cannot fail says nothing."""
+    """A check that cannot fail proves nothing."""
     found = held(write_drive(tmp_path / "drive", ["vehicle"], seconds=100, overrides=(*TEST, *overrides)))
     failed = {claim for claim, holds in found.items() if holds is False}
     assert {begin for begin in broken if any(claim.startswith(begin) for claim in failed)} == broken

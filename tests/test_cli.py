@@ -1,4 +1,4 @@
-"""The command line: verbs, help, exit statuses, no GStreamer where none is needed, silence where nobody listens."""
+"""The command line: verbs, help, exit statuses, no GStreamer unless needed, silence on a closed pipe."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, expected",
     [
         (["prnt"], "command line: prnt: unknown verb, did you mean print?"),
         (["fly"], f"command line: fly: unknown verb; expected one of {', '.join(VERBS)}"),
@@ -49,12 +49,12 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
         (["replay", "conf=/nowhere"], "command line: conf: /nowhere: no such directory"),
     ],
 )
-def test_words_that_are_no_command(tod: Command, words: list[str], told: str) -> None:
-    assert tod(*words) == (2, "", f"{told}\n")
+def test_words_that_are_no_command(tod: Command, words: list[str], expected: str) -> None:
+    assert tod(*words) == (2, "", f"{expected}\n")
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, expected",
     [
         (["print", "duration_s=3"], "duration_s: is an argument of vehicle, operator, demo, record; print has "),
         (["print", "input=a.jsonl"], "input: is an argument of replay; print has total_kbps, format, conf"),
@@ -68,13 +68,13 @@ def test_words_that_are_no_command(tod: Command, words: list[str], told: str) ->
         ),
     ],
 )
-def test_names_and_choices_that_are_not_there_get_a_suggestion(tod: Command, words: list[str], told: str) -> None:
+def test_unknown_names_and_choices_get_a_suggestion(tod: Command, words: list[str], expected: str) -> None:
     status, out, err = tod(*words)
     assert (status, out) == (2, "")
-    assert err.startswith(f"command line: {told}")
+    assert err.startswith(f"command line: {expected}")
 
 
-def test_the_conf_of_the_environment_must_be_there_too(tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_conf_of_the_environment_must_exist_too(tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TOD_CONF", "/nowhere")
     assert tod("print") == (2, "", "command line: conf: /nowhere: no such directory\n")
 
@@ -106,7 +106,7 @@ def test_print_replay_and_validate_need_no_gstreamer(without_gstreamer: dict[str
 
 
 @pytest.mark.parametrize("verb", ["print", "replay"])
-def test_they_do_not_import_it_where_it_is(verb: str) -> None:
+def test_print_and_replay_never_import_gstreamer(verb: str) -> None:
     program = (
         "import sys; from runner.__main__ import main; "
         f"main([{verb!r}, 'modes=paper', 'source=test']); sys.exit('gi' in sys.modules)"
@@ -117,7 +117,7 @@ def test_they_do_not_import_it_where_it_is(verb: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "gi, told",
+    "gi, expected",
     [
         (
             "raise ImportError('there is no gi here')",
@@ -130,13 +130,13 @@ def test_they_do_not_import_it_where_it_is(verb: str) -> None:
         ),
     ],
 )
-def test_doctor_and_validate_say_what_of_gstreamer_does_not_load(
-    without_gstreamer: dict[str, str], tmp_path: Path, gi: str, told: str
+def test_doctor_and_validate_report_which_part_of_gstreamer_does_not_load(
+    without_gstreamer: dict[str, str], tmp_path: Path, gi: str, expected: str
 ) -> None:
     (tmp_path / "gi" / "__init__.py").write_text(f"{gi}\n")
     result = process("doctor", "vehicle", "source=test", "page.serve=false", env=without_gstreamer)
     assert (result.status, result.err) == (1, "")
-    assert any(line.startswith(f"MISSING {told}") for line in result.out.splitlines()), result.out
+    assert any(line.startswith(f"MISSING {expected}") for line in result.out.splitlines()), result.out
     result = process("validate", env=without_gstreamer)
     assert (result.status, result.err) == (0, "")
     assert "nothing was checked against the GStreamer registry: " in result.out
@@ -164,13 +164,15 @@ def test_doctor_looks_at_what_a_verb_needs(tod: Command, words: list[str], modul
     assert named == modules
 
 
-@pytest.mark.parametrize("words, told", [(["vehcle"], "unknown verb, did you mean vehicle?"), (["a", "b"], "one verb")])
-def test_doctor_takes_a_verb(tod: Command, words: list[str], told: str) -> None:
+@pytest.mark.parametrize(
+    "words, expected", [(["vehcle"], "unknown verb, did you mean vehicle?"), (["a", "b"], "one verb")]
+)
+def test_doctor_takes_a_verb(tod: Command, words: list[str], expected: str) -> None:
     result = tod("doctor", *words)
-    assert (result.status, result.out) == (2, "") and told in result.err
+    assert (result.status, result.out) == (2, "") and expected in result.err
 
 
-# --- nobody listens ---------------------------------------------------------------------------------------------------
+# --- closed pipes -----------------------------------------------------------------------------------------------------
 
 
 def test_a_closed_standard_output_ends_silently() -> None:

@@ -1,4 +1,4 @@
-"""Ages of pictures by two machines' clocks: which are told, and which are not known."""
+"""Ages of pictures by two machines' clocks: which are reported and which are unknown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def ages(clocks: Clocks, t: float, **samples: Sample) -> list[float | None]:
     return [sample.latency_ms for sample in clocks.checked(t, samples).values()]
 
 
-def test_ages_are_told_as_long_as_none_is_negative() -> None:
+def test_ages_are_reported_while_none_is_negative() -> None:
     clocks = Clocks()
     assert ages(clocks, 0.0, front=Sample(), rear=Sample()) == [None, None]
     assert ages(clocks, 0.25, front=Sample(3, 40.0), rear=Sample(3, 0.0)) == [40.0, 0.0]
@@ -37,14 +37,14 @@ def test_a_clock_that_is_ahead_makes_every_age_unknown_for_a_while() -> None:
     assert clocks.ahead_ms is None
 
 
-@pytest.mark.parametrize(("noise_ms", "told"), [(-0.4, None), (0.0, 0.0)])
-def test_noise_around_zero_is_no_clock_that_is_ahead(noise_ms: float, told: float | None) -> None:
+@pytest.mark.parametrize(("noise_ms", "expected"), [(-0.4, None), (0.0, 0.0)])
+def test_noise_around_zero_is_no_clock_that_is_ahead(noise_ms: float, expected: float | None) -> None:
     clocks = Clocks()
-    assert ages(clocks, 0.25, front=Sample(3, noise_ms), rear=Sample(3, 5.0)) == [told, 5.0]
+    assert ages(clocks, 0.25, front=Sample(3, noise_ms), rear=Sample(3, 5.0)) == [expected, 5.0]
     assert clocks.ahead_ms is None
 
 
-def test_the_age_of_the_last_picture_of_a_silent_camera_is_not_told() -> None:
+def test_the_age_of_the_last_picture_of_a_silent_camera_is_not_reported() -> None:
     clocks, last = Clocks(), Sample(3, 40.0)
     assert ages(clocks, 0.25, front=last) == [40.0]
     assert ages(clocks, 1.25, front=last) == [40.0]
@@ -52,7 +52,7 @@ def test_the_age_of_the_last_picture_of_a_silent_camera_is_not_told() -> None:
     assert ages(clocks, 1.75, front=replace(last, frames=4)) == [40.0]
 
 
-def test_a_negative_age_of_a_silent_camera_is_not_news_for_ever() -> None:
+def test_a_negative_age_of_a_silent_camera_does_not_count_for_ever() -> None:
     clocks, last = Clocks(), Sample(3, -500.0)
     assert ages(clocks, 0.25, front=last, rear=Sample(3, 10.0)) == [None, None]
     assert ages(clocks, 11.0, front=last, rear=Sample(50, 10.0)) == [None, 10.0]

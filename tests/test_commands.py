@@ -1,4 +1,4 @@
-"""Commands are the difference between what is decided and what was commanded before."""
+"""Commands are the difference between the decision and what was commanded before."""
 
 from __future__ import annotations
 

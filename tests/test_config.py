@@ -1,4 +1,4 @@
-"""Configuration: Table I, files of the user's own, and the exact words for everything that can be wrong."""
+"""Configuration: Table I, user files, and the exact message for each mistake."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
     assert (str(cameras["front_left"].fps), cameras["top_left"].fps) == ("333/10", 30)
 
 
-# --- a directory of the user's own ------------------------------------------------------------------------------------
+# --- a user's own directory -------------------------------------------------------------------------------------------
 
 
 def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> None:
@@ -173,7 +173,7 @@ def test_a_relative_directory(conf: UserConf, tod: Command, monkeypatch: pytest.
 
 
 def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
-    """What `print` says is wrong; the user's directory is shown as ~."""
+    """The problems that `print` reports; the user's directory is shown as ~."""
     found = tod("print", "source=test", *words, *([conf.word] if conf.path.exists() else []))
     return [problem.replace(str(conf.path), "~") for problem in found.problems]
 
@@ -187,8 +187,8 @@ def test_the_three_messages_of_the_style_guide(
     monkeypatch.chdir(tmp_path)
     found = tod("print", "source=test", "modes=paper", "conf=conf")
     assert (found.status, found.out) == (2, "")
-    *told, summary = found.err.splitlines()
-    assert sorted(told) == [
+    *messages, summary = found.err.splitlines()
+    assert sorted(messages) == [
         "conf/cameras/rear_center.yaml: heigth_px: unknown key, did you mean height_px?",
         "conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: must rise from 0",
         "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
@@ -205,7 +205,7 @@ REAR, GRAPH, PAPER, ROBOT = (
 
 
 @pytest.mark.parametrize(
-    "file, changes, told",
+    "file, changes, expected",
     [
         # cameras
         (REAR, {"height_px": "heigth_px"}, "heigth_px: unknown key, did you mean height_px?"),
@@ -278,15 +278,15 @@ REAR, GRAPH, PAPER, ROBOT = (
         ),
     ],
 )
-def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: dict[str, str], told: str) -> None:
+def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: dict[str, str], expected: str) -> None:
     conf.change(file, changes)
     (problem,) = problems(tod, conf, "modes=paper")
     assert problem.startswith(f"~/{file}: ")
-    assert problem.endswith(told)
+    assert problem.endswith(expected)
 
 
 @pytest.mark.parametrize(
-    "old, new, told",
+    "old, new, expected",
     [
         ("compact_480p", "compact_48p", "defaults: 'cameras/compact_48p': no such file, did you mean compact_480p?"),
         (
@@ -333,9 +333,9 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ),
     ],
 )
-def test_a_mistake_in_a_vehicle(conf: UserConf, tod: Command, old: str, new: str, told: str) -> None:
+def test_a_mistake_in_a_vehicle(conf: UserConf, tod: Command, old: str, new: str, expected: str) -> None:
     conf.change(ROBOT, {old: new})
-    assert problems(tod, conf, "vehicle=delivery_robot") == [f"~/{ROBOT}: {told}"]
+    assert problems(tod, conf, "vehicle=delivery_robot") == [f"~/{ROBOT}: {expected}"]
 
 
 def test_a_native_picture_must_hold_the_crop(conf: UserConf, tod: Command) -> None:
@@ -346,7 +346,7 @@ def test_a_native_picture_must_hold_the_crop(conf: UserConf, tod: Command) -> No
 
 
 @pytest.mark.parametrize(
-    "content, told",
+    "content, expected",
     [
         (b"", "is empty, must be a mapping"),
         (b"name: x\n", "must begin with the line # @package _global_"),
@@ -358,10 +358,10 @@ def test_a_native_picture_must_hold_the_crop(conf: UserConf, tod: Command) -> No
         ),
     ],
 )
-def test_a_file_that_is_no_configuration(conf: UserConf, tod: Command, content: bytes, told: str) -> None:
+def test_a_file_that_is_no_configuration(conf: UserConf, tod: Command, content: bytes, expected: str) -> None:
     conf.write("vehicle/mine.yaml", content)
     (problem,) = problems(tod, conf, "vehicle=mine")
-    assert problem.startswith(f"~/vehicle/mine.yaml: {told}")
+    assert problem.startswith(f"~/vehicle/mine.yaml: {expected}")
 
 
 def test_a_rule_list_in_the_wrong_order(conf: UserConf, tod: Command) -> None:
@@ -376,7 +376,7 @@ def test_a_rule_list_in_the_wrong_order(conf: UserConf, tod: Command) -> None:
     ]
 
 
-def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
+def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
     conf.write("modes/mine.yaml", "defaults: [papr, _self_]\n")
     assert problems(tod, conf, "modes=mine") == [
         "~/modes/mine.yaml: defaults: 'modes/papr': no such file, did you mean paper?"
@@ -384,7 +384,7 @@ def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, expected",
     [
         (["vehicle=tum_q8"], "vehicle: tum_q8: no such file in conf/vehicle/, did you mean tum_q7?"),
         (["modes=saef"], "modes: saef: no such file in conf/modes/, did you mean safe?"),
@@ -432,10 +432,10 @@ def test_a_base_that_is_not_there(conf: UserConf, tod: Command) -> None:
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )
-def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list[str], told: str) -> None:
+def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list[str], expected: str) -> None:
     (problem,) = problems(tod, conf, *words)
     assert problem.startswith("command line: ")
-    assert problem.endswith(told)
+    assert problem.endswith(expected)
 
 
 def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Command) -> None:
@@ -453,7 +453,7 @@ def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Comm
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, expected",
     [
         (
             ["source=file"],
@@ -471,11 +471,11 @@ def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Comm
         ),
     ],
 )
-def test_what_a_source_asks_for_must_be_there(tod: Command, words: list[str], told: list[str]) -> None:
-    assert tod("print", *words).problems == told
+def test_what_a_source_needs_must_exist(tod: Command, words: list[str], expected: list[str]) -> None:
+    assert tod("print", *words).problems == expected
 
 
-def test_all_problems_are_told_at_once_in_one_run(conf: UserConf, tod: Command) -> None:
+def test_all_problems_are_reported_at_once_in_one_run(conf: UserConf, tod: Command) -> None:
     conf.change(REAR, {"[0, 400, 1800]": "[0, 400]", "fps: 40": "fps: fast"})
     conf.change("cameras/top_view.yaml", {"3000": "400"})
     conf.change(GRAPH, {"gate, property": "gaet, property"})
@@ -496,7 +496,7 @@ def test_all_problems_are_told_at_once_in_one_run(conf: UserConf, tod: Command) 
     )
 
 
-def test_the_same_problem_is_told_once() -> None:
+def test_the_same_problem_is_reported_once() -> None:
     problem = Problem("a.yaml", "b", "1", "must not")
     assert str(ConfigError([problem, problem])) == "a.yaml: b: 1: must not\n1 problem, nothing was started"
     two = ConfigError([problem, Problem("a.yaml", "", None, "must not either")])

@@ -55,7 +55,7 @@ def grid(factors=EIGHTHS, rates=RATES, **how):
 
 
 def true_crossing(lower, upper):
-    """Where the two made-up curves meet."""
+    """The bitrate at which the two made-up curves meet."""
     low, high = 1.0, 1e6
     for _ in range(200):
         middle = (low * high) ** 0.5
@@ -105,10 +105,10 @@ def test_a_smaller_tolerance_keeps_no_fewer_factors():
     assert sizes[0] < sizes[-1]
 
 
-def test_what_does_not_hold_its_target_takes_no_part():
+def test_points_that_miss_their_target_take_no_part():
     points = grid([Fraction(1, 2), Fraction(1)])
     honest = draw_curves(points, SCORE)
-    # At full size the encoder cannot go below 300 kbit/s, and looks good for it.
+    # At full size the encoder cannot go below 300 kbit/s, and scores well for it.
     cheat = partial(point, Fraction(1), actual=330, hard=0.01)
     cheats = [p if p.scaling < 1 or p.target_kbps > 300 else cheat(p.target_kbps) for p in points]
     curves = draw_curves(cheats, SCORE)
@@ -124,7 +124,7 @@ def test_a_factor_with_no_use_for_more_bitrate_stays_as_good():
     assert at(curves, 4000, Fraction(1, 8)) == pytest.approx(quality(Fraction(1, 8), 400))
 
 
-def test_nothing_that_holds_its_target_is_refused():
+def test_points_that_all_miss_their_target_are_refused():
     with pytest.raises(ValueError, match="no encoding holds its target bitrate"):
         draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
 
@@ -191,7 +191,7 @@ def test_a_budget_of_the_processor_drops_large_factors():
         choose(grid(), replace(CRITERIA, cores=0.001))
 
 
-def test_what_a_person_should_know_is_said():
+def test_a_choice_warns_of_its_limits():
     unreached = choose(grid(), replace(CRITERIA, good=0.9999))
     assert unreached.b_full == 4000
     assert unreached.warnings[-1].startswith("b_full: mssim 0.9999 is not reached, 0.9")

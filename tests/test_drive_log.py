@@ -1,4 +1,4 @@
-"""What a side writes of a drive and what is read back: whole lines whatever happens, clear words on what is wrong."""
+"""What a side logs of a drive and what is read back: whole lines whatever happens, clear messages about errors."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ import sys
 from pathlib import Path
 from runner.drive.log import Log
 
-said = []
-log = Log(Path(sys.argv[1]), "vehicle", dict(), dict(), said.append)
+messages = []
+log = Log(Path(sys.argv[1]), "vehicle", dict(), dict(), messages.append)
 log.begin()
 {limit}
 for number in range({count}):
     log.note(f"{{number}} " + "x" * 5000)
 log.close()
-print(len(said), *said)
+print(len(messages), *messages)
 """
 
 
@@ -51,7 +51,7 @@ def child(directory: Path, count: str, limit: str = "") -> subprocess.Popen[str]
 
 
 def run(code: str, directory: Path) -> subprocess.CompletedProcess[str]:
-    """Python code in a process of its own, told a directory."""
+    """Python code in its own process, with a directory as argument."""
     command = [sys.executable, "-c", code, str(directory)]
     return subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=60, check=False)
 
@@ -92,29 +92,29 @@ def test_a_killed_process_loses_at_most_its_last_line(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
-    """A limit on the size of files is what a full disk is: a part of a line is written, then nothing."""
+    """A file size limit acts like a full disk: part of a line is written, then nothing."""
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (70_000, 70_000))"
     with child(tmp_path, "100", limit) as process:
-        told, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     first = "the drive continues without its log: drive.jsonl: no space left on device"
-    assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", told)
+    assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", output)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
     assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: has no end; the process was killed, or still runs"]
 
 
-def test_a_log_goes_on_when_the_disk_has_room_again(tmp_path: Path) -> None:
-    """Nothing is lost meanwhile: the lines wait."""
+def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
+    """Nothing is lost meanwhile: the lines are queued."""
     code = (
         "import resource, sys, time; from pathlib import Path; from runner.drive.log import Log\n"
-        "said = []; log = Log(Path(sys.argv[1]), 'vehicle', {}, {}, said.append); log.begin()\n"
+        "messages = []; log = Log(Path(sys.argv[1]), 'vehicle', {}, {}, messages.append); log.begin()\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))\n"
         "for n in range(99): log.note(f'{n} ' + 'x' * 1000)\n"
-        "while not said: time.sleep(0.01)\n"
+        "while not messages: time.sleep(0.01)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))\n"
-        "while len(said) < 2: time.sleep(0.01)\n"
-        "log.note('99'); log.close(); print(*said, sep='\\n')\n"
+        "while len(messages) < 2: time.sleep(0.01)\n"
+        "log.note('99'); log.close(); print(*messages, sep='\\n')\n"
     )
     done = run(code, tmp_path)
     assert done.stdout.splitlines() == [
@@ -126,10 +126,10 @@ def test_a_log_goes_on_when_the_disk_has_room_again(tmp_path: Path) -> None:
     assert [note.text.split()[0] for note in drive.sides["vehicle"].of(Note)] == [str(n) for n in range(100)]
 
 
-def test_a_disk_that_hangs_holds_up_nobody_and_what_is_dropped_is_counted(
+def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file is a pipe that nobody reads until all is said."""
+    """The file is a pipe that is not read until all notes are queued."""
     monkeypatch.setattr("runner.drive.log.QUEUED_LINES", 100)
     read_end, write_end = os.pipe()
     monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
@@ -148,19 +148,19 @@ def test_a_disk_that_hangs_holds_up_nobody_and_what_is_dropped_is_counted(
     assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: {dropped} lines were dropped, since the disk was too slow"]
 
 
-def test_a_disk_that_hangs_for_good_keeps_no_process_from_ending(
+def test_a_disk_that_hangs_for_good_does_not_keep_the_process_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("runner.drive.log.CLOSE_S", 0.1)
     read_end, write_end = os.pipe()
     monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
-    said: list[str] = []
-    log = Log(tmp_path, "vehicle", {}, {}, said.append)
+    messages: list[str] = []
+    log = Log(tmp_path, "vehicle", {}, {}, messages.append)
     log.begin()
     for _ in range(20):
         log.note("x" * 5000)
     log.close()
-    assert re.fullmatch(r"drive.jsonl: \d+ lines were not written", said[0])
+    assert re.fullmatch(r"drive.jsonl: \d+ lines were not written", messages[0])
     os.close(read_end)  # the thread of the log ends
 
 
@@ -183,7 +183,7 @@ def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
         assert [text.split()[1] for text in texts if text[0] == name] == [str(n) for n in range(200)]
 
 
-def test_where_nothing_can_be_written_is_told_before_the_drive(tmp_path: Path) -> None:
+def test_an_unwritable_directory_is_reported_before_the_drive(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"command line: log: '.*/file': (file exists|not a directory)"):
         begun(tmp_path / "file")
@@ -192,19 +192,19 @@ def test_where_nothing_can_be_written_is_told_before_the_drive(tmp_path: Path) -
         Log(tmp_path / "drive", "vehicle", {}, {}, print)
 
 
-def test_what_never_begins_leaves_nothing(tmp_path: Path) -> None:
+def test_a_log_that_never_begins_leaves_no_file(tmp_path: Path) -> None:
     log = Log(tmp_path, "vehicle", {}, {}, print)
     with pytest.raises(UserError, match="is empty: nothing was logged"):
         read_drive(tmp_path)
     log.close()
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "drive.jsonl").touch()  # of a process that was killed before it began
+    (tmp_path / "drive.jsonl").touch()  # left by a process that was killed before it began
     begun(tmp_path).close()
     assert len(written(tmp_path)) == 2
 
 
-def test_who_is_told_of_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None:
-    """As the operator's station does: what it is told becomes a note of the log that has just ended."""
+def test_the_callback_for_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None:
+    """As the operator's station does: it notes the message in the log that has just ended."""
     code = (
         "import resource, sys; from pathlib import Path; from runner.drive.log import Log\n"
         "log = Log(Path(sys.argv[1]), 'operator', {}, {}, lambda what: log.note(what))\n"
@@ -217,7 +217,7 @@ def test_who_is_told_of_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None
 
 
 def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
-    """A request may name any camera; that it is refused is a line, too."""
+    """A request may name any camera; its refusal is logged, too."""
     log = begun(tmp_path)
     event = CameraSwitched(t=0.1, camera="\ud800", on=False)
     log.event(event)
@@ -226,7 +226,7 @@ def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change, told",
+    "change, expected",
     [
         (lambda lines: [], "{file}: is empty: nothing was logged"),
         (lambda lines: lines[1:], "{file}: line 1: not the first line of a drive log: must be a file that log= wrote"),
@@ -247,7 +247,7 @@ def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_no_drive_is_told_with_its_line(tmp_path: Path, change: Any, told: str) -> None:
+def test_an_invalid_drive_is_reported_with_its_line(tmp_path: Path, change: Any, expected: str) -> None:
     log = begun(tmp_path)
     log.note("a")
     log.close()
@@ -255,10 +255,10 @@ def test_what_is_no_drive_is_told_with_its_line(tmp_path: Path, change: Any, tol
     file.write_text("".join(change(written(tmp_path))))
     with pytest.raises(UserError) as error:
         read_drive(tmp_path)
-    assert str(error.value).startswith(told.format(file=file))
+    assert str(error.value).startswith(expected.format(file=file))
 
 
-def test_a_directory_without_a_drive_is_told(tmp_path: Path) -> None:
+def test_a_directory_without_a_drive_is_reported(tmp_path: Path) -> None:
     for path, rule in (
         (tmp_path, "contains no drive log: neither drive.jsonl nor operator.jsonl"),
         (tmp_path / "nowhere", "no such directory"),

@@ -1,4 +1,4 @@
-"""The vocabulary: JSON and back, and what is told of lines that are no events."""
+"""The vocabulary: JSON and back, and messages about lines that are no events."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def roi(**keys: Any) -> dict[str, Any]:
         (clock(event="position_reported", lat=0, lon=-181), "lon: -181: must be at least -180"),
     ],
 )
-def test_what_is_no_event(document: Any, problem: str) -> None:
+def test_an_invalid_event_is_refused(document: Any, problem: str) -> None:
     assert event_problem(document) == problem
 
 
@@ -129,5 +129,5 @@ def test_what_is_no_event(document: Any, problem: str) -> None:
         ("[" * 100_000, "not JSON: nested too deeply"),
     ],
 )
-def test_what_is_no_json(line: str, problem: str) -> None:
+def test_invalid_json_is_refused(line: str, problem: str) -> None:
     assert read_line(line)[1] == problem

@@ -1,4 +1,4 @@
-"""Experiments and limited links as configuration: what they choose, what is wrong with them, what the link carries."""
+"""Experiments and limited links as configuration: their choices, their mistakes, the rate of the link."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_
     assert link.kind == "relay"
     rates = [link.limit.kbps_at(t / 10) / 2 for t in range(1000)]
     assert min(rates) == 3030 and max(rates) < 8000
-    assert rates[120] > 4000  # where the prediction, which looks ahead, is in the dip already
+    assert rates[120] > 4000  # while the prediction, which looks ahead, is already in the dip
     trace = tmp_path / "uplink.csv"
     trace.write_text("t_s,uplink_kbps\n0,1000\n1,2000\n")
     link = limited("link=netns", f"link.file={trace}", "link.share=1.5")
@@ -65,7 +65,7 @@ def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, expected",
     [
         (
             HEAD + "defaults: [_self_]\n" + TAIL + "pqos: {file: nowhere.csv}\n",
@@ -84,16 +84,16 @@ def test_a_link_follows_the_map_without_looking_ahead_or_a_trace_of_its_own(tmp_
         (HEAD + "defaults: [_self_]\nfsp_max: 3\n" + TAIL, "fsp_max: unknown key, did you mean fps_max?"),
     ],
 )
-def test_what_is_wrong_with_an_experiment_is_told_of_its_file(
-    tod: Command, conf: UserConf, text: str, told: str
+def test_mistakes_of_an_experiment_are_reported_for_its_file(
+    tod: Command, conf: UserConf, text: str, expected: str
 ) -> None:
     path = conf.write("experiment/mine.yaml", text).path / "experiment/mine.yaml"
     result = tod("validate", conf.word, *NARROW)
     assert result.status == 2
-    assert result.err.startswith(f"{path}: {told}"), result.err
+    assert result.err.startswith(f"{path}: {expected}"), result.err
 
 
-def test_a_run_that_cannot_be_composed_is_told(tod: Command, conf: UserConf) -> None:
+def test_a_run_that_cannot_be_composed_is_reported(tod: Command, conf: UserConf) -> None:
     runs = "experiment: {about: x, duration_s: 5, runs: {a: [modes=papr]}}\n"
     conf.write("experiment/mine.yaml", HEAD + "defaults: [_self_]\n" + runs)
     result = tod("validate", conf.word, *NARROW)
@@ -131,7 +131,7 @@ def test_a_link_joins_rtsp_only(tod: Command) -> None:
     assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
 
 
-def test_what_a_link_does_is_to_be_looked_at(tod: Command) -> None:
+def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:
     result = tod("demo", "link=relay", "source=test")
     assert result.status == 2
     rule = "needs a log to show its effect: give log=DIR or output=OUT"

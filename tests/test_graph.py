@@ -1,4 +1,4 @@
-"""Graphs compile to plain text, compared in full; knobs turn to assignments; text survives a shell."""
+"""Graphs compile to plain text, compared in full; knobs turn into assignments; text survives a shell."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_nothing_fills_an_unknown_placeholder() -> None:
     assert str(refused.value) == f"graph.vehicle[0].properties.mtu: '{{mtuu}}': {rule}"
 
 
-def test_a_source_may_not_bear_the_name_of_the_graphs() -> None:
+def test_a_source_may_not_use_the_name_of_an_element_of_the_graph() -> None:
     with pytest.raises(ModelError) as refused:
         plan(source=Source((Element("gate", "videotestsrc", {}),)))
     assert str(refused.value) == "source.elements[0].name: 'gate': is already the name of another element"
@@ -202,7 +202,7 @@ def test_a_clip_that_is_not_rendered_yet_has_a_stand_in() -> None:
     assert (rendered.stands_in, rendered.loops) == (False, True)
 
 
-def test_frames_born_in_python_are_printed_as_a_test_picture() -> None:
+def test_frames_generated_in_python_are_printed_as_a_test_picture() -> None:
     camera = vehicle("source=appsrc").cameras["front_left"]
     compiled = plan(camera)
     assert compiled.stands_in
@@ -248,7 +248,7 @@ def test_the_url_of_a_camera() -> None:
     assert rtsp_url(MEDIA, "front_left") == "rtsp://127.0.0.1:8554/front_left"
 
 
-# --- graphs that cannot be --------------------------------------------------------------------------------------------
+# --- invalid graphs -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_a_graph_is_valid_once_built(changes: dict[str, Any], message: str) -> N
     assert str(refused.value) == message
 
 
-def test_a_knob_that_cannot_offer_what_is_asked_of_it() -> None:
+def test_a_knob_that_cannot_offer_the_requested_value() -> None:
     wrong = replace(graph(), knobs={"bitrate": (KnobTarget("pay0", "x", "left"),)})
     with pytest.raises(ModelError) as refused:
         assignments(replace(LEFT, graph=wrong), "bitrate", 1)

@@ -1,4 +1,4 @@
-"""Graphs that build on each other: one part replaced, the rest taken over, problems reported where they are written."""
+"""Graphs that build on each other: one part replaced, the rest inherited, problems reported with their file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_an_encoder_is_replaced_alone(conf: UserConf) -> None:
     conf.write("graph/mine.yaml", OPEN + ENCODER + "  - {name: parse, element: h264parse}\n")
     mine = graph(conf, "graph=mine")
     assert names(mine) == "gate crop scaler size encoder parse sent pay0"
-    assert mine.vehicle[4].properties == {"complexity": "low"}  # and nothing of x264enc's
+    assert mine.vehicle[4].properties == {"complexity": "low"}  # and none of x264enc's
 
 
 @pytest.mark.parametrize("camera, factory", [("front_left", "openh264enc"), ("front_right", "x264enc")])
@@ -114,7 +114,7 @@ def test_a_path_is_the_one_in_the_file(conf: UserConf, tod: Command, old: str, n
 
 def test_a_part_that_no_list_takes_in_is_refused(conf: UserConf, tod: Command) -> None:
     conf.change("graph/h264_rtsp.yaml", {"  - ${..encoder}\n": ENCODER})
-    # The packaged graph gives an encoder, and the user's list does without: nobody would notice.
+    # The packaged graph defines an encoder that the user's list would silently ignore.
     assert tod("print", "source=test", "graph=openh264_rtsp", conf.word).problems == [
         f"conf/graph/openh264_rtsp.yaml: {UNUSED}"
     ]

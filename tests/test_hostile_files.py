@@ -1,4 +1,4 @@
-"""Files and words that are no configuration: refused with a sentence, soon, without much memory."""
+"""Hostile files and words: refused with one message, quickly, without much memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _interpolations(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "make, told",
+    "make, expected",
     [
         (_aliases, "line 5: must hold at most 10000 values, aliases written out"),
         (_merges, "line 5: must hold at most 10000 values, aliases written out"),
@@ -56,7 +56,7 @@ def _interpolations(path: Path) -> None:
     ],
 )
 def test_a_file_is_refused_before_it_does_harm(
-    conf: UserConf, tod: Command, make: Callable[[Path], None], told: str
+    conf: UserConf, tod: Command, make: Callable[[Path], None], expected: str
 ) -> None:
     path = conf.write("modes/paper.yaml", "").path / "modes" / "mine.yaml"
     path.with_name("paper.yaml").unlink()
@@ -66,7 +66,7 @@ def test_a_file_is_refused_before_it_does_harm(
         problems = tod(verb, "source=test", "modes=mine", conf.word).problems
         assert time.process_time() - began < LONGEST_S
         if verb == "print" or make is not _interpolations:  # whose keys the schema does not know
-            assert problems[0].startswith(f"{path}: {told}")
+            assert problems[0].startswith(f"{path}: {expected}")
 
 
 def test_files_that_build_on_each_other_in_a_circle(conf: UserConf, tod: Command) -> None:
@@ -98,16 +98,16 @@ def test_the_package_may_stand_in_any_comment_at_the_top(conf: UserConf, tod: Co
 
 
 @pytest.mark.parametrize(
-    "word, told",
+    "word, expected",
     [
         ("a=" + "[" * 40, "is too long or nested too deeply, write it into a file"),
         ("a=" + "x" * 5000, "is too long or nested too deeply, write it into a file"),
         ("fps_max=" + "9" * 400, "must have at most 300 digits"),
     ],
 )
-def test_words_have_limits_too(tod: Command, word: str, told: str) -> None:
+def test_words_have_limits_too(tod: Command, word: str, expected: str) -> None:
     (problem,) = tod("print", "source=test", word).problems
-    assert problem.startswith("command line: ") and problem.endswith(told) and len(problem) < 200
+    assert problem.startswith("command line: ") and problem.endswith(expected) and len(problem) < 200
 
 
 @pytest.mark.parametrize(
@@ -116,12 +116,12 @@ def test_words_have_limits_too(tod: Command, word: str, told: str) -> None:
         ({"a": 1, "b": "${a}"}, 4, True),
         ({"a": 1, "b": "${a}"}, 3, False),
         ({"a": [1, 2], "b": ["${a}", "${.[0]}", "${..a}"]}, 18, True),
-        ({"a": "${a}"}, 2, True),  # a circle, which OmegaConf tells
+        ({"a": "${a}"}, 2, True),  # a circle, which OmegaConf reports
         ({"a": "${nope.x}"}, 3, True),
         ({"a": "x" * 1000}, 5, False),
     ],
 )
-def test_what_interpolations_come_to(document: object, most: int, fits: bool) -> None:
+def test_the_size_of_interpolations_is_limited(document: object, most: int, fits: bool) -> None:
     assert written_out(document, most) is fits
 
 
@@ -141,7 +141,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
 
 
 @pytest.mark.parametrize(
-    "word, told",
+    "word, expected",
     [
         (
             "modes.automatic=[{total_from_prediction: {}}]",
@@ -156,8 +156,8 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
         ("~cameras.front_left.fps", "cameras.front_left.fps: missing: must be given"),
     ],
 )
-def test_a_mistake_of_the_command_line_is_blamed_on_it(tod: Command, word: str, told: str) -> None:
-    assert tod("print", "source=test", word).problems == [f"command line: {told}"]
+def test_a_mistake_of_the_command_line_is_blamed_on_it(tod: Command, word: str, expected: str) -> None:
+    assert tod("print", "source=test", word).problems == [f"command line: {expected}"]
 
 
 def test_a_file_that_breaks_what_it_builds_on_is_blamed(conf: UserConf, tod: Command) -> None:
@@ -200,7 +200,7 @@ def test_the_password_of_a_camera_is_not_printed(tod: Command, form: str) -> Non
     assert "passwords of addresses are left out" in result.err
 
 
-def test_nor_told_in_a_message(tod: Command) -> None:
+def test_nor_shown_in_a_message(tod: Command) -> None:
     result = tod("print", "source=test", f'media.port="{ADDRESS}"', f'+source.clip.x="{ADDRESS}"')
     assert result.status == 2
     assert "s3cr" not in result.err and "10.0.0.1" in result.err

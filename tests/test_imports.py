@@ -1,4 +1,4 @@
-"""What each verb loads: how much of the project, and which heavy packages of others."""
+"""What each verb loads: how many modules of the project, and which heavy third-party packages."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
     return own, set(every).intersection(HEAVY)
 
 
-RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and asks GStreamer's registry
+RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (37, COMPOSING),
     "replay": (39, COMPOSING),
     "validate": (71, COMPOSING | {"numpy", "gi"}),

@@ -1,4 +1,4 @@
-"""What waits for the loop: order, fairness, bounds."""
+"""Requests queued for the loop: order, fairness, bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from runner.vehicle.inbox import MEASUREMENTS, ROUND_S, SENDERS, TAKEN, WAITING, Inbox, Request
 
 
-def asked(sender: str, event: str, **keys: Any) -> Request:
+def make_request(sender: str, event: str, **keys: Any) -> Request:
     return Request(sender, {"event": event, **keys})
 
 
@@ -25,22 +25,22 @@ def all_of(inbox: Inbox, rounds: int = 1) -> list[Request]:
 def test_one_request_of_each_sender_in_turn() -> None:
     inbox = Inbox()
     for number in range(3):
-        inbox.put(asked("a", "total_set", kbps=number))
-    inbox.put(asked("b", "total_set", kbps=9))
+        inbox.put(make_request("a", "total_set", kbps=number))
+    inbox.put(make_request("b", "total_set", kbps=9))
     assert [(r.sender, r.document["kbps"]) for r in all_of(inbox)] == [("a", 0), ("b", 9), ("a", 1), ("a", 2)]
 
 
 def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_of_the_mode() -> None:
     inbox = Inbox()
-    first = asked("a", "bitrate_predicted", kbps=1)
+    first = make_request("a", "bitrate_predicted", kbps=1)
     assert inbox.put(first) is None
-    assert inbox.put(asked("a", "total_set", kbps=5)) is None
-    assert inbox.put(asked("a", "link_measured", camera="x", kbps=1)) is None
-    assert inbox.put(asked("a", "link_measured", camera="y", kbps=1)) is None
-    assert inbox.put(asked("a", "bitrate_predicted", kbps=2)) is first
-    assert inbox.put(asked("b", "bitrate_predicted", kbps=7)) is None
-    inbox.put(asked("a", "mode_selected", mode="single"))
-    assert inbox.put(asked("a", "bitrate_predicted", kbps=3)) is None
+    assert inbox.put(make_request("a", "total_set", kbps=5)) is None
+    assert inbox.put(make_request("a", "link_measured", camera="x", kbps=1)) is None
+    assert inbox.put(make_request("a", "link_measured", camera="y", kbps=1)) is None
+    assert inbox.put(make_request("a", "bitrate_predicted", kbps=2)) is first
+    assert inbox.put(make_request("b", "bitrate_predicted", kbps=7)) is None
+    inbox.put(make_request("a", "mode_selected", mode="single"))
+    assert inbox.put(make_request("a", "bitrate_predicted", kbps=3)) is None
     own = [r.document for r in all_of(inbox) if r.sender == "a"]
     assert [(d["event"], d.get("kbps")) for d in own] == [
         ("total_set", 5),
@@ -52,34 +52,34 @@ def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_o
     ]
 
 
-def test_what_is_too_much_is_refused_and_others_are_not_concerned() -> None:
+def test_excess_requests_are_refused_and_others_are_not_affected() -> None:
     inbox = Inbox()
-    requests = [asked("flood", "total_set", kbps=n) for n in range(WAITING + 5)]
+    requests = [make_request("flood", "total_set", kbps=n) for n in range(WAITING + 5)]
     assert [inbox.put(r) is r for r in requests] == [False] * WAITING + [True] * 5
-    assert inbox.put(asked("a", "total_set", kbps=1)) is None
+    assert inbox.put(make_request("a", "total_set", kbps=1)) is None
     for number in range(2 * SENDERS):
-        inbox.put(asked(f"stranger{number}", "total_set", kbps=1))
+        inbox.put(make_request(f"stranger{number}", "total_set", kbps=1))
     assert len(all_of(inbox, rounds=2)) == WAITING + SENDERS - 1
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from([*MEASUREMENTS, "total_set", "mode_selected"]))))
 def test_requests_are_never_merged_or_reordered(puts: list[tuple[str, str]]) -> None:
     inbox = Inbox()
-    kept = [r for n, (who, event) in enumerate(puts) if inbox.put(r := asked(who, event, n=n)) is not r]
+    kept = [r for n, (sender, event) in enumerate(puts) if inbox.put(r := make_request(sender, event, n=n)) is not r]
     taken = all_of(inbox, rounds=2 if len(puts) > TAKEN else 1)
-    for who in "abc":
-        numbers = [r.document["n"] for r in taken if r.sender == who]
+    for sender in "abc":
+        numbers = [r.document["n"] for r in taken if r.sender == sender]
         assert numbers == sorted(numbers)
-        wanted = [r.document["n"] for r in kept if r.sender == who and r.measures is None]
-        assert [r.document["n"] for r in taken if r.sender == who and r.measures is None] == wanted
+        wanted = [r.document["n"] for r in kept if r.sender == sender and r.measures is None]
+        assert [r.document["n"] for r in taken if r.sender == sender and r.measures is None] == wanted
 
 
 def test_a_flood_is_taken_a_few_at_a_time_and_others_go_between() -> None:
     inbox = Inbox()
     for number in range(WAITING):
-        inbox.put(asked("flood", "total_set", kbps=number))
+        inbox.put(make_request("flood", "total_set", kbps=number))
     assert len(all_of(inbox)) == TAKEN
-    inbox.put(asked("a", "total_set", kbps=1))
+    inbox.put(make_request("a", "total_set", kbps=1))
     assert [request.sender for request in all_of(inbox)] == ["a"]
     assert len(all_of(inbox, rounds=2)) == WAITING - TAKEN
 

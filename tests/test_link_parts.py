@@ -15,13 +15,13 @@ KBPS, QUEUE_MS = 800, 100  # 100 bytes in a ms
 arrivals = st.lists(st.tuples(st.floats(0, 0.05), st.integers(28, 1500)), min_size=1, max_size=60)  # gap s, bytes
 
 
-def passed(packets, looks=()):
-    """What a bucket does with packets (time, size), looked at in between: (time, index) of each, and the bucket."""
+def passed(packets, polls=()):
+    """Pass packets (time, size) through a bucket, polled in between: (time, index) of each, and the bucket."""
     bucket = Bucket(KBPS, QUEUE_MS, 0.0)
     left = []
     for index, (t, size) in enumerate(packets):
-        for look in looks:
-            left += bucket.take(min(look, t)) if look <= t else ()
+        for poll in polls:
+            left += bucket.take(min(poll, t)) if poll <= t else ()
         bucket.put(size, index, t)
     left += bucket.take(1e9)
     return left, bucket
@@ -58,11 +58,11 @@ def test_packets_pass_in_order_and_none_waits_longer_than_the_queue(gaps):
 
 
 @given(arrivals, st.lists(st.floats(0, 2), max_size=20))
-def test_who_looks_late_finds_the_same(gaps, looks):
-    assert passed(timed(gaps), sorted(looks))[0] == passed(timed(gaps))[0]
+def test_late_polls_give_the_same_result(gaps, polls):
+    assert passed(timed(gaps), sorted(polls))[0] == passed(timed(gaps))[0]
 
 
-def test_a_full_queue_drops_and_says_how_long_it_is():
+def test_a_full_queue_drops_and_reports_its_length():
     bucket = Bucket(KBPS, QUEUE_MS, 0.0)
     for index in range(20):
         bucket.put(1000, index, 0.0)
@@ -73,7 +73,7 @@ def test_a_full_queue_drops_and_says_how_long_it_is():
     assert bucket.counters(0.0).dropped == 7
 
 
-def test_a_new_rate_holds_for_what_waits():
+def test_a_new_rate_applies_to_queued_packets():
     bucket = Bucket(KBPS, QUEUE_MS, 0.0)
     for index in range(5):
         bucket.put(1000, index, 0.0)
@@ -84,7 +84,7 @@ def test_a_new_rate_holds_for_what_waits():
     assert bucket.due() == pytest.approx(0.002 + (1000 - 28 - 110) / 100_000)
 
 
-def test_a_slow_link_has_room_for_a_packet_and_never_stands_still():
+def test_a_slow_link_has_room_for_a_packet_and_never_stalls():
     limit = Limit(lambda t: 0.0, queue_ms=10, delay_ms=0)
     assert limit.kbps(5) == 1
     assert queue_bytes(1, 10) == burst_bytes(1) == 3028
@@ -104,13 +104,13 @@ PACKET = b"$\x00\x00\x06\r\n\r\nab"
 
 
 @given(st.lists(st.sampled_from([SETUP, REPLY, SDP, PACKET]), max_size=6), st.integers(1, 90))
-def test_rtsp_is_cut_into_the_same_units_however_it_comes(sent, chunk):
+def test_rtsp_is_cut_into_the_same_units_however_it_arrives(sent, chunk):
     data, units = b"".join(sent), Units()
     pieces = (data[start : start + chunk] for start in range(0, len(data), chunk))
     assert [unit for piece in pieces for unit in units.feed(piece)] == sent
 
 
-def test_what_never_ends_is_not_rtsp():
+def test_a_header_that_never_ends_is_not_rtsp():
     with pytest.raises(ValueError, match="no end of an RTSP header"):
         list(Units().feed(b"x" * 70_000))
 

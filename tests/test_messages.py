@@ -1,4 +1,4 @@
-"""Messages of the control link as they come from outside: size, form."""
+"""Messages of the control link as they are received: size, form."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def test_a_request_has_a_limited_size() -> None:
 @pytest.mark.parametrize(
     ("payload", "problem"), [(b"{", "not JSON: "), (b"[1]", "must be a mapping with id and event"), (b"", "not JSON: ")]
 )
-def test_what_is_no_message(payload: bytes, problem: str) -> None:
+def test_an_invalid_message_is_refused(payload: bytes, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         read_message(payload)

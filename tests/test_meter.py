@@ -1,4 +1,4 @@
-"""Rates over the last second, and how well what comes follows what was decided, by hand-made counters."""
+"""Rates over the last second, and how well reception follows the decision, with hand-made counters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Decided:
     height: int = 260
 
 
-def fed(meter: ReceptionMeter, seconds: float, fps: int = 20, kbps: int = 800, decided: Decided | None = None) -> None:
+def feed(meter: ReceptionMeter, seconds: float, fps: int = 20, kbps: int = 800, decided: Decided | None = None) -> None:
     """Four samples a second of a steady stream."""
     for sample in range(int(4 * seconds) + 1):
         t = sample / 4
@@ -41,15 +41,15 @@ def fed(meter: ReceptionMeter, seconds: float, fps: int = 20, kbps: int = 800, d
 def test_rates_are_those_of_the_last_second() -> None:
     meter = ReceptionMeter(fps=20)
     assert meter.add(0.0, Counters(0, 0), None).kbps == 0
-    fed(meter, 3)
-    for sample in range(1, 5):  # then nothing comes
+    feed(meter, 3)
+    for sample in range(1, 5):  # then nothing arrives
         rates = meter.add(3 + sample / 4, Counters(60, 300_000), None)
     assert (rates.fps, rates.kbps) == (0, 0)
 
 
 def test_windows_count_once_the_decision_is_settled() -> None:
     meter = ReceptionMeter(fps=20)
-    fed(meter, 5, decided=Decided())
+    feed(meter, 5, decided=Decided())
     assert meter.windows == 4  # at 1.5, 2.5, 3.5 and 4.5 s
     assert meter.followed == [pytest.approx(1.0)] * 4
     assert (meter.short, meter.sizes, meter.latencies_ms) == (0, {(480, 260): 4}, [12.0] * 4)
@@ -57,14 +57,14 @@ def test_windows_count_once_the_decision_is_settled() -> None:
 
 def test_what_falls_short_of_the_decision_is_counted() -> None:
     meter = ReceptionMeter(fps=40)
-    fed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
+    feed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
     assert meter.followed == [pytest.approx(0.5)] * 4
     assert (meter.short, meter.sizes) == (4, {})
 
 
 def test_nothing_is_compared_while_nothing_is_to_be_sent() -> None:
     meter = ReceptionMeter(fps=20)
-    fed(meter, 5, decided=Decided(sending=False))
+    feed(meter, 5, decided=Decided(sending=False))
     assert meter.windows == 0
 
 

@@ -47,7 +47,7 @@ def frame(number: int = 0) -> Luma:
 
 
 def blurred(luma: Luma, factor: float = 0.5) -> Luma:
-    """As a lane of that scaling factor shows it, were its encoder perfect."""
+    """The output of a lane of that scaling factor with a perfect encoder."""
     small = cv2.resize(luma, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return cv2.resize(small, luma.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
@@ -161,7 +161,7 @@ def test_psnr_is_its_definition(seed: int, height: int, width: int) -> None:
 
 
 def reference_map(x: Luma, y: Luma) -> tuple[float, Any]:
-    """MSSIM and the map of SSIM by scikit-image, set as Wang's code is."""
+    """MSSIM and the map of SSIM by scikit-image, configured like Wang's code."""
     skimage = pytest.importorskip("skimage.metrics")
     options: Any = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
     mean, found = skimage.structural_similarity(x, y, full=True, **options)
@@ -220,7 +220,7 @@ def test_vmaf_of_the_published_pair(vmaf: Metric) -> None:
         assert len(scores) == 5 and np.mean(scores) == pytest.approx(published, abs=1e-4)
 
 
-def test_vmaf_says_what_it_is(vmaf: Metric) -> None:
+def test_vmaf_states_its_identity(vmaf: Metric) -> None:
     tool = vmaf_module.find_tool()
     assert vmaf.identity.startswith("vmaf of luma, vmaf_v0.6.1, 8 bit, libvmaf ")
     assert vmaf.identity.endswith(f", ffmpeg {tool.version}")
@@ -305,7 +305,7 @@ def test_vmaf_process_that_dies(vmaf: Metric, when: str) -> None:
 
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
-    """An ffmpeg that knows libvmaf and does what the given shell words say when it should score."""
+    """An ffmpeg that has libvmaf and runs the given shell words instead of scoring."""
 
     def write(words: str, filters: str = " .. libvmaf           VV->V      Calculate the VMAF") -> str:
         exe = tmp_path / "ffmpeg"
@@ -322,7 +322,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str
     return write
 
 
-def test_vmaf_tells_why_ffmpeg_ended(fake: Callable[[str], str]) -> None:
+def test_vmaf_reports_why_ffmpeg_ended(fake: Callable[[str], str]) -> None:
     fake("echo '[libvmaf @ 0x1] no memory left' >&2; echo 'Conversion failed!' >&2; exit 3")
     with pytest.raises(RunError, match=r"^ffmpeg failed to score VMAF: no memory left$"):
         find_metric("vmaf")
@@ -338,7 +338,7 @@ def test_vmaf_without_scores(fake: Callable[[str], str]) -> None:
         meter.close()
 
 
-def test_vmaf_gives_up_on_a_process_that_stands(fake: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vmaf_gives_up_on_a_process_that_hangs(fake: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vmaf_module, "PATIENCE_S", 0.2)
     exe = fake("exec sleep 60")
     meter: Any = vmaf_module.VmafMeter(vmaf_module.Tool(exe, ""), VMAF_MODEL, (1280, 720), FPS, 1)
@@ -439,7 +439,7 @@ def test_brisque_features_of_a_drive() -> None:
         assert brisque_module.features(picture) == pytest.approx(slow_features(picture), abs=2e-4)
 
 
-def test_brisque_features_of_what_is_no_scene() -> None:
+def test_brisque_features_of_artificial_pictures() -> None:
     """Flat pictures and odd sizes give numbers, not warnings."""
     for picture in (np.full((40, 40), 255, np.uint8), np.zeros((14, 14), np.uint8), noise(0, 31, 45)):
         assert np.isfinite(brisque_module.features(picture)).all()
@@ -478,8 +478,8 @@ def opencv_files(directory: Path) -> tuple[Path, Path]:
 
 
 def test_regression_by_hand(tmp_path: Path) -> None:
-    features = np.full(36, 0.5)  # in the middle of its range, so 0, are all but
-    features[:3] = 3, 0.5, 9  # 0.5, 0.5 and, as it has no range, 0
+    features = np.full(36, 0.5)  # the middle of each range, scaled to 0, except for
+    features[:3] = 3, 0.5, 9  # these: 0.5, 0.5 and, as it has no range, 0
     # Squared distances: 1.5^2 + 0.25^2, and 0.5^2 + 0.5^2 + 0.75^2
     expected = 12.5 * math.exp(-0.05 * 2.3125) - 7 * math.exp(-0.05 * 1.0625) + 30.5
     identities = set()

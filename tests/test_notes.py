@@ -1,4 +1,4 @@
-"""What the operator reads of a decision: one phrase, whatever it changes."""
+"""The operator's note about a decision: one phrase, whatever it changes."""
 
 from __future__ import annotations
 

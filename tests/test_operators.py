@@ -32,7 +32,7 @@ def test_any_message_of_its_own_brings_an_operator_back() -> None:
     assert operators.present == {"a"}
 
 
-def test_who_never_announced_itself_is_no_operator() -> None:
+def test_a_sender_that_never_announced_itself_is_no_operator() -> None:
     operators = Operators(1.0)
     assert not operators.message_received("predictor", 0.0)
     assert operators.present == frozenset()
@@ -65,7 +65,7 @@ def test_the_longest_absent_is_forgotten_first() -> None:
     [
         ([], 0.99, None),
         ([], 1.01, "1.01 s old, limit 1.00 s"),
-        ([0.2, 0.3], 1.19, None),  # beyond the round trip, the least delay there was
+        ([0.2, 0.3], 1.19, None),  # besides the round trip, the smallest delay so far
         ([0.2, 0.3], 1.21, "1.21 s old, limit 1.20 s"),
         ([6.0, 6.0], 6.0, f"6.00 s old, limit {1 + MAX_ROUND_TRIP_S:.2f} s"),
         ([0.01] + [0.4] * DELAYS, 1.39, None),  # the path has become longer

@@ -1,4 +1,4 @@
-"""What is said of a camera that fails again and again."""
+"""Messages about a camera that fails repeatedly."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from runner.gst.outage import Outage
 pytestmark = pytest.mark.gst  # the package runner.gst loads it
 
 
-def test_each_reason_is_told_once_and_the_end_with_its_length():
-    told = []
-    outage = Outage(told.append)
+def test_each_reason_is_reported_once_and_the_end_with_its_length():
+    messages = []
+    outage = Outage(messages.append)
     assert outage.reason is None
     outage.failed("no frame for 1 s", 10.0)
     for second in range(12, 30):
         outage.failed("refused" if second % 2 else "no frame for 1 s", float(second))
     assert outage.reason == "no frame for 1 s"
-    assert told == ["no frame for 1 s", "refused"]
+    assert messages == ["no frame for 1 s", "refused"]
     outage.over(30.2)
-    assert told[2:] == ["works again after 20 s"]
+    assert messages[2:] == ["works again after 20 s"]
     assert outage.reason is None
 
 
-def test_what_fails_again_is_told_again():
-    told = []
-    outage = Outage(told.append)
+def test_a_new_failure_is_reported_again():
+    messages = []
+    outage = Outage(messages.append)
     for began in (0.0, 10.0):
         outage.failed("refused", began)
         outage.over(began + 1)
-    assert told == ["refused", "works again after 1 s"] * 2
+    assert messages == ["refused", "works again after 1 s"] * 2
 
 
-def test_nothing_is_told_where_nothing_failed():
-    told = []
-    Outage(told.append).over(1.0)
-    assert told == []
+def test_nothing_is_reported_if_nothing_failed():
+    messages = []
+    Outage(messages.append).over(1.0)
+    assert messages == []

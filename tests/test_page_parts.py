@@ -1,4 +1,4 @@
-"""What the page's server is made of: queues of a viewer, control, history."""
+"""Parts of the page's server: a viewer's queues, control, history."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def unit(number, key=False, captured=None):
 
 
 def sent(viewer):
-    """Everything that waits: texts as their kind, units as (camera, flags, number)."""
+    """Everything queued: texts as their kind, units as (camera, flags, number)."""
     messages = []
     while (message := viewer.pop()) is not None:
         if isinstance(message, str):
@@ -59,12 +59,12 @@ def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
     with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as line:
         line.sendall(begun.replace(b"PORT", str(port).encode()))
         with suppress(ConnectionResetError):
-            while line.recv(65536):  # the answer to what is finished, then the end
+            while line.recv(65536):  # the response to the finished request, then the end
                 pass
 
 
 @pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])
-def test_what_is_no_http_is_refused_without_a_traceback(line, caplog, capfd):
+def test_invalid_http_is_refused_without_a_traceback(line, caplog, capfd):
     with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         connection.sendall(line + b"\r\n\r\n")
         assert connection.recv(12)[:10] in (b"HTTP/1.0 4", b"HTTP/1.1 4")
@@ -93,11 +93,11 @@ def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
     assert sent(viewer) == [(0, 0, 9), (0, KEY, 10)]
 
 
-def test_a_burst_of_one_is_drawn_and_none_is_waited_for():
-    come = []
-    viewer = PageViewer("me", 1, lambda camera: come)
+def test_a_viewer_waits_for_a_burst_and_a_burst_of_one_is_drawn():
+    burst = []
+    viewer = PageViewer("me", 1, lambda camera: burst)
     assert sent(viewer) == []
-    come.append(unit(0, key=True))
+    burst.append(unit(0, key=True))
     assert sent(viewer) == [(0, KEY | RESTART, 0)]
 
 
@@ -139,7 +139,7 @@ def test_control_belongs_to_one_page():
     assert [control.seen_by(page) for page in "ab"] == ["you", "another"]
     control.take("b")
     assert [control.seen_by(page) for page in "ab"] == ["another", "you"]
-    control.release("a")  # not its to give
+    control.release("a")  # not the holder
     assert control.seen_by("b") == "you"
     control.release("b")
     assert [control.seen_by(page) for page in "ab"] == ["nobody", "nobody"]
@@ -187,7 +187,7 @@ def test_history_keeps_a_point_a_second_for_minutes():
     assert columns["cameras"]["front"]["kbps"] == columns["time"]
 
 
-def test_history_has_a_place_for_what_was_not_known():
+def test_history_keeps_none_for_unknown_values():
     history = History()
     history.add(sample(0))
     history.add(sample(1, position=Position(48.1, 11.6)))

@@ -1,4 +1,4 @@
-"""Sources of predictions: grid look-up against brute force, heading, what is said off the map, traces over time."""
+"""Sources of predictions: grid look-up against brute force, heading, predictions off the map, traces over time."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def kbps(pqos: Pqos, event: Any) -> Fraction:
 
 
 def brute_force(places: Any, rates: Any, radius_m: float, way: Way) -> float | None:
-    """The same answer from the definition alone, one point after the other."""
+    """The same answer from the definition alone, one point at a time."""
     best = None
     for (lat, lon), rate in zip(places, rates, strict=True):
         x = math.radians(lon - way.lon) * EARTH_M * math.cos(math.radians(way.lat))
@@ -121,7 +121,7 @@ def test_antimeridian_is_no_long_way() -> None:
 
 @pytest.mark.parametrize("extent_m", [600, 100_000])
 def test_a_million_points_are_looked_up_at_once(extent_m: float) -> None:
-    """Bounds of processor time; bench/pqos_map.py measures."""
+    """Limits are in processor time; bench/pqos_map.py measures."""
     random = np.random.default_rng(1)
     lat, lon = 48 + random.uniform(0, extent_m, (2, 1_000_000)) / 111_000
     start = time.process_time()
@@ -152,7 +152,7 @@ def test_lowest_within_radius() -> None:
         (41, 10, 90, 3000),
         (50, 10, 270, 5000),  # looks the other way
         (50, 10, 0, 5000),
-        (50, 0, 90, 5000),  # stands
+        (50, 0, 90, 5000),  # standstill
         (89, 0, 90, 5000),
         (91, 0, 90, 3000),
     ],
@@ -163,13 +163,13 @@ def test_look_ahead(east: float, speed: float, heading: float, expected: int) ->
 
 def test_heading_and_speed_from_movement() -> None:
     pqos = make_map(ROAD, look_ahead_s=5)
-    assert kbps(pqos, at(0, 40)) == 5000  # nothing is known to move yet
+    assert kbps(pqos, at(0, 40)) == 5000  # no movement is known yet
     assert kbps(pqos, at(1, 50)) == 3000  # 10 m/s eastwards
     assert kbps(pqos, at(2, 40)) == 5000  # and back
 
 
 def test_fast_gps_scatter_is_no_movement() -> None:
-    """20 Hz, standing, 0.2 m of scatter: 4 m/s from one position to the next, yet the car stands."""
+    """20 Hz at standstill, 0.2 m of scatter: 4 m/s from one position to the next, though the car does not move."""
     pqos = make_map(ROAD, look_ahead_s=5)
     found = [kbps(pqos, at(i / 20, 80 + 0.1 * (-1) ** i)) for i in range(100)]
     assert set(found[11:]) == {5000}  # the first half second has no longer baseline to judge by
@@ -214,7 +214,7 @@ def test_rate_is_exact_and_validity_is_passed_on(tmp_path: Path) -> None:
     assert pqos.observe(ClockAdvanced(t=4)) is None
 
 
-def test_swapped_map_is_told_once() -> None:
+def test_swapped_map_is_reported_once() -> None:
     lat, lon = degrees(0, 0)
     pqos = MapPqos(BandwidthMap(np.array([lon]), np.array([lat]), np.array([9000.0]), 10), 2, Fraction(700))
     assert pqos.warnings == ()
@@ -227,7 +227,7 @@ def test_swapped_map_is_told_once() -> None:
 
 
 @pytest.mark.parametrize("lat, lon", [(48.1, 11.0), (11.0, 11.0), (11.0, 120.0)])
-def test_a_dead_spot_is_not_told(lat: float, lon: float) -> None:
+def test_a_dead_spot_is_not_reported(lat: float, lon: float) -> None:
     pqos = make_map([(0, 0, 9000)])
     assert kbps(pqos, PositionReported(t=0, lat=lat, lon=lon)) == 700
     assert pqos.warnings == ()
@@ -239,8 +239,8 @@ MAP = {"kind": "map", "file": "maps/demo_loop.csv", "radius_m": 15, "look_ahead_
 TRACE = {"kind": "trace", "file": "trace.csv", "loop": False, "off_trace_kbps": 200, "period_s": 0.5}
 
 
-def said(pqos: Pqos, times: Any) -> list[tuple[float, float]]:
-    """What a source says on clock events, as (t, kbit/s)."""
+def predictions(pqos: Pqos, times: Any) -> list[tuple[float, float]]:
+    """A source's predictions on clock events, as (t, kbit/s)."""
     found = (pqos.observe(ClockAdvanced(t=float(t))) for t in times)
     return [(event.t, float(event.kbps)) for event in found if event]
 
@@ -248,11 +248,11 @@ def said(pqos: Pqos, times: Any) -> list[tuple[float, float]]:
 def test_trace(tmp_path: Path) -> None:
     (tmp_path / "trace.csv").write_text("t_s,lat,lon,uplink_kbps\n1,,,5000\n2,,,6000\n2.4,,,3000\n")
     once = build_pqos({**TRACE, "period_s": 10}, [tmp_path])
-    assert said(once, [0, 0.9, 1, 1.999, 2, 2.3, 2.4, 2.79, 2.9, 9]) == [
+    assert predictions(once, [0, 0.9, 1, 1.999, 2, 2.3, 2.4, 2.79, 2.9, 9]) == [
         (0, 200), (1, 5000), (2, 6000), (2.4, 3000), (2.9, 200),
     ]  # fmt: skip
     loop = build_pqos({**TRACE, "period_s": 10, "loop": True}, [tmp_path])
-    assert said(loop, [0, 1, 2, 2.4, 2.81, 3.81, 4.21]) == [
+    assert predictions(loop, [0, 1, 2, 2.4, 2.81, 3.81, 4.21]) == [
         (0, 200), (1, 5000), (2, 6000), (2.4, 3000), (2.81, 5000), (3.81, 6000), (4.21, 3000),
     ]  # fmt: skip
 
@@ -262,13 +262,13 @@ def test_unchanged_is_repeated_each_period(tmp_path: Path, kind: str) -> None:
     (tmp_path / "trace.csv").write_text("t_s,kbps\n0,5000\n100,5000\n")
     constant = {"kind": "constant", "kbps": 5000, "period_s": 0.5}
     pqos = build_pqos(constant if kind == "constant" else TRACE, [tmp_path])
-    assert [t for t, _ in said(pqos, np.arange(21) * 0.1)] == pytest.approx([0, 0.5, 1, 1.5, 2])
+    assert [t for t, _ in predictions(pqos, np.arange(21) * 0.1)] == pytest.approx([0, 0.5, 1, 1.5, 2])
     assert pqos.observe(OperatorConnected(t=2.2)) is None
     assert pqos.observe(OperatorConnected(t=2.6)) == BitratePredicted(t=2.6, kbps=Fraction(5000))
 
 
 @given(st.lists(st.integers(0, 5), min_size=2, max_size=8), st.lists(st.floats(0, 20), min_size=1, max_size=30))
-def test_what_a_trace_said_last_is_in_force(tmp_path_factory: Any, rates: list[int], times: list[float]) -> None:
+def test_the_last_rate_of_a_trace_is_in_force(tmp_path_factory: Any, rates: list[int], times: list[float]) -> None:
     folder = tmp_path_factory.mktemp("trace")
     (folder / "trace.csv").write_text("t_s,kbps\n" + "".join(f"{t},{rate}\n" for t, rate in enumerate(rates)))
     pqos, last = build_pqos({**TRACE, "loop": True}, [folder]), None
@@ -277,7 +277,7 @@ def test_what_a_trace_said_last_is_in_force(tmp_path_factory: Any, rates: list[i
         assert last is not None and last.kbps == rates[int(t) % len(rates)] and t - last.t < 0.5
 
 
-def test_live_says_nothing() -> None:
+def test_live_predicts_nothing() -> None:
     pqos = build_pqos({"kind": "live"}, [])
     assert pqos.observe(at(0)) is None and pqos.warnings == ()
 
@@ -358,7 +358,7 @@ def test_every_schema_property_is_described() -> None:
     assert all(d["additionalProperties"] is False for d in objects[1:])
 
 
-def test_demo_loop_is_the_drive_it_says() -> None:
+def test_demo_loop_is_the_drive_it_describes() -> None:
     """Rates from 3000 to 8000, below 3300 in two stretches of 5 s at 10 m/s, a long shallow one above 5230."""
     lon, lat, rates = np.loadtxt(CONF / "maps" / "demo_loop.csv", delimiter=",", skiprows=1).T
     steps = [math.hypot(*offset(*step)) for step in zip(lat[:-1], lon[:-1], lat[1:], lon[1:], strict=True)]
@@ -399,15 +399,15 @@ def test_recorded_traces(name: str) -> None:
     path = shared(f"traces/tidy/{name}_uplink_1s.csv")
     times, rates = np.genfromtxt(path, delimiter=",", skip_header=1, usecols=(0, 3)).T
     pqos = build_pqos({**TRACE, "file": str(path)}, [])
-    assert [rate for _, rate in said(pqos, times)] == rates.tolist()
-    assert said(pqos, [times[-1] + 100]) == [(times[-1] + 100, 200)]
+    assert [rate for _, rate in predictions(pqos, times)] == rates.tolist()
+    assert predictions(pqos, [times[-1] + 100]) == [(times[-1] + 100, 200)]
 
 
 def test_recorded_drive_is_map_and_trace() -> None:
     path = shared("traces/tidy/starlink_autobahn_2024-04-19_leg1_uplink.csv")
     pqos = build_pqos({**MAP, "file": str(path), "look_ahead_s": 0}, [])
     assert kbps(pqos, PositionReported(t=0, lat=52.265172, lon=8.001866)) <= Fraction("12348.1")
-    assert said(build_pqos({**TRACE, "file": str(path)}, []), [0, 1]) == [(0, 12348.1), (1, 13206)]
+    assert predictions(build_pqos({**TRACE, "file": str(path)}, []), [0, 1]) == [(0, 12348.1), (1, 13206)]
 
 
 def test_downlink_alone_is_refused() -> None:

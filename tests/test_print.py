@@ -76,7 +76,7 @@ def test_the_text(tod: Command) -> None:
     assert (result.status, result.out.splitlines(), result.err) == (0, expected, "")
 
 
-def test_a_camera_that_is_not_sent_says_so(tod: Command) -> None:
+def test_a_camera_that_is_not_sent_is_marked(tod: Command) -> None:
     lines = tod("print", "source=test", "total_kbps=0").out.splitlines()
     assert "# front_left: not sending: 0 of 6000 kbit/s, range [0, 300) -> 0.125, below 1 kbit/s: not sending" in lines
     vehicle = printed(tod, "source=test", "total_kbps=0")["cameras"]["front_left"]["vehicle"]
@@ -96,7 +96,7 @@ def test_every_line_is_one_command_of_words(tod: Command, graph: str, source: st
 
 @pytest.fixture
 def clip(conf: UserConf) -> str:
-    """A path with everything in it that a shell or Hydra would take for its own."""
+    """A path with everything in it that a shell or Hydra would interpret."""
     name = 'it\'s a "clip" with $HOME, {braces}, a=b & ü.mp4'
     conf.write(name, b"")
     return str(conf.path / name)
@@ -126,7 +126,7 @@ def test_gstreamer_reads_the_server_string_as_the_shell_reads_the_line(tod: Comm
     assert gst.parse_launch(description).get_by_name("file").get_property("location") == clip
 
 
-def test_frames_born_in_python_are_stood_in_for_and_it_says_so(tod: Command) -> None:
+def test_a_stand_in_for_frames_generated_in_python_is_reported(tod: Command) -> None:
     names = "front_left, front_center, front_right, rear_center, top_front, top_left, top_right, top_rear"
     note = f"videotestsrc stands in for the frames of {names}"
     result = tod("print", "source=appsrc", "format=json")
@@ -137,7 +137,7 @@ def test_frames_born_in_python_are_stood_in_for_and_it_says_so(tod: Command) -> 
     assert f"# {note}" in tod("print", "source=appsrc").out.splitlines()
 
 
-def test_the_default_source_is_stood_in_for_until_it_is_rendered(tod: Command) -> None:
+def test_the_default_source_has_a_stand_in_until_it_is_rendered(tod: Command) -> None:
     camera = printed(tod)["cameras"]["front_left"]
     assert camera["vehicle"].startswith("videotestsrc ")
 
@@ -151,7 +151,7 @@ def test_a_transport_without_a_server(tod: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    "word, told",
+    "word, expected",
     [
         ("total_kbps=many", "command line: total_kbps: 'many': must be a number from 0"),
         ("total_kbps=-1", "command line: total_kbps: '-1': must be a number from 0"),
@@ -162,5 +162,5 @@ def test_a_transport_without_a_server(tod: Command) -> None:
         ("conf=/nowhere", "command line: conf: /nowhere: no such directory"),
     ],
 )
-def test_wrong_arguments(tod: Command, word: str, told: str) -> None:
-    assert tod("print", "source=test", word) == (2, "", f"{told}\n")
+def test_wrong_arguments(tod: Command, word: str, expected: str) -> None:
+    assert tod("print", "source=test", word) == (2, "", f"{expected}\n")

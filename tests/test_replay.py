@@ -1,4 +1,4 @@
-"""Events in, decisions out: the JSON lines, where a run ends, predictions put in place of others, drive logs."""
+"""Events in, decisions out: the JSON lines, where a run ends, replaced predictions, drive logs."""
 
 from __future__ import annotations
 
@@ -86,15 +86,15 @@ def test_one_line_per_event_in_order_also_for_what_changed_nothing_or_was_refuse
         {"t": 1, "event": "position_reported", "lat": 48, "lon": 11},
         {"t": 2, "event": "camera_switched", "camera": "front_left", "on": False},
     ]
-    told = answers(story)
-    assert [(line["t"], line["event"]) for line in told] == [(event["t"], event["event"]) for event in story]
-    assert [line["accepted"] for line in told] == [True, False, True, True]
-    refused = told[1]
+    decisions = answers(story)
+    assert [(line["t"], line["event"]) for line in decisions] == [(event["t"], event["event"]) for event in story]
+    assert [line["accepted"] for line in decisions] == [True, False, True, True]
+    refused = decisions[1]
     assert list(refused)[:4] == ["t", "event", "accepted", "reason"]
     assert refused["reason"] == "total_set is accepted in mode collective only, the mode is automatic"
     assert refused["commands"] == []
-    assert refused["cameras"] == told[0]["cameras"]
-    assert told[3]["cameras"]["front_left"] == {
+    assert refused["cameras"] == decisions[0]["cameras"]
+    assert decisions[3]["cameras"]["front_left"] == {
         "on": False,
         "sending": False,
         "demand_kbps": 0,
@@ -132,7 +132,7 @@ def test_standard_input_and_output() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad, told",
+    "bad, expected",
     [
         ("no", "not JSON: Expecting value (column 1)"),
         ("", "not JSON: Expecting value (column 1)"),
@@ -145,7 +145,7 @@ def test_standard_input_and_output() -> None:
         ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key; expected one of t, event"),
     ],
 )
-def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, told: str | None) -> None:
+def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, expected: str | None) -> None:
     with events_file.open("a") as file:
         file.write(f'{{"log": "note", "t": 0, "text": ""}}\n{bad}\n{lines([predicted(9, 1)])}')
     events_file.write_text(events_file.read_text().replace('"t": 1,', '"t": 0.5,', 1))
@@ -153,7 +153,7 @@ def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, b
     for words in ([], [f"output={output}"]):
         result = tod("replay", *PAPER, f"input={events_file}", *words)
         assert result.status == 2
-        assert result.err.startswith(f"{events_file}: line 4: {told or ''}")
+        assert result.err.startswith(f"{events_file}: line 4: {expected or ''}")
         assert result.err.count("\n") == 1
         kept = output.read_text() if words else result.out
         assert [json.loads(line)["total_kbps"] for line in kept.splitlines()] == [3000, 8000]
@@ -167,7 +167,7 @@ def test_bad_lines_on_standard_input() -> None:
 
 
 @pytest.mark.parametrize(
-    "word, told",
+    "word, expected",
     [
         ("input=/nowhere.jsonl", "command line: input: '/nowhere.jsonl': no such file or directory"),
         ("input=/", "command line: input: '/drive.jsonl': no such file or directory"),
@@ -175,12 +175,12 @@ def test_bad_lines_on_standard_input() -> None:
         ("output=/", "command line: output: '/': is a directory"),
     ],
 )
-def test_files_that_cannot_be_opened(tod: Command, events_file: Path, word: str, told: str) -> None:
+def test_files_that_cannot_be_opened(tod: Command, events_file: Path, word: str, expected: str) -> None:
     words = [word] if word.startswith("input") else [f"input={events_file}", word]
-    assert tod("replay", *PAPER, *words) == (2, "", f"{told}\n")
+    assert tod("replay", *PAPER, *words) == (2, "", f"{expected}\n")
 
 
-def test_an_output_file_is_there_only_at_the_end(events_file: Path) -> None:
+def test_an_output_file_appears_only_at_the_end(events_file: Path) -> None:
     output = events_file.with_name("my answers ü.jsonl")
     output.write_text("from before\n")
     command = [sys.executable, "-m", "runner", "replay", *PAPER, f"output={output}"]
@@ -212,7 +212,7 @@ def test_each_answer_comes_before_the_next_event_is_asked_for() -> None:
     assert running.returncode == 0
 
 
-# --- predictions put in place of others -------------------------------------------------------------------------------
+# --- replaced predictions ---------------------------------------------------------------------------------------------
 
 
 class Doubled:
@@ -226,24 +226,24 @@ class Doubled:
 
 def test_a_source_predicts_in_place_of_the_events() -> None:
     story = [CLOCK | {"t": 1}, CLOCK | {"t": 2}, predicted(3, 9999), CLOCK | {"t": 4}]
-    told = answers(story, pqos=Doubled())
-    assert [(line["t"], line["event"], line.get("source"), line["total_kbps"]) for line in told] == [
+    decisions = answers(story, pqos=Doubled())
+    assert [(line["t"], line["event"], line.get("source"), line["total_kbps"]) for line in decisions] == [
         (1, "clock_advanced", None, 3000),
         (1, "bitrate_predicted", "pqos", 10),
         (2, "clock_advanced", None, 10),
-        (3, "bitrate_predicted", "pqos", 30),  # the one of the input is dropped
+        (3, "bitrate_predicted", "pqos", 30),  # the input's own is dropped
         (4, "clock_advanced", None, 30),
         (4, "bitrate_predicted", "pqos", 40),
     ]
-    assert list(told[1])[:4] == ["t", "event", "source", "accepted"]
+    assert list(decisions[1])[:4] == ["t", "event", "source", "accepted"]
 
 
 def test_without_a_source_on_the_command_line_the_events_own_predictions_count(tod: Command, events_file: Path) -> None:
     own = tod("replay", *PAPER, f"input={events_file}").out
     assert "source" not in json.loads(own.splitlines()[0])
     for word in ("pqos=constant", "pqos.off_map_kbps=700"):
-        told = [json.loads(line) for line in tod("replay", *PAPER, f"input={events_file}", word).out.splitlines()]
-        assert {line.get("source") for line in told} <= {"pqos"}
+        decisions = [json.loads(line) for line in tod("replay", *PAPER, f"input={events_file}", word).out.splitlines()]
+        assert {line.get("source") for line in decisions} <= {"pqos"}
     assert (
         tod("replay", *PAPER, f"input={events_file}", "pqos=map", "pqos.file=no.csv")
         .problems[0]
@@ -257,9 +257,9 @@ def test_a_map_predicts_from_the_positions_of_the_input(tod: Command, tmp_path: 
     positions = [(0, 48.0, 11.0), (1, 48.0, 11.001), (2, 48.5, 11.0)]
     drive.write_text(lines({"t": t, "event": "position_reported", "lat": a, "lon": o} for t, a, o in positions))
     result = tod("replay", *PAPER, conf.word, f"input={drive}", "pqos=map", "pqos.file=maps/mine.csv")
-    told = [json.loads(line) for line in result.out.splitlines()]
-    assert [line["total_kbps"] for line in told if line.get("source")] == [4000, 2000, 1000]
-    assert [line["event"] for line in told] == ["position_reported", "bitrate_predicted"] * 3
+    decisions = [json.loads(line) for line in result.out.splitlines()]
+    assert [line["total_kbps"] for line in decisions if line.get("source")] == [4000, 2000, 1000]
+    assert [line["event"] for line in decisions] == ["position_reported", "bitrate_predicted"] * 3
 
 
 def test_a_recorded_trace_causes_fewer_changes_of_size_when_steady() -> None:
@@ -268,8 +268,8 @@ def test_a_recorded_trace_causes_fewer_changes_of_size_when_steady() -> None:
 
     def changes(modes: str) -> int:
         clock = ({"t": t / 2, "event": "clock_advanced"} for t in range(240))
-        told = answers(clock, vehicle(f"modes={modes}"), build_pqos(settings, [Path.cwd()]))
-        return sum(command["knob"] == "size" for line in told[1:] for command in line["commands"])
+        decisions = answers(clock, vehicle(f"modes={modes}"), build_pqos(settings, [Path.cwd()]))
+        return sum(command["knob"] == "size" for line in decisions[1:] for command in line["commands"])
 
     assert changes("steady") < changes("safe") == changes("paper")
 
@@ -299,7 +299,7 @@ def story(tmp_path: Path) -> Path:
 
 
 def test_a_drive_replays_to_the_decisions_that_it_holds(tod: Command, drive: Path, story: Path) -> None:
-    """With the configuration it was driven with, though nobody names it again, from wherever it is read."""
+    """With the configuration of the drive, without naming it again, wherever it is read from."""
     again = tod("replay", f"input={drive}")
     assert again.out == tod("replay", *PAPER, "cameras.front_left.weight=3", f"input={story}").out
     assert again.out == tod("replay", f"input={drive / 'drive.jsonl'}").out
@@ -340,20 +340,20 @@ def test_overrides_change_the_configuration_of_a_drive(
 
 
 @pytest.mark.parametrize(
-    "override, told",
+    "override, expected",
     [
         ("modes=stedy", "command line: modes: stedy: no such file in conf/modes/, did you mean steady?"),
         ("cameras.front_left.wieght=1", "command line: cameras.front_left.wieght: unknown key, did you mean weight?"),
         ("fps_max=fast", "command line: fps_max: 'fast': must be a number or null"),
     ],
 )
-def test_wrong_overrides_of_a_drive_are_told(tod: Command, drive: Path, override: str, told: str) -> None:
+def test_wrong_overrides_of_a_drive_are_reported(tod: Command, drive: Path, override: str, expected: str) -> None:
     result = tod("replay", override, f"input={drive}")
     assert (result.status, result.out) == (2, "")
-    assert result.err.splitlines()[0] == told
+    assert result.err.splitlines()[0] == expected
 
 
-def test_a_configuration_that_is_no_longer_valid_is_told_of_the_drive(tod: Command, drive: Path) -> None:
+def test_a_configuration_that_is_no_longer_valid_is_reported_for_the_drive(tod: Command, drive: Path) -> None:
     path = drive / "drive.jsonl"
     path.write_text(path.read_text().replace('"fps_max": null', '"fps_mox": null', 1))
     result = tod("replay", f"input={drive}")
@@ -372,26 +372,26 @@ def test_a_drive_that_was_cut_off_is_replayed_to_its_last_whole_line(tod: Comman
     assert result.err == f"{path}: line {at + 1} is cut off and was left out\n"
 
 
-def test_files_that_are_no_drive_are_told(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_drive_are_reported(tod: Command, drive: Path, tmp_path: Path) -> None:
     path = drive / "drive.jsonl"
     first, *_ = path.read_text().splitlines(keepends=True)
 
-    def told(text: str) -> str:
+    def error(text: str) -> str:
         path.write_text(text)
         result = tod("replay", f"input={drive}")
         assert (result.status, result.out) == (2, "")
         return result.err.removeprefix(str(path))
 
-    assert told(first.replace('"format": 1', '"format": 2')) == ": line 1: format: 2: this version reads format 1\n"
+    assert error(first.replace('"format": 1', '"format": 2')) == ": line 1: format: 2: this version reads format 1\n"
     operator = first.replace('"side": "vehicle"', '"side": "operator"')
-    assert told(operator) == ": line 1: side: 'operator': has no events, they are in drive.jsonl\n"
-    assert told(first.replace('"versions"', '"version"')).startswith(": line 1: version: unknown key, did you mean")
-    assert told(first + '{"t": 1, "log": "decisoin"}\n').endswith("unknown kind of line, did you mean decision?\n")
+    assert error(operator) == ": line 1: side: 'operator': has no events, they are in drive.jsonl\n"
+    assert error(first.replace('"versions"', '"version"')).startswith(": line 1: version: unknown key, did you mean")
+    assert error(first + '{"t": 1, "log": "decisoin"}\n').endswith("unknown kind of line, did you mean decision?\n")
     result = tod("replay", f"input={tmp_path}")
     assert result.err == f"command line: input: '{tmp_path}/drive.jsonl': no such file or directory\n"
 
 
-def test_what_is_read_is_not_written_over(tod: Command, drive: Path) -> None:
+def test_the_input_is_not_overwritten(tod: Command, drive: Path) -> None:
     path = drive / "drive.jsonl"
     before = path.read_bytes()
     for word in (drive, path):
@@ -400,9 +400,7 @@ def test_what_is_read_is_not_written_over(tod: Command, drive: Path) -> None:
         assert result.err == f"command line: output: '{path}': is the input, choose another file\n"
 
 
-def test_an_answer_that_does_not_come_to_its_end_leaves_no_drive(
-    tod: Command, events_file: Path, tmp_path: Path
-) -> None:
+def test_a_replay_that_fails_leaves_no_drive(tod: Command, events_file: Path, tmp_path: Path) -> None:
     with events_file.open("a") as file:
         file.write("no\n")
     result = tod("replay", *PAPER, f"input={events_file}", f"log={tmp_path / 'answer'}")
@@ -441,7 +439,7 @@ def test_another_kind_of_camera_stays_in_its_place(tod: Command, drive: Path, tm
     assert (now["height_px"], now["weight"]) == (720, 2)
 
 
-def test_a_drive_is_never_written_over(tod: Command, drive: Path, story: Path) -> None:
+def test_a_drive_is_never_overwritten(tod: Command, drive: Path, story: Path) -> None:
     before = (drive / "drive.jsonl").read_bytes()
     result = tod("replay", f"input={story}", f"log={drive}")
     assert result.status == 2

@@ -52,20 +52,20 @@ def defined(path: Path) -> dict[str, Figure]:
 
 
 def drawn(figure: Figure) -> Any:
-    """As print draws it."""
+    """A figure as drawn for print."""
     from runner.drive.print import drawn
 
     return drawn(figure)
 
 
 def document(output: Path) -> dict[str, Any]:
-    told = json.loads((output / "report.json").read_text())
-    assert findings(told, "report") == []
-    return dict(told)
+    content = json.loads((output / "report.json").read_text())
+    assert findings(content, "report") == []
+    return dict(content)
 
 
 def check_figures(output: Path, names: list[str]) -> None:
-    """Each is there, as a PNG of a column's width that shows something, and as a PDF; no half-written file is."""
+    """Each exists, as a PNG of a column's width that is not blank, and as a PDF; no half-written file exists."""
     expected = {f"{name}.{form}" for name in names for form in ("png", "pdf")} | {"index.html", "report.json"}
     assert {path.name for path in output.iterdir()} == expected
     for name in names:
@@ -85,9 +85,9 @@ def test_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert status == 0
     assert out.splitlines()[-1] == str(output / "index.html")
     check_figures(output, FIGURES)
-    told = document(output)
-    assert told["figures"] == FIGURES
-    (one,) = told["drives"]
+    content = document(output)
+    assert content["figures"] == FIGURES
+    (one,) = content["drives"]
     assert (one["label"], one["vehicle"], one["began"]) == ("test_drive", "tum_q7", "2026-02-02T02:40:00Z")
     assert one["duration_s"] == 20
     assert one["ended"] == {"vehicle": True, "operator": True, "link": True}
@@ -139,9 +139,9 @@ def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
     status, out, _ = tod("report", str(drive), str(other), f"output={tmp_path / 'out'}")
     assert status == 0
     check_figures(tmp_path / "out", FIGURES)
-    told = document(tmp_path / "out")["drives"]
-    assert [one["label"] for one in told] == [f"{drive.parent.name}/test_drive", "other/test_drive"]
-    assert told[1]["notes"][0] == "no positions were logged: not drawn on the map"
+    content = document(tmp_path / "out")["drives"]
+    assert [one["label"] for one in content] == [f"{drive.parent.name}/test_drive", "other/test_drive"]
+    assert content[1]["notes"][0] == "no positions were logged: not drawn on the map"
     assert "all drives" in out
     taller, single = (image.open(tmp_path / "out" / f"{name}.png").height for name in ("totals", "bitrate_on_track"))
     assert taller > single
@@ -160,11 +160,11 @@ def test_sides_that_are_missing(tod: Command, tmp_path: Path, sides: list[str], 
     status, out, _ = tod("report", str(path), f"output={tmp_path / 'out'}")
     assert status == 0
     check_figures(tmp_path / "out", figures)
-    told = document(tmp_path / "out")
-    assert told["drives"][0]["link"] is None
+    content = document(tmp_path / "out")
+    assert content["drives"][0]["link"] is None
     if "operator" not in sides:
         left_out = "latency: left out, no latency was logged: that takes an operator's log"
-        assert left_out in told["left_out"]
+        assert left_out in content["left_out"]
         assert left_out in out
 
 
@@ -190,7 +190,7 @@ def test_a_camera_that_is_off_all_the_time(tod: Command, tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("unprinted")
-def test_claims_are_held_against_the_drive(
+def test_claims_are_checked_against_the_drive(
     drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from runner.drive import claims as module
@@ -215,8 +215,8 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
     evil = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{data}}"
 
     def change(side: str, lines: Lines) -> Lines:
-        for told in lines:
-            for camera in told["cameras"].values() if told.get("log") in ("decision", "state") else ():
+        for entry in lines:
+            for camera in entry["cameras"].values() if entry.get("log") in ("decision", "state") else ():
                 camera["reason"] = evil
         return [*lines, {"t": 1.0, "log": "note", "text": evil}]
 
@@ -252,8 +252,8 @@ def test_print_and_page_draw_the_same_curves(drive: Path) -> None:
         axes = [each for each in drawn(figure).axes if each.get_title(loc="left")] or drawn(figure).axes[:1]
         assert len(axes) == len(charts), name
         for each, chart in zip(axes, charts, strict=True):
-            asked = [curve for curve in chart.curves if not curve.filled]
-            for line, curve in zip(each.lines[: len(asked)] if asked else (), asked, strict=True):
+            expected = [curve for curve in chart.curves if not curve.filled]
+            for line, curve in zip(each.lines[: len(expected)] if expected else (), expected, strict=True):
                 assert np.array_equal(np.asarray(line.get_ydata()), curve.y, equal_nan=True), (name, curve.label)
 
 
@@ -340,9 +340,9 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
         ([str(drive), "--output"], "command line: --output: flags are not supported; write NAME=VALUE, or --help"),
         ([str(tmp_path), out], f"{tmp_path}: contains no drive log: neither drive.jsonl nor operator.jsonl"),
     ]
-    for words, told in wrong:
+    for words, expected in wrong:
         status, printed, err = tod("report", *words)
-        assert (status, printed, err.splitlines()[-1]) == (2, "", told)
+        assert (status, printed, err.splitlines()[-1]) == (2, "", expected)
     assert not (tmp_path / "out").exists()
 
 
@@ -359,7 +359,7 @@ def test_a_path_may_hold_an_equals_sign(tod: Command, tmp_path: Path) -> None:
     assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0
 
 
-def test_no_verb_that_takes_none_gets_words(tod: Command) -> None:
+def test_a_verb_without_positional_arguments_refuses_them(tod: Command) -> None:
     assert tod("print", "drive").err == "command line: drive: must be NAME=VALUE\n"
 
 

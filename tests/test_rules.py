@@ -1,4 +1,4 @@
-"""The rules of the modes: the paper's numbers, the safe answers, calmer pictures; rule lists as YAML gives them."""
+"""The rules of the modes: the paper's numbers, safe reactions, calmer pictures; rule lists from YAML."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from runner.core.step import Run, start, step
 
 TUM = vehicle("modes=paper")
 START = State.initial(TUM, Mode.AUTOMATIC)
-STEPS = [1320, 1650, 2200, 2970, 3300, 4400, 5225, 14850]  # worked out from Table I
+STEPS = [1320, 1650, 2200, 2970, 3300, 4400, 5225, 14850]  # computed from Table I
 
 
 def decided(total: Fraction | int | str, state: State = START) -> rules.Decision:
@@ -57,7 +57,7 @@ def test_table_1(total: int, camera: str, kbps: int, scaling: float) -> None:
     assert (setting.kbps, setting.scaling) == (kbps, scaling)
 
 
-def test_the_sweep_steps_up_where_table_1_says_and_nowhere_else() -> None:
+def test_the_sweep_steps_up_exactly_where_table_1_requires() -> None:
     sweep = [factors(total) for total in range(16_001)]
     assert [total for total in range(1, 16_001) if sweep[total] != sweep[total - 1]] == STEPS
 
@@ -90,7 +90,7 @@ def test_a_tiny_roi_is_not_sent_either_and_takes_the_smallest_factor() -> None:
     assert left.reason == "0 of 0.8 kbit/s, range [0, 300) -> 0.125, below 1 kbit/s: not sending"
 
 
-def test_reasons_speak_of_the_numbers() -> None:
+def test_reasons_state_the_numbers() -> None:
     left = decided(3000).settings["front_left"]
     assert left.reason == "545 of 6000 kbit/s, range [300, 950) -> 0.25"
     cut = replace(START, rois={**START.rois, "front_left": Roi(0, 0, 960, 520)})
@@ -147,7 +147,7 @@ def test_a_stale_prediction_is_halved_down_to_the_floor() -> None:
 
 
 def drive_at(kbps: float, t: float, **keys: Any) -> Drive:
-    """A safe drive some time after its only prediction, which came at 1 s."""
+    """A safe drive some time after its only prediction, received at 1 s."""
     drive = Drive("modes=safe")
     drive.accept("bitrate_predicted", t=1, kbps=kbps, **keys)
     drive.accept("clock_advanced", t=t)
@@ -163,7 +163,7 @@ def test_the_floor_is_not_passed_on_the_way() -> None:
     assert drive_at(700, 3.5).total == 500  # half of it is 350
 
 
-def test_a_prediction_says_how_long_it_may_be_used() -> None:
+def test_a_prediction_states_how_long_it_may_be_used() -> None:
     assert [drive_at(8000, t, valid_s=10).total for t in (11, 11.5)] == [8000, 4000]
     assert [drive_at(8000, t, valid_s=0.5).total for t in (1.5, 1.6)] == [8000, 4000]
 
@@ -231,7 +231,7 @@ def test_a_greater_factor_is_held_back_and_a_smaller_one_taken_at_once() -> None
     assert drive.sent("front_center")[0] == 454  # only the factor waits
     assert [factor(4.9, 3000), factor(5, 3000)] == [0.25, 0.5]
     assert [factor(6, 2000), factor(7, 3000), factor(8, 2000), factor(10, 3000)] == [0.25] * 4
-    assert [factor(12.9, 3000), factor(13, 3000)] == [0.25, 0.5]  # a break starts the wait anew
+    assert [factor(12.9, 3000), factor(13, 3000)] == [0.25, 0.5]  # a break restarts the wait
 
 
 def test_memory_is_empty_under_the_paper_and_frozen_elsewhere() -> None:
@@ -303,7 +303,7 @@ def reasons(run: Run) -> list[str]:
     return [setting.reason for setting in run.decision.settings.values()]
 
 
-def test_a_rule_that_states_nothing_hears_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rule_that_states_no_reads_runs_on_every_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
 
     @rules.rule(needs=["total"], gives=["total"])

@@ -81,7 +81,7 @@ def test_an_roi_is_judged_by_the_same_bits_per_pixel(bitrate: Fraction, roi: Roi
         (16, 16, "0.125", (16, 16)),  # never below 16
         (320, 16, "0.5", (320, 16)),  # both sides by the factor of the shorter one
         (1920, 64, "0.125", (480, 16)),
-        (1920, 120, "0.125", (240, 16)),  # 15 rounds to 16, nothing to mend
+        (1920, 120, "0.125", (240, 16)),  # 15 rounds to 16, nothing to correct
         (17, 16, "1", (18, 16)),
     ],
 )
@@ -100,7 +100,7 @@ def test_sizes_are_even_not_below_16_and_keep_the_aspect(roi: Roi, factor: Fract
 
 
 @given(rois, factors)
-def test_a_side_is_mended_together_with_the_other(roi: Roi, factor: Fraction) -> None:
+def test_both_sides_are_corrected_together(roi: Roi, factor: Fraction) -> None:
     assume(factor * min(roi.width, roi.height) < 15)
     width, height = output_size(roi, factor)
     assert min(width, height) == 16

@@ -1,4 +1,4 @@
-"""The schemas are closed and say what each key is; what they find is told as a person would."""
+"""The schemas are closed and describe every key; findings are worded for people."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_every_property_is_described_and_objects_are_closed(name: str) -> None:
             or "without_map" in path
             or (not path and name in ("event", "drive", "pqos"))
         ):
-            continue  # conditions on what is described elsewhere
+            continue  # conditions on keys that are described elsewhere
         if part.get("type") == "object" and "properties" in part:
             assert part.get("additionalProperties", True) is not True, path
         if isinstance(part.get("properties"), dict) and not path.endswith("properties"):
@@ -125,8 +125,8 @@ CAMERA = {
     ],
 )
 def test_findings(changes: dict[str, Any], found: list[str]) -> None:
-    told = findings(CAMERA | changes, "camera")
-    assert [": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in told] == found
+    reported = findings(CAMERA | changes, "camera")
+    assert [": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in reported] == found
 
 
 def test_a_misspelt_key_is_one_mistake() -> None:

@@ -23,16 +23,16 @@ def bound(family, address):
 
 
 def waiting(taken):
-    came = []
+    received = []
     while True:
         try:
-            came.append(taken.recv(2000))
+            received.append(taken.recv(2000))
         except BlockingIOError:
-            return came
+            return received
 
 
 @pytest.mark.parametrize(("family", "everywhere"), [(socket.AF_INET, "0.0.0.0"), (socket.AF_INET6, "::")])
-def test_only_one_sender_is_heard_and_the_others_are_counted(family, everywhere):
+def test_only_one_sender_is_received_and_the_others_are_counted(family, everywhere):
     with (
         bound(family, everywhere) as ours,
         bound(socket.AF_INET, "127.0.0.1") as vehicle,
@@ -64,7 +64,7 @@ def test_packets_of_the_vehicle_that_find_no_room_are_not_counted():
         senders.close()
 
 
-def test_ipv6_senders_are_told_apart():
+def test_ipv6_senders_are_distinguished():
     with (
         bound(socket.AF_INET6, "::") as ours,
         bound(socket.AF_INET6, "::1") as vehicle,
@@ -81,7 +81,7 @@ def test_ipv6_senders_are_told_apart():
 
 
 def run(steps, packet):
-    """What the kernel does with a filter; packet from the IP header on."""
+    """Run a filter as the kernel does; packet from the IP header on."""
     net, held, at = 0xFFF00000, 0, 0
     while True:
         code, if_true, if_false, operand = steps[at]

@@ -1,4 +1,4 @@
-"""A drive on one time axis: clocks joined, counters that begin again, what holds until the next, panels."""
+"""A drive on one time axis: joined clocks, counters that restart, values held until the next, panels."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def line(*points: tuple[float, float]) -> TimeSeries:
     return TimeSeries(t, y)
 
 
-def test_what_holds_until_the_next() -> None:
+def test_values_hold_until_the_next() -> None:
     steps = line((1, 10), (3, 20), (3, 30))
     np.testing.assert_array_equal(held(steps, np.array([0.0, 1.0, 2.9, 3.0, 9.0])), [NAN, 10, 10, 30, 30])
     np.testing.assert_array_equal(held(line(), np.array([0.0, 1.0])), [NAN, NAN])
 
 
 @pytest.mark.parametrize(
-    "begin, end, told",
+    "begin, end, expected",
     [(0, 5, (2 * 10 + 2 * 30) / 4), (2, 4, 20), (1, 2, 10), (4, 5, 30), (0, 1, NAN), (5, 5, NAN)],
 )
-def test_the_mean_over_time(begin: float, end: float, told: float) -> None:
-    assert mean_held(line((1, 10), (3, 30)), begin, end) == pytest.approx(told, nan_ok=True)
+def test_the_mean_over_time(begin: float, end: float, expected: float) -> None:
+    assert mean_held(line((1, 10), (3, 30)), begin, end) == pytest.approx(expected, nan_ok=True)
 
 
 def test_spans_share_a_stretch_of_time() -> None:
@@ -122,10 +122,10 @@ def test_when_a_camera_was_to_be_sent(tmp_path: Path) -> None:
     assert (5.0, "switched off") in switched
 
 
-def test_clocks_that_differ_are_told(tmp_path: Path) -> None:
+def test_clocks_that_differ_are_reported(tmp_path: Path) -> None:
     def early(side: str, lines: Lines) -> Lines:
-        for told in lines:
-            for camera in told["cameras"].values() if told.get("log") == "sample" else ():
+        for entry in lines:
+            for camera in entry["cameras"].values() if entry.get("log") == "sample" else ():
                 camera["arrivals"] = [[t, ms - 50] for t, ms in camera["arrivals"]]
         return lines
 
@@ -142,8 +142,8 @@ def test_clocks_that_differ_are_told(tmp_path: Path) -> None:
 
 def test_latencies_are_known_long_after_a_clock_was_set_right(tmp_path: Path) -> None:
     def early(side: str, lines: Lines) -> Lines:
-        for told in lines:
-            for camera in told["cameras"].values() if told.get("log") == "sample" and told["t"] < 5 else ():
+        for entry in lines:
+            for camera in entry["cameras"].values() if entry.get("log") == "sample" and entry["t"] < 5 else ():
                 camera["arrivals"] = [[t, ms - 5000] for t, ms in camera["arrivals"]]
         return lines
 
@@ -154,21 +154,21 @@ def test_latencies_are_known_long_after_a_clock_was_set_right(tmp_path: Path) ->
     assert 14.5 < known.min() < 16.5  # the operator's log begins later
 
 
-# --- what cannot be reported ------------------------------------------------------------------------------------------
+# --- drives without a report -----------------------------------------------------------------------------------------
 
 
 def without(**keys: Any) -> Any:
     def change(side: str, lines: Lines) -> Lines:
-        return [told for told in lines if not any(told.get(key) == value for key, value in keys.items())]
+        return [entry for entry in lines if not any(entry.get(key) == value for key, value in keys.items())]
 
     return change
 
 
 def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
     def problem(name: str) -> str:
-        with pytest.raises(UserError) as told:
+        with pytest.raises(UserError) as raised:
             series(read_drive(tmp_path / name))
-        return str(told.value).removeprefix(f"{tmp_path}/")
+        return str(raised.value).removeprefix(f"{tmp_path}/")
 
     write_drive(tmp_path / "empty", seconds=5, change=lambda _side, _lines: [])
     assert problem("empty") == "empty: is empty: only the first line was logged"

@@ -1,4 +1,4 @@
-"""What SIGINT and SIGTERM do to a process, whatever its main thread is busy with."""
+"""Effects of SIGINT and SIGTERM on a process, whatever its main thread is busy with."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from runner.system.signals import END_S, LIFELINE
 pytestmark = [pytest.mark.slow, pytest.mark.timed]  # starts and ends processes, within a limit
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: for ever
+LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: blocks for ever
 
 
 def started(body: str, **options: object) -> subprocess.Popen[str]:
-    """A process that runs `body` as a verb would run, and has said "ready"."""
+    """A process that runs `body` as a verb would run, and has printed "ready"."""
     program = dedent(
         """\
         import ctypes, sys, threading, time
@@ -47,8 +47,8 @@ def started(body: str, **options: object) -> subprocess.Popen[str]:
 def ended(child: subprocess.Popen[str]) -> tuple[int, str, float]:
     """Exit status, standard error, seconds until then."""
     began = time.monotonic()
-    _, said = child.communicate(timeout=20)
-    return child.returncode, said, time.monotonic() - began
+    _, errors = child.communicate(timeout=20)
+    return child.returncode, errors, time.monotonic() - began
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -73,7 +73,7 @@ def test_a_library_that_makes_another_error_of_it_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_verb_that_looks_is_not_interrupted(number: signal.Signals) -> None:
+def test_a_verb_that_polls_is_not_interrupted(number: signal.Signals) -> None:
     child = started(
         """\
         with signals.stopping() as stop:
@@ -92,8 +92,8 @@ def test_a_verb_that_looks_is_not_interrupted(number: signal.Signals) -> None:
 def test_a_main_thread_in_a_c_library_is_ended_by_force(mode: str) -> None:
     child = started(f"{mode}threading.Timer(0.3, ready).start(); {LOCK}; {LOCK.partition('; ')[2]}")
     child.send_signal(signal.SIGTERM)
-    status, said, seconds = ended(child)
-    assert (status, said) == (143, "shutdown timed out: ending now\n")
+    status, errors, seconds = ended(child)
+    assert (status, errors) == (143, "shutdown timed out: ending now\n")
     assert seconds > END_S / 2
 
 
@@ -118,17 +118,17 @@ def test_a_second_signal_ends_at_once_and_leaves_no_half_file(tmp_path: Path) ->
 
 def test_cleaning_up_that_hangs_delays_nothing_for_long() -> None:
     child = started("with signals.urgent(lambda: time.sleep(60)):\n    ready(); time.sleep(0.1); time.sleep(60)")
-    child.send_signal(signal.SIGSTOP)  # both signals are there when it looks
+    child.send_signal(signal.SIGSTOP)  # both signals are pending when it resumes
     child.send_signal(signal.SIGINT)
     child.send_signal(signal.SIGTERM)
     child.send_signal(signal.SIGCONT)
-    status, said, seconds = ended(child)
+    status, errors, seconds = ended(child)
     assert status in (130, 143)
-    assert said == "second signal: ending now\n"
+    assert errors == "second signal: ending now\n"
     assert seconds < 10
 
 
-def test_nobody_who_reads_standard_error_is_waited_for() -> None:
+def test_a_full_pipe_of_standard_error_does_not_delay_the_end() -> None:
     child = started("ready()\nwhile True:\n    sys.stderr.write('x' * 4096)")
     time.sleep(0.2)  # the pipe is full now
     child.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""What cannot be rendered is a mistake in the configuration, told before anything starts."""
+"""A view that cannot be rendered is a mistake in the configuration, reported before anything starts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
     ],
 )
 def test_a_camera_that_the_drive_cannot_show(override: str, line: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as raised:
         configuration(["source=synthetic", override]).vehicle()
-    assert str(told.value) == f"{line}\n1 problem, nothing was started"
-    configuration(["source=test", override]).vehicle()  # other sources do not mind
+    assert str(raised.value) == f"{line}\n1 problem, nothing was started"
+    configuration(["source=test", override]).vehicle()  # other sources accept it

@@ -1,4 +1,4 @@
-"""How events change what is known, and the reasons of those that are refused."""
+"""How events change the state, and the reasons for refusals."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ REFUSED: list[tuple[str, str, dict[str, Any], str]] = [
 @pytest.mark.parametrize("mode, event, keys, reason", REFUSED)
 def test_refused(mode: str, event: str, keys: dict[str, Any], reason: str) -> None:
     drive = Drive("modes=paper", f"mode={mode}")
-    before = drive.tell("clock_advanced", t=1)
-    after = drive.tell(event, t=2, **keys)
+    before = drive.feed("clock_advanced", t=1)
+    after = drive.feed(event, t=2, **keys)
     assert after.refused == reason
     assert after.commands == ()
     assert after.decision == before.decision

@@ -1,4 +1,4 @@
-"""Freezes by hand-made arrivals, percentiles, shares of time, quality between measured points."""
+"""Freezes of hand-made arrivals, percentiles, shares of time, quality between measured points."""
 
 from __future__ import annotations
 
@@ -53,22 +53,22 @@ def arrivals(*gaps: float, first: float = 0.0) -> np.ndarray:
     ],
 )
 def test_a_gap_freezes_from_the_larger_of_both_bounds_on(gap_s: float, long_s: float, frozen: bool) -> None:
-    came = arrivals(*[gap_s] * 40, long_s, *[gap_s] * 5)
-    found = freezes(came, [(0.0, float(came[-1]))])
+    arrived = arrivals(*[gap_s] * 40, long_s, *[gap_s] * 5)
+    found = freezes(arrived, [(0.0, float(arrived[-1]))])
     assert found == ([(pytest.approx(40 * gap_s), pytest.approx(long_s))] if frozen else [])
 
 
 def test_the_mean_is_of_the_last_30_gaps() -> None:
-    # After 30 gaps of 25 ms, the 200 ms before them are forgotten: 175 ms freeze again; after 29 they are not.
+    # After 30 gaps of 25 ms, the 200 ms before them are forgotten and 175 ms is a freeze again; not so after 29.
     for since, frozen in ((30, True), (29, False)):
-        came = arrivals(*[0.2] * 40, *[0.025] * since, 0.176, 0.025)
-        assert bool(freezes(came, [(0.0, float(came[-1]))])) is frozen
+        arrived = arrivals(*[0.2] * 40, *[0.025] * since, 0.176, 0.025)
+        assert bool(freezes(arrived, [(0.0, float(arrived[-1]))])) is frozen
 
 
 def test_a_freeze_is_part_of_later_means() -> None:
-    came = arrivals(*[0.025] * 40, 6.0, 0.3, 0.025)
-    # The mean is then (29 * 25 + 6000) / 30 = 224 ms: 300 ms are no freeze, though they were before.
-    assert freezes(came, [(0.0, float(came[-1]))]) == [(pytest.approx(1.0), pytest.approx(6.0))]
+    arrived = arrivals(*[0.025] * 40, 6.0, 0.3, 0.025)
+    # The mean is then (29 * 25 + 6000) / 30 = 224 ms: 300 ms is no freeze any more.
+    assert freezes(arrived, [(0.0, float(arrived[-1]))]) == [(pytest.approx(1.0), pytest.approx(6.0))]
 
 
 def test_nothing_is_judged_by_less_than_five_gaps() -> None:
@@ -83,15 +83,15 @@ def test_a_stream_that_never_comes_or_stops_before_it_can_be_judged_freezes() ->
 
 
 def test_a_camera_that_is_not_sent_does_not_freeze() -> None:
-    came = np.concatenate([arrivals(*[0.025] * 40), arrivals(*[0.025] * 40, first=11.0)])
-    assert freezes(came, [(0.0, 12.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(10.0))]
-    assert freezes(came, [(0.0, 1.01), (11.0, 12.0)]) == []
+    arrived = np.concatenate([arrivals(*[0.025] * 40), arrivals(*[0.025] * 40, first=11.0)])
+    assert freezes(arrived, [(0.0, 12.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(10.0))]
+    assert freezes(arrived, [(0.0, 1.01), (11.0, 12.0)]) == []
 
 
 def test_a_stream_that_stops_for_good_is_frozen_to_the_end_of_the_span() -> None:
-    came = arrivals(*[0.025] * 40)
-    assert freezes(came, [(0.0, 5.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(4.0))]
-    assert freezes(came, [(0.0, 1.1)]) == []
+    arrived = arrivals(*[0.025] * 40)
+    assert freezes(arrived, [(0.0, 5.0)]) == [Freeze(pytest.approx(1.0), pytest.approx(4.0))]
+    assert freezes(arrived, [(0.0, 1.1)]) == []
 
 
 def test_freezes_of_a_drive(tmp_path: Path) -> None:
@@ -142,10 +142,10 @@ def test_a_drive_with_both_sides(tmp_path: Path) -> None:
     assert front.arrival.median < front.decode.median
 
 
-def test_sizes_are_told_in_the_order_of_their_factors(tmp_path: Path) -> None:
+def test_sizes_are_listed_in_the_order_of_their_factors(tmp_path: Path) -> None:
     camera = statistics(series(read_drive(write_drive(tmp_path / "drive")))).cameras["front_left"]
-    told = replace(camera, factors={0.25: 0.2, 0.5: 0.8}, sizes={(960, 540): 0.8, (480, 270): 0.2})
-    headings, (row,) = camera_rows(SimpleNamespace(metric=None, cameras={"front": told}))
+    reordered = replace(camera, factors={0.25: 0.2, 0.5: 0.8}, sizes={(960, 540): 0.8, (480, 270): 0.2})
+    headings, (row,) = camera_rows(SimpleNamespace(metric=None, cameras={"front": reordered}))
     assert row[headings.index("factor: time")] == "0.25: 20%\n0.5: 80%"
     assert row[headings.index("sizes px")] == "480x270\n960x540"
 
@@ -179,7 +179,7 @@ def camera(kbps: float, scaling: float, *, sending: bool = True, share: float = 
         (100, 0.5, 1, 0.6, 0),
         (200, 0.5, 1, 0.7, 0),  # half way in log bitrate
         (400, 0.5, 1, 0.8, 0),
-        (100, 0.5, 0.5, 0.7, 0),  # of half the picture: as 200 of all of it
+        (100, 0.5, 0.5, 0.7, 0),  # for half the picture: like 200 for all of it
         (50, 0.5, 1, 0.6, 1),
         (900, 0.5, 1, 0.8, 1),
     ],
@@ -191,37 +191,37 @@ def test_quality_between_measured_points(
     assert (found.mean, found.clamped) == (pytest.approx(quality), clamped)
 
 
-def stood_still(begin: float, end: float, kbps: float = 400, seconds: float = 25) -> CameraSeries:
-    """A camera at 10 Hz of which nothing came for a while; rates as the operator measures them, over a second."""
+def interrupted(begin: float, end: float, kbps: float = 400, seconds: float = 25) -> CameraSeries:
+    """A camera at 10 Hz with a gap in its arrivals; rates over a second, as the operator measures them."""
     every = np.arange(1, 10 * seconds + 1) / 10
-    came = every[(every <= begin) | (every > end)]
+    arrived = every[(every <= begin) | (every > end)]
     t = np.arange(1, 4 * seconds + 1) / 4
-    frames = np.searchsorted(came, t, "right").astype(float)
-    rates = np.where(t < 1, NAN, (frames - np.searchsorted(came, t - 1, "right")) * kbps / 10)
-    zero, size, latency = np.zeros(t.shape), np.full(t.shape, 2.0), np.full(came.shape, 50.0)
+    frames = np.searchsorted(arrived, t, "right").astype(float)
+    rates = np.where(t < 1, NAN, (frames - np.searchsorted(arrived, t - 1, "right")) * kbps / 10)
+    zero, size, latency = np.zeros(t.shape), np.full(t.shape, 2.0), np.full(arrived.shape, 50.0)
     received = ReceivedSeries(
-        t, rates, size, size, size, frames, frames * kbps * 12.5, zero, zero, came, latency, latency
+        t, rates, size, size, size, frames, frames * kbps * 12.5, zero, zero, arrived, latency, latency
     )
     decided = camera(kbps, 0.5).decided
     return CameraSeries("one", decided, received, None)
 
 
-def test_a_picture_that_stands_still_keeps_its_quality_and_its_share_of_the_time_is_told() -> None:
-    found = camera_statistics(stood_still(10, 20), 25.0, MODEL)
+def test_a_frozen_picture_keeps_its_quality_and_its_share_of_the_time_is_reported() -> None:
+    found = camera_statistics(interrupted(10, 20), 25.0, MODEL)
     assert found.quality is not None
     assert found.frozen == pytest.approx(10 / 25, abs=0.02)
     assert found.quality.moving == pytest.approx(0.8)
-    assert found.quality.mean == pytest.approx(0.8)  # an upper bound: reached where nothing moved meanwhile
+    assert found.quality.mean == pytest.approx(0.8)  # an upper bound, reached if nothing moved meanwhile
     t, quality = found.quality.line
     assert np.isfinite(quality[(t > 10) & (t <= 20)]).all()
-    assert np.isnan(quality[(t > 20.1) & (t < 21)]).all()  # the rate of the second before holds some of the freeze
+    assert np.isnan(quality[(t > 20.1) & (t < 21)]).all()  # the second behind this rate includes part of the freeze
     (column,) = [row for row in zip(*table_of(found), strict=True) if row[0].endswith("frozen")]
     assert column[1] in ("40%", "41%")
 
 
 def test_a_frozen_share_counts_the_quality_before_it_and_not_the_mean() -> None:
-    """Poor pictures, then none, then good ones: what was seen is the last poor one."""
-    series = stood_still(10, 20)
+    """Poor pictures, then none, then good ones: meanwhile the last poor one was on screen."""
+    series = interrupted(10, 20)
     assert series.received is not None
     rates = np.where(series.received.t <= 10.5, series.received.kbps / 4, series.received.kbps)
     found = estimate(replace(series, received=replace(series.received, kbps=rates)), MODEL, (Freeze(10.0, 10.1),))
@@ -231,8 +231,8 @@ def test_a_frozen_share_counts_the_quality_before_it_and_not_the_mean() -> None:
     assert found.mean < found.moving
 
 
-def test_a_camera_that_never_came_shows_no_picture_that_could_have_quality() -> None:
-    found = estimate(stood_still(0, 25), MODEL, (Freeze(0.0, 25.0),))
+def test_a_camera_without_arrivals_has_no_quality() -> None:
+    found = estimate(interrupted(0, 25), MODEL, (Freeze(0.0, 25.0),))
     assert np.isnan(found.mean)
 
 

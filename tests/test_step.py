@@ -1,4 +1,4 @@
-"""One event further: modes without jumps, totals, weights, and nothing commanded twice."""
+"""Single steps: mode changes without jumps, totals, weights, and nothing commanded twice."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_camera_switched_off_in_automatic_has_its_last_values_in_single() -> N
 # --- totals, demands, weights -----------------------------------------------------------------------------------------
 
 
-def test_the_total_is_told_before_the_cap_at_demand() -> None:
+def test_the_total_is_reported_before_the_cap_at_demand() -> None:
     drive = predicted(50_000)
     assert drive.total == 50_000
     assert sum(kbps for kbps, _ in sent(drive).values()) == 33_000
@@ -252,7 +252,7 @@ def test_nothing_is_decided_where_no_input_of_the_rules_changed(monkeypatch: pyt
     drive.accept("clock_advanced", t=5)
     drive.accept("link_measured", camera="front_left", kbps=3)
     drive.accept("position_reported", lat=48, lon=11)
-    drive.tell("total_set", kbps=3)
+    drive.feed("total_set", kbps=3)
 
 
 events = st.one_of(
@@ -356,7 +356,7 @@ def test_a_rule_that_fails_leaves_the_last_decision_in_force(misbehave: Any, fau
     after = drive.accept("bitrate_predicted", kbps=2000)
     assert (after.decision, after.commands, after.fault) == (before.decision, (), fault)
     assert after.state.prediction is not None and after.state.prediction.kbps == 2000
-    assert drive.tell("position_reported", lat=1, lon=1).fault == fault  # nothing that the rules read has changed
+    assert drive.feed("position_reported", lat=1, lon=1).fault == fault  # nothing that the rules read has changed
     again = drive.accept("bitrate_predicted", kbps=3000)
     assert (drive.total, again.fault) == (3000, None)
 
@@ -364,7 +364,7 @@ def test_a_rule_that_fails_leaves_the_last_decision_in_force(misbehave: Any, fau
 def test_a_mode_whose_rules_fail_is_not_entered() -> None:
     drive = failing(raises, Mode.COLLECTIVE)
     before = drive.accept("bitrate_predicted", kbps=1500)
-    after = drive.tell("mode_selected", mode="collective")
+    after = drive.feed("mode_selected", mode="collective")
     assert after.refused == "mode collective: rule mine failed: ZeroDivisionError: division by zero"
     assert (after.state.mode, after.decision, after.fault) == (Mode.AUTOMATIC, before.decision, None)
 

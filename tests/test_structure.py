@@ -1,4 +1,4 @@
-"""What may import what: the contracts of pyproject.toml hold, and see an import that breaks them."""
+"""Imports: the contracts of pyproject.toml hold, and detect an import that breaks them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINT = Path(sys.executable).with_name("lint-imports")
 
 def lint(checkout: Path) -> subprocess.CompletedProcess[str]:
     words = [str(LINT), "--no-cache", "--no-logo"]
-    environment = {**os.environ, "COLUMNS": "200"}  # a contract's name and what comes of it in one line
+    environment = {**os.environ, "COLUMNS": "200"}  # a contract's name and its result in one line
     return subprocess.run(words, cwd=checkout, env=environment, capture_output=True, text=True, check=False, timeout=60)
 
 

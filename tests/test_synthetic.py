@@ -1,4 +1,4 @@
-"""The synthetic drive: what lies in its cache, and what the cameras see."""
+"""The synthetic drive: its cache, and what the cameras see."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def see(world: Path) -> Callable[[View], Any]:
 
 @contextmanager
 def built(world: Path) -> Iterator[None]:
-    """Building the street takes seconds: what is rendered takes the one that has been built."""
+    """Building the street takes seconds: rendering reuses the one that is already built."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("runner.synthetic.world.build_world", lambda seconds, file: shutil.copy(world, file))
         yield
@@ -67,7 +67,7 @@ def built(world: Path) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def cache(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[tuple[str, float]]]]:
-    """A cache with two clips, and what was reported while they were rendered; FORWARD is asked for twice."""
+    """A cache with two clips, and the progress reported while they were rendered; FORWARD is requested twice."""
     folder, reports = tmp_path_factory.mktemp("cache"), []
     (folder / "drive-0.mp4.part").write_bytes(b"half a clip")
     with built(world):
@@ -219,7 +219,7 @@ def decode(clip: Path) -> tuple[Any, list[int]]:
 
 
 @pytest.mark.gst
-def test_writer_reports_what_gstreamer_says(tmp_path: Path) -> None:
+def test_writer_reports_the_error_of_gstreamer(tmp_path: Path) -> None:
     from runner.gst.clip_writer import write_clip
 
     with pytest.raises(RuntimeError, match="writing the clip: Could not open file"):
@@ -272,7 +272,7 @@ def test_rendering_is_deterministic(see: Callable[[View], Any]) -> None:
 def test_turned_camera_sees_the_same_world(see: Callable[[View], Any]) -> None:
     """A fisheye turned left by 45 degrees shows the same picture an eighth of its 360 degrees further to the right.
 
-    That is only so near the horizon, where equal angles are equal distances; a mirrored picture would move left.
+    This holds only near the horizon, where equal angles are equal distances; a mirrored picture would move left.
     """
     ahead = View(720, 64, Fraction(2), Pose(2.0, 0.0, 1.5, 0.0, 0.0, 0.0), 180.0, "fisheye")
     turned = replace(ahead, pose=replace(ahead.pose, yaw_deg=45.0))
@@ -283,7 +283,7 @@ def test_turned_camera_sees_the_same_world(see: Callable[[View], Any]) -> None:
 
 
 def test_driving_forward_moves_pictures_of_side_cameras_backward(see: Callable[[View], Any]) -> None:
-    """What the left camera sees moves to the left, what the right one sees to the right: nothing is mirrored."""
+    """Pictures of the left camera move to the left, those of the right one to the right: nothing is mirrored."""
     fast = {"fps": Fraction(40), "height": 60}
     for view, sign in ((replace(LEFT, **fast), -1), (replace(RIGHT, **fast), 1)):
         pictures = see(view)[::16, 30:45]

@@ -1,4 +1,4 @@
-"""Tables that settings name: what is read, and each mistake with its exact message."""
+"""Tables named in settings: what is read, and each mistake with its exact message."""
 
 from __future__ import annotations
 

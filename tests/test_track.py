@@ -50,7 +50,7 @@ def distance(a: PositionReported, b: PositionReported) -> float:
 
 
 def furthest(points: Any, order: Any) -> float:
-    """m from the point of the map that the route leaves out most, to the nearest point of the route."""
+    """m between the route and the map point that is furthest from it."""
     x, y = (np.radians(points[:, i]) * EARTH_M * (math.cos(math.radians(48)), 1)[i] for i in (0, 1))
     return float(np.hypot(x[:, None] - x[order], y[:, None] - y[order]).min(axis=1).max())
 
@@ -102,7 +102,7 @@ def test_road_that_does_not_close() -> None:
 
 
 def test_order_is_found_at_once() -> None:
-    """Bounds of processor time."""
+    """Limits are in processor time."""
     random = np.random.default_rng(0)
     for points in (places(*random.uniform(0, 1000, (2, 3000))), random.permutation(oval(1_000_000, 2000, 9, 1.5))):
         start = time.process_time()
@@ -117,7 +117,7 @@ def test_one_place_is_no_route() -> None:
 
 
 def test_road_with_a_standstill_in_the_middle() -> None:
-    """A recorder that stood wrote many equal points: time must rise all the same."""
+    """A recorder at standstill wrote many equal points: time must still increase."""
     x = np.concatenate([np.arange(0, 200, 3.0), np.full(50, 200.0), np.arange(200, 0, -3.0)])
     track = drive(places(x, 0 * x), 8, loop=True)
     assert all(math.isfinite(track.at(t / 10).lon) for t in range(600))
@@ -127,7 +127,7 @@ def test_road_with_a_standstill_in_the_middle() -> None:
 
 
 def simple(loop: bool, speed: Any = None) -> Track:
-    """East 10 m/s for 10 s, 5 s standing, then north 5 m/s for 10 s."""
+    """East 10 m/s for 10 s, 5 s standstill, then north 5 m/s for 10 s."""
     lon, lat = places([0, 100, 100, 100], [0, 0, 0, 50]).T
     return Track(np.array([3.0, 13, 18, 28]), lat, lon, speed, loop)
 
@@ -137,8 +137,8 @@ def test_track_between_rows() -> None:
     found = track.at(5)
     assert distance(found, track.at(0)) == pytest.approx(50, abs=0.1)
     assert (found.t, found.speed_mps) == (5, pytest.approx(10, abs=0.01)) and found.heading_deg == pytest.approx(90)
-    stands = track.at(12)
-    assert stands.speed_mps == 0 and stands.heading_deg == pytest.approx(90)  # held
+    standing = track.at(12)
+    assert standing.speed_mps == 0 and standing.heading_deg == pytest.approx(90)  # held
     assert track.at(20).heading_deg == pytest.approx(0, abs=0.01)
 
 

@@ -1,4 +1,4 @@
-"""Access units: where a decoder can start, and what one that comes late is given."""
+"""Access units: where a decoder can start, and what a late decoder receives."""
 
 from __future__ import annotations
 
@@ -26,18 +26,20 @@ def test_only_an_idr_starts_anew(data, anew):
 
 
 @pytest.mark.parametrize("data", [AUD + SPS, AUD, b"", b"\0\0\1"])
-def test_what_holds_no_picture_is_of_no_use(data):
+def test_a_unit_without_a_picture_is_of_no_use(data):
     assert read_unit(data, None, 0) is None
 
 
 def test_half_a_picture_is_left_out_and_half_an_idr_picture_becomes_a_grey_one():
     sps = b"\0\0\0\1" + bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
-    assert read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None  # without parameter set nothing can be made
+    assert (
+        read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None
+    )  # without a parameter set no grey picture can be made
     grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
     assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
     assert read_unit(grey.data, None, 0).key
-    assert PPS in grey.data  # of the stream: who follows may come without
+    assert PPS in grey.data  # those of the stream: later units may lack them
     recent = Recent(refresh_s=1.0)
     shown = [recent.add(grey), *(recent.add(unit(2.5 + tenth / 10)) for tenth in range(1, 30))]
     assert [u.arrived for u in shown if u.exact] == [2.5 + tenth / 10 for tenth in range(20, 30)]
@@ -63,7 +65,7 @@ def unit(arrived, key=False, recovery=None):
 
 def test_a_late_decoder_gets_the_idr_and_two_refresh_periods():
     recent = Recent(refresh_s=1.0)
-    recent.add(unit(-1))  # nothing can be done with what came before the first IDR
+    recent.add(unit(-1))  # nothing before the first IDR can be decoded
     assert recent.burst() == []
     recent.add(unit(0, key=True))
     for tenth in range(1, 101):
@@ -82,7 +84,7 @@ def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods
     assert [u.arrived for u in shown if u.exact] == [tenth / 10 for tenth in range(21, 30)]
     first, second, *_ = recent.burst()
     assert (first.key, first.exact, read_unit(first.data, None, 0).key) == (True, False, True)
-    assert second.arrived == 0.9  # of the burst only what is needed for the newest
+    assert second.arrived == 0.9  # the burst holds only what the newest needs
     assert recent.add(unit(3, key=True)).exact
     assert recent.add(unit(3.1)).exact
 
@@ -93,7 +95,7 @@ def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
     for tenth in range(1, 58):
         recent.add(unit(tenth / 10, recovery=9 if tenth % 10 == 0 else None))
     _, *rest = recent.burst()
-    assert [u.arrived for u in rest] == [tenth / 10 for tenth in range(40, 58)]  # that of 5.0 still runs
+    assert [u.arrived for u in rest] == [tenth / 10 for tenth in range(40, 58)]  # the wave of 5.0 has not ended
     recent.add(unit(5.8))
     recent.add(unit(5.9))
     assert recent.burst()[1].arrived == 5.0
@@ -153,7 +155,7 @@ def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, r
         assert burst[-1] is everything[-1]
         assert not any(u.key for u in burst[1:])
         assert all(u.arrived >= now - 2 * refresh_s for u in burst[1:])
-        # Nothing is missing but what lies between the IDR and the last two periods.
+        # Only what lies between the IDR and the last two periods is missing.
         since = everything[everything.index(burst[0]) + 1 :]
         assert burst[1:] == [u for u in since if u.arrived >= now - 2 * refresh_s]
 

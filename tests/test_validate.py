@@ -1,4 +1,4 @@
-"""Every file and every combination; files of the user's own with all problems at once."""
+"""Every file and every combination; all problems of a user's files at once."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def count(group: str) -> int:
 
 @pytest.mark.slow
 def test_what_is_packaged_is_valid() -> None:
-    """All graphs, vehicles, experiments and links; every combination is a step of its own in `make test`."""
+    """All graphs, vehicles, experiments and links; every combination is a separate step of `make test`."""
     result = process("validate", "all=true", "source=test", "modes=paper")
     files = sum(map(count, (".", *GROUPS)))
     assert (result.status, result.err) == (0, "")
@@ -138,26 +138,26 @@ def test_maps_are_no_configuration(tod: Command, conf: UserConf) -> None:
 
 
 @pytest.mark.parametrize(
-    "rows, told",
+    "rows, expected",
     [
         ("lon,lat,kbps\n", "must have rows"),
         ("lon,lat\n1,2\n", None),
         (None, "no such file"),
     ],
 )
-def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, told: str | None) -> None:
+def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, expected: str | None) -> None:
     conf.change("pqos/map.yaml", {"maps/demo_loop.csv": "maps/mine.csv"})
     if rows is not None:
         conf.write("maps/mine.csv", rows)
     (problem,) = problems(tod, conf, *one("pqos"))
     assert problem.startswith("~/pqos/map.yaml: file: ")
-    assert told is None or told in problem
+    assert expected is None or expected in problem
 
 
 @pytest.mark.gst
 @pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
 @pytest.mark.parametrize(
-    "old, new, told",
+    "old, new, expected",
     [
         ("element: x264enc", "element: x264encc", "encoder[0].element: 'x264encc'"),
         ("quantizer: 10", "quantiser: 10", "encoder[0].properties.quantiser"),
@@ -167,16 +167,16 @@ def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, told: str
         ("property: bitrate, value: kbps", "property: bitrat, value: kbps", "knobs.bitrate[0].property"),
     ],
 )
-def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, told: str) -> None:
+def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, expected: str) -> None:
     conf.change("graph/h264_rtsp.yaml", {old: new})
     found = problems(tod, conf, *one())
-    assert any(problem.startswith(f"~/graph/h264_rtsp.yaml: {told}") for problem in found), found
+    assert any(problem.startswith(f"~/graph/h264_rtsp.yaml: {expected}") for problem in found), found
 
 
 @pytest.mark.gst
 @pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
 @pytest.mark.parametrize(
-    "old, new, told",
+    "old, new, expected",
     [
         ("element: avenc_ffv1", "element: avenc_ffv2", "elements[0].element: 'avenc_ffv2': unknown element, "),
         ("slices: 4", "slices: -4", "elements[0].properties.slices: -4: must be from 0 to 2147483647"),
@@ -185,11 +185,11 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
     ],
 )
 def test_ways_to_record_are_checked_though_none_is_chosen(
-    tod: Command, conf: UserConf, old: str, new: str, told: str
+    tod: Command, conf: UserConf, old: str, new: str, expected: str
 ) -> None:
     conf.change("recording/ffv1.yaml", {old: new})
     (found,) = problems(tod, conf, *one("recording"))
-    assert found.startswith(f"~/recording/ffv1.yaml: {told}")
+    assert found.startswith(f"~/recording/ffv1.yaml: {expected}")
 
 
 def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> None:
@@ -199,7 +199,7 @@ def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> N
     assert problem.endswith(": must rise")
 
 
-# --- what is composed how often ---------------------------------------------------------------------------------------
+# --- how often Hydra composes -----------------------------------------------------------------------------------------
 
 FLEET = Path(__file__).parent / "fleet"  # 2 vehicles, 6 kinds of camera, 4 modes, 3 graphs, 3 sources, 2 pqos
 FILES = {group: [(group, name) for name in options(group, [FLEET])] for group in GROUPS}
@@ -235,7 +235,7 @@ def test_files_that_keep_to_themselves_are_composed_and_read_once(
 
 
 @pytest.mark.slow
-def test_what_is_put_together_is_what_hydra_composes() -> None:
+def test_assembled_documents_equal_those_that_hydra_composes() -> None:
     combinations = Combinations([], FLEET, chain(*FILES.values()))
     crossed = product(*(FILES[group] for group in ("vehicle", "graph", "source")))
     alone = [(choice,) for group in ("cameras", *SECTIONS) for choice in FILES[group]]
@@ -257,7 +257,7 @@ def test_what_is_put_together_is_what_hydra_composes() -> None:
         ("config.yaml", (CONF / "config.yaml").read_text().replace("port: 8554", "port: '${graph.first_port}'")),
     ],
 )
-def test_what_reaches_into_other_groups_is_not_put_together(conf: UserConf, name: str, text: str) -> None:
+def test_files_that_reach_into_other_groups_are_not_assembled(conf: UserConf, name: str, text: str) -> None:
     conf.write(name, text)
     group, _, file = name.removesuffix(".yaml").rpartition("/")
     choices = {group: file} if group else {"modes": "paper"}
@@ -294,14 +294,14 @@ def test_files_of_two_directories(tod: Command, conf: UserConf) -> None:
 
 
 @pytest.mark.parametrize(
-    "word, told",
+    "word, expected",
     [
         ("{}/modes/b.yaml", "{}/modes/b.yaml: no such file"),
         ("{}/modes", "{}/modes: must be NAME=VALUE, or a file that ends in .yaml or .yml"),
         ("{}/../x.yaml", "{}/../x.yaml: is in no configuration directory: none above it has vehicle/, cameras/, ..."),
     ],
 )
-def test_a_word_that_names_no_file_of_a_configuration(tod: Command, conf: UserConf, word: str, told: str) -> None:
+def test_a_word_that_names_no_file_of_a_configuration(tod: Command, conf: UserConf, word: str, expected: str) -> None:
     conf.write("modes/a.yaml", "defaults: [paper, _self_]\n").write("../x.yaml", "a: 1\n")
     result = tod("validate", word.format(conf.path))
-    assert (result.status, result.err) == (2, f"command line: {told.format(conf.path)}\n")
+    assert (result.status, result.err) == (2, f"command line: {expected.format(conf.path)}\n")

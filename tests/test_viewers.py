@@ -45,12 +45,18 @@ def test_only_loopback_costs_no_uplink(address, leaves):
         ([ANNA], BERT, 1, "anna", None),
         ([ANNA, BERT], ANNA, 2, "anna", [BERT]),
         ([ANNA], ANNA, 1, "anna", [ANNA]),  # whose address changed
-        ([ANYONE], StreamViewer("192.0.2.9"), 1, "", None),  # no operator is not the controller where there is none
+        (
+            [ANYONE],
+            StreamViewer("192.0.2.9"),
+            1,
+            "",
+            None,
+        ),  # without a controller, an anonymous viewer is not taken for it
         ([LOCAL, ANYONE], ANNA, 1, "anna", [ANYONE]),
         ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, "anna", [ANYONE._replace(since=1)]),
     ],
 )
-def test_who_is_let_in_and_who_leaves(viewers, newcomer, limit, controller, leaving):
+def test_which_viewers_are_let_in_and_which_leave(viewers, newcomer, limit, controller, leaving):
     assert admit(viewers, newcomer, limit, controller) == leaving
 
 

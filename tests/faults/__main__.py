@@ -1,6 +1,6 @@
 """usage: python tests/faults [PACKAGE ...]
 
-Puts one fault after the other, two in each package, into a copy of the checkout and runs the tests that must fail.
+Injects one fault at a time, two in each package, into a copy of the checkout and runs the tests that must fail.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LIMIT_S = 600  # ten times what the tests of one file take
 
 
 class Fault(NamedTuple):
-    """What to replace in which file below runner/, and which tests must notice."""
+    """The text to replace in a file below runner/, and the tests that must notice."""
 
     file: str
     right: str
@@ -126,16 +126,14 @@ def main(words: list[str]) -> int:
 
 
 def _caught(fault: Fault) -> str:
-    """The first test that fails with the fault; "" where none does."""
+    """The first test that fails with the fault; "" if none does."""
     with tempfile.TemporaryDirectory() as directory:
         copy = Path(directory, "checkout")
         left_out = shutil.ignore_patterns(".*", "node_modules", "__pycache__", "bench", "docs")
         shutil.copytree(CHECKOUT, copy, symlinks=True, ignore=left_out)
         file = copy / "runner" / fault.file
         text = file.read_text()
-        assert text.count(fault.right) == 1, (
-            f"{fault.file}: {fault.right!r} stands there {text.count(fault.right)} times"
-        )
+        assert text.count(fault.right) == 1, f"{fault.file}: {fault.right!r} occurs {text.count(fault.right)} times"
         file.write_text(text.replace(fault.right, fault.wrong))
         environment = {
             **os.environ,

@@ -1,15 +1,15 @@
 """usage: python tests/golden [--update] [SECTION ...]
 
-Compares what must stay as it is, byte for byte, with what is kept beside this script; at most a minute:
+Compares output that must not change, byte for byte, with copies beside this script; takes at most a minute:
 
   plans      `print` of every vehicle with every graph and source, as text and as JSON
   events     decisions on 2400 generated events, over every vehicle and modes file
   drives     replays of three recorded drives
-  validate   what `validate` says of a hundred broken files
+  validate   output of `validate` for a hundred broken files
   keys       keys of events, of lines of drive logs and of messages of the control link
-  mutations  file and path of what `validate` says of 200 mutations of packaged files; only where it is named: minutes
+  mutations  file and path of the problems `validate` finds in 200 mutations of packaged files; only if named: minutes
 
-With --update the sections are written anew; `git diff --stat` then shows which ones changed, this script what.
+With --update the sections are rewritten; run it without --update first to see what changes.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _difference(name: str, kept: str, now: str) -> Iterator[str]:
     return difflib.unified_diff(kept.splitlines(), now.splitlines(), f"{name}, kept", f"{name}, now", n=0, lineterm="")
 
 
-# --- what is compared -------------------------------------------------------------------------------------------------
+# --- sections ---------------------------------------------------------------------------------------------------------
 
 
 def plans(pool: ProcessPoolExecutor) -> Texts:
@@ -168,7 +168,7 @@ def _files(group: str) -> list[str]:
 
 
 def _inputs(vehicle: str, source: str) -> list[str]:
-    """What some sources need before they can be printed."""
+    """Overrides that some sources need before they can be printed."""
     if source == "file":
         return [f"source.clip={HERE / '__main__.py'}"]
     return ["source.address=rtsp://192.0.2.1/camera"] if source == "rtsp" else []
@@ -183,7 +183,7 @@ def _outputs(pool: ProcessPoolExecutor, words: list[list[str]]) -> Texts:
 
 
 def _here(words: list[str], directory: str = ".") -> str:
-    """Status and output of a verb in a directory, in this process: the start of Python would take longer."""
+    """Status and output of a verb in a directory, in this process: starting Python would take longer."""
     from runner.__main__ import main
     from runner.configuration import config
 
@@ -196,14 +196,14 @@ def _here(words: list[str], directory: str = ".") -> str:
 
 @lru_cache(maxsize=8)
 def _composed(overrides: tuple[str, ...], user: Path | None = None) -> Any:
-    """Composing takes longer than all else, and text and JSON of a plan come from the same."""
+    """Composing takes longest, and text and JSON of a plan share one composition."""
     from runner.configuration.compose import compose
 
     return compose(overrides, user)
 
 
 def _problems(mutation: mutated.Mutation) -> str:
-    """File and path of each problem that `validate` finds where a user's file shadows the packaged one."""
+    """File and path of each problem that `validate` finds when a user's file shadows the packaged one."""
     from runner.errors import ConfigError
     from runner.verbs import Arguments
     from runner.verbs import validate as verb
@@ -245,7 +245,7 @@ def _cameras(vehicle: str) -> list[str]:
 
 
 def _event(chance: random.Random, camera: str, cameras: list[str]) -> dict[str, Any]:
-    """One event; some are refused, since the mode is another or a value is out of range."""
+    """One event; some are refused, since the mode is wrong or a value is out of range."""
     kbps = chance.choice((0, 0.5, 1, 99.9, chance.randrange(20_000), round(chance.uniform(0, 8000), 2)))
     name = chance.choice(list(_GENERATED))
     return {"event": name, **_GENERATED[name](chance, camera, cameras, kbps)}
@@ -287,7 +287,7 @@ _GENERATED: dict[str, Callable[[random.Random, str, list[str], float], dict[str,
 
 
 def _keys(name: str) -> Iterator[str]:
-    """Every path of properties that a schema has, with what is required, references between its parts followed."""
+    """Every property path of a schema, optional ones marked, references between its parts followed."""
     document = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
     yield from sorted(set(_paths(document, document, "", ())))
 
@@ -313,7 +313,7 @@ def _paths(node: Any, document: Any, path: str, seen: tuple[str, ...]) -> Iterat
 
 
 def _target(reference: str, document: Any) -> tuple[Any, Any]:
-    """What a reference refers to, in the same schema or in another file of the directory."""
+    """The target of a reference, in the same schema or in another file of the directory."""
     file, _, pointer = reference.partition("#")
     home = json.loads((SCHEMAS / Path(file).name).read_text()) if file else document
     target = home

@@ -1,10 +1,10 @@
-"""One hundred configuration files, each with one mistake: a packaged file and what takes the place of what in it.
+"""One hundred configuration files, each with one mistake: packaged files, and the text to replace in each.
 
-`DIRECTORIES` groups them into users' directories. Mistakes that a schema sees end `validate` before anything is
-composed, so they share a directory; the others have one for each group, since vehicles, graphs and sources meet.
+`directories` groups them into users' directories. Mistakes that a schema sees end `validate` before anything is
+composed, so they share a directory; the others have one per group, since vehicles, graphs and sources are combined.
 
-Graphs and modes are taken from conf/ beside this file: they give each list as a whole, as users' files do that were
-written before graphs and modes were built on each other.
+Graphs and modes are taken from conf/ beside this file: they state each list in full, as do users' files that
+were written before graphs and modes could build on each other.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ SCHEMA: Mapping[str, Sequence[Edit]] = {
         ("defaults:\n", "defaults: everything\nothers:\n"),
     ],
 }
-# By group: what only the composed configuration shows.
+# By group: mistakes that only the composed configuration shows.
 COMPOSED: Mapping[str, Mapping[str, Sequence[Edit]]] = {
     "cameras": {
         "cameras/wide_720p": [
@@ -162,7 +162,7 @@ COMPOSED: Mapping[str, Mapping[str, Sequence[Edit]]] = {
 def directories(packaged: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Each directory's name, and the text of its files by path.
 
-    raises  ValueError where an edit finds nothing to replace, or more than its file's beginning shows
+    raises  ValueError if an edit finds nothing to replace
     """
     yield "schema", dict(_edited(packaged, SCHEMA))
     for group, edits in COMPOSED.items():
@@ -170,7 +170,7 @@ def directories(packaged: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def text_of(packaged: Path, name: str) -> str:
-    """The text of a packaged file that is to be changed."""
+    """The original text of a packaged file."""
     kept = WHOLE_LISTS / f"{name}.yaml"
     return (kept if kept.exists() else packaged / f"{name}.yaml").read_text()
 

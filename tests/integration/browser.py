@@ -1,4 +1,4 @@
-"""What the tests of the operator's page share: a browser's page, and what it shows."""
+"""Shared by the tests of the operator's page: a browser's page, and what it shows."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ import rig
 SCREENSHOTS = Path(os.environ.get("TOD_SCREENSHOTS", "/tmp/tod-runner-screenshots"))
 
 
-until = partial(rig.until, every_s=0.1)  # asking a browser costs it time
+until = partial(rig.until, every_s=0.1)  # each poll costs the browser time
 
 
 @contextmanager
 def opened(browser, url, width=1280, height=800, refused=False, **context):
-    """A page in a browser of its own, which must stay free of errors and ask no other host.
+    """A page in its own browser context, which must stay free of errors and contact no other host.
 
-    refused  the station goes away meanwhile, which the browser tells for each request
+    refused  the station goes away meanwhile, which the browser logs for each request
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
         page = tab.new_page()
         wrong, own = [], (url.partition("#")[0], "data:", "blob:")
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
+        page.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
         page.goto(url)
         until(lambda: page.evaluate("window.tod !== undefined"))
         yield page
-        expected = ("WebSocket connection", *(["net::ERR_CONNECTION_REFUSED"] if refused else []))
-        assert [text for text in wrong if not any(each in text for each in expected)] == []
+        expected = ("WebSocket connection", *(["net::ERR_"] if refused else []))
+        unexpected = [text for text in wrong if not any(each in text for each in expected)]
+        assert not unexpected, unexpected
 
 
 def take_control(page):
     def taken():
-        """A person would click again where the page was just connecting."""
+        """A user would click again if the page was still connecting."""
         if (holder := page.evaluate("tod.control")) == "you":
             return True
         page.locator("#take-control").click()
-        if holder == "another":  # asked once more
+        if holder == "another":  # asks for confirmation
             page.locator("#confirm-yes").click()
         return rig.passes(lambda: page.evaluate("tod.control === 'you'"), seconds=2)
 
@@ -55,7 +56,7 @@ def measure(page):
 
 
 def all_live(page, seconds=30):
-    """Every camera has been live; on a busy machine hardly ever all at the very same moment."""
+    """Every camera has been live at some time; on a busy machine hardly ever all at the same moment."""
     waiting = set(measure(page))
 
     def seen():
@@ -77,7 +78,7 @@ def state_when(page, wanted, seconds=15):
 
 
 def luma(page, camera):
-    """The picture that was drawn last: its luma, and when it was captured, ms."""
+    """The last picture drawn: its luma, and its capture time, ms."""
     picture = page.evaluate(f"tod.picture('{camera}')")
     width, height = picture["width"], picture["height"]
     data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
@@ -90,5 +91,5 @@ def shot(page, name):
 
 
 def send(page, **event):
-    """A request as the page sends it; its answer."""
+    """Send a request as the page does; returns the reply."""
     return page.evaluate("event => tod.request(event)", event)

@@ -1,7 +1,7 @@
-"""Everything here needs GStreamer, and most of it lives by the clock.
+"""Everything here needs GStreamer, and most of it depends on real time.
 
-`pytest -m "not gst"` leaves out what needs GStreamer. `make test` runs a few files at a time of what is marked `timed`,
-then, two files at a time, the tests marked `alone`, whose limits are tight. Everything else runs on the processor time
+`pytest -m "not gst"` leaves out the tests that need GStreamer. `make test` runs those marked `timed`, a few files at a
+time, then those marked `alone`, whose limits are tight, two files at a time. Everything else runs on the processor time
 that these leave over.
 """
 
@@ -18,7 +18,7 @@ from runner.mqtt.broker import private_broker
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
 
-LONGEST = ("test_docs", "test_page", "test_live", "test_ends", "test_page_sides", "test_control")  # begun first
+LONGEST = ("test_docs", "test_page", "test_live", "test_ends", "test_page_sides", "test_control")  # started first
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -44,7 +44,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def broker() -> Iterator[Endpoint]:
-    """Address of a broker of the test's own."""
+    """Address of the test's own broker."""
     endpoint = Endpoint("127.0.0.1", free_port())
     with private_broker(endpoint):
         yield endpoint

@@ -1,4 +1,4 @@
-"""What the tests with real GStreamer share: free ports, one-camera vehicles, a client that looks at pictures."""
+"""Shared by the tests with real GStreamer: free ports, one-camera vehicles, a client that inspects pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "da
 CLIPS = sorted((SHARED / "video").glob("*")) if SHARED.is_dir() else []
 
 
-# No sandbox inside containers; no talk with hosts that a closed network refuses anyway.
+# No sandbox inside containers; no background traffic to hosts that a closed network refuses anyway.
 CHROMIUM_FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -36,9 +36,9 @@ CHROMIUM_FLAGS = [
 ]
 
 
-# Below those that Linux gives to clients: one of these may be taken before a side under test has bound it.
+# Below the ephemeral range of Linux: a client might take one of those before a side under test has bound it.
 _PORTS = itertools.cycle(range(10_000, 30_000))
-next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes begin elsewhere
+next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes start elsewhere
 
 
 def free_port() -> int:
@@ -52,50 +52,50 @@ def free_port() -> int:
 
 
 def answers(port: int) -> bool:
-    """Whether somebody listens there."""
+    """Whether a server listens on a local port."""
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def until(done: Callable[[], Any], seconds: float = 15, every_s: float = 0.01) -> Any:
-    """Wait for something to come to pass; the limit is far above what is normal."""
+    """Wait until a condition is true; the limit is far above what is normal."""
     end = time.monotonic() + seconds
     while not (seen := done()):
-        assert time.monotonic() < end, "it did not come to pass"
+        assert time.monotonic() < end, "timed out"
         time.sleep(every_s)
     return seen
 
 
 def passes(done: Callable[[], Any], seconds: float) -> bool:
-    """Whether something comes to pass in time."""
+    """Whether a condition becomes true in time."""
     try:
         return bool(until(done, seconds))
     except AssertionError:
         return False
 
 
-class Heard(Listener):
-    """Keeps what a station says, as ("state" | "sample" | "note", record)."""
+class RecordingListener(Listener):
+    """Keeps what a station reports, as ("state" | "sample" | "note", record)."""
 
     def __init__(self) -> None:
-        self.said: list[tuple[str, Any]] = []
+        self.received: list[tuple[str, Any]] = []
 
     def on_state(self, state: VehicleState | None) -> None:
-        self.said.append(("state", state))
+        self.received.append(("state", state))
 
     def on_sample(self, sample: Sample) -> None:
-        self.said.append(("sample", sample))
+        self.received.append(("sample", sample))
 
     def on_note(self, note: Note) -> None:
-        self.said.append(("note", note))
+        self.received.append(("note", note))
 
     @property
     def notes(self) -> list[str]:
-        return [record.text for kind, record in self.said if kind == "note"]
+        return [record.text for kind, record in self.received if kind == "note"]
 
 
 class Operator:
-    """An operator's end of the control link, as a program would write it."""
+    """An operator's end of the control link, as a program would implement it."""
 
     def __init__(self, broker: Any, vehicle: str = "delivery_robot", name: str = "") -> None:
         from runner.mqtt.link import ControlLink
@@ -106,7 +106,7 @@ class Operator:
         self.last: Any = None  # state
         self.replies: dict[str, Any] = {}
         self.telemetry: list[Any] = []
-        self._heard_at = 0.0
+        self._telemetry_at = 0.0
         self.requests = topic(vehicle, "request", self.name)
         listen = {
             topic(vehicle, "state"): lambda message: self.states.put(state_to_json(read_state(message.payload))),
@@ -121,11 +121,11 @@ class Operator:
         from runner.mqtt.messages import read_telemetry
 
         self.telemetry.append(to_json(read_telemetry(message.payload)))
-        self._heard_at = time.monotonic()
+        self._telemetry_at = time.monotonic()
 
     def as_of(self) -> float:
-        """The vehicle's time now, as far as it is known here."""
-        return float(until(lambda: self.telemetry)[-1]["t"]) + time.monotonic() - self._heard_at
+        """The vehicle's current time, estimated from its telemetry."""
+        return float(until(lambda: self.telemetry)[-1]["t"]) + time.monotonic() - self._telemetry_at
 
     def send(self, identity: str, **event: Any) -> None:
         self.link.publish(self.requests, {"id": identity, "as_of": self.as_of(), **event})
@@ -135,7 +135,7 @@ class Operator:
         return until(lambda: self.replies.get(identity))
 
     def state(self, wanted: Callable[[Any], bool]) -> Any:
-        """The next state of which something is true."""
+        """The next state that fulfils a condition."""
         end = time.monotonic() + 15
         while not wanted(state := self.states.get(timeout=max(0.0, end - time.monotonic()))):
             self.last = state
@@ -143,16 +143,16 @@ class Operator:
         return state
 
     def reach(self, wanted: Callable[[Any], bool]) -> Any:
-        """The state last looked at, or else the next one, of which something is true."""
+        """The last state, or else the next one, that fulfils a condition."""
         return self.last if self.last and wanted(self.last) else self.state(wanted)
 
     def publish(self, payload: bytes, **options: Any) -> None:
-        """Anything, as a request."""
+        """Publish any payload as a request."""
         self.link._client.publish(self.requests, payload, qos=1, **options)
 
 
 def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    """The command line in a process of its own."""
+    """The command line in its own process."""
     command = [sys.executable, "-m", "runner", *words]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **options.pop("env", {})}
     options = {"cwd": CHECKOUT, "timeout": 120, **options}
@@ -168,7 +168,7 @@ def process(
     before: Sequence[str] = (),
     cwd: Path = CHECKOUT,
 ) -> Iterator[subprocess.Popen[str]]:
-    """A verb in a process of its own, killed at the end; `before` comes before its command line."""
+    """A verb in its own process, killed at the end; `before` is prepended to its command line."""
     command = [*before, sys.executable, "-m", "runner", verb, *words]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **(env or {})}
     with subprocess.Popen(
@@ -182,7 +182,7 @@ def process(
 
 @contextmanager
 def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iterator[Any]:
-    """Some cameras of a vehicle behind a real RTSP server. Yields (side, vehicle, plans, what was reported)."""
+    """Some cameras of a vehicle behind a real RTSP server. Yields (side, vehicle, plans, reports)."""
     from dataclasses import replace
 
     from runner.apply import VehicleSide, check_plan
@@ -202,7 +202,7 @@ def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iter
 
 
 class Client:
-    """Receives and decodes one camera; keeps the size of each frame and, where asked for, the last picture."""
+    """Receives and decodes one camera; keeps the size of each frame and, if requested, the last picture."""
 
     def __init__(self, plan: Any, *, pictures: bool = False) -> None:
         from runner.gst import Gst
@@ -244,6 +244,11 @@ class Client:
         stride = len(data) // height
         return np.frombuffer(data, np.uint8).reshape(height, stride)[:, : width * 3].reshape(height, width, 3)
 
+    def reconnect(self) -> None:
+        self.close()
+        self.errors.clear()
+        self.pipeline.set_state(self._gst.State.PLAYING)
+
     def close(self) -> None:
         self.pipeline.set_state(self._gst.State.NULL)
 
@@ -279,7 +284,7 @@ GLib.MainLoop().run()
 
 @contextmanager
 def ip_camera(port: int) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """An IP camera in a process of its own. Yields its address and the process, which may be stopped or killed."""
+    """An IP camera in its own process. Yields its address and the process, which may be stopped or killed."""
     command = [sys.executable, "-c", IP_CAMERA, str(port)]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=CHECKOUT) as child:

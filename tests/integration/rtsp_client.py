@@ -1,4 +1,4 @@
-"""An RTSP client on bare sockets, for what no player does: wrong URLs, silence, a reader that stops or is slow."""
+"""An RTSP client on bare sockets, for what players never do: wrong URLs, silence, a reader that stops or is slow."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 class RtspClient:
     """One connection; packets are kept as (time, sequence number, marker).
 
-    at      where to connect to in place of what the URL says
+    at      address to connect to instead of the URL's
     source  address to connect from
     agent   its User-Agent
-    small   buffers and segments as on a slow network: loopback's would hold many seconds of video
+    small   buffers and segments as on a slow network: those of loopback would hold many seconds of video
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class RtspClient:
         return self._answer()
 
     def open(self, *, udp: bool = False, **play: object) -> list[int]:
-        """Status codes of DESCRIBE, SETUP and PLAY, as far as they go."""
+        """Status codes of DESCRIBE, SETUP and PLAY, up to the first failure."""
         codes = [self.ask("DESCRIBE", Accept="application/sdp")]
         base = re.search(r"Content-Base: (\S+?)/*\r", self.head)
         if codes == [200]:
@@ -58,7 +58,7 @@ class RtspClient:
         return codes
 
     def read(self) -> RtspClient:
-        """Take packets from now on, in a thread."""
+        """Read packets from now on, in a thread."""
         self._thread = threading.Thread(target=self._read_udp if self._rtp else self._read_tcp, daemon=True)
         self._thread.start()
         return self
@@ -83,7 +83,7 @@ class RtspClient:
         return max(b - a for a, b in pairwise(ends))
 
     def ended(self, seconds: float = 10) -> bool:
-        """Whether the server closes the connection within a time; throws away what comes."""
+        """Whether the server closes the connection within a time; discards incoming data."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self.tcp.settimeout(left)

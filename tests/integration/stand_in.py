@@ -1,4 +1,4 @@
-"""Both sides without GStreamer: what they are told is recorded, and answered as if every camera streamed."""
+"""Both sides without GStreamer: commands are recorded, and answered as if every camera streamed."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from runner.apply import Reception
 from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
 
-FRAMES = 5  # that a camera which sends has delivered from one look to the next
+FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
 
 
 class RecordingVehicle:
     """Stands in for `runner.apply.VehicleSide`.
 
-    watched   cameras that have a pipeline: what is commanded of them counts as applied
-    commands  all that came, in order
+    watched   cameras that have a pipeline: their commands count as applied
+    commands  all that were received, in order
     """
 
     def __init__(self, plans: Sequence[Plan], *_: Any) -> None:

@@ -1,4 +1,4 @@
-"""What loop and station ask of the sides that stream: the same under GStreamer and under stand-ins that record."""
+"""What loop and station require of the streaming sides: the same with GStreamer and with recording stand-ins."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from rig import Heard, Operator, free_port, process, until
+from rig import Operator, RecordingListener, free_port, process, until
 from runner import apply
 from runner.operator.frames import live_frames
 from runner.operator.live import live_operator
@@ -19,7 +19,7 @@ CAMERAS = ("front", "rear", "mast")
 
 
 class Watched:
-    """A vehicle that streams, and who watches which of its cameras."""
+    """A streaming vehicle, and viewers of its cameras."""
 
     def __init__(self, live, words, stack):
         self.live, self._words, self._stack = live, words, stack
@@ -91,7 +91,7 @@ def test_a_request_is_answered_once_it_is_read_back(operator, vehicle):
 
 
 def fits(camera):
-    """Whether what is decided for a camera is applied."""
+    """Whether the decision for a camera is applied."""
     size = {"width": camera["width"], "height": camera["height"]}
     return (camera["applied"].get("bitrate"), camera["applied"].get("size")) == (camera["kbps"], size)
 
@@ -133,35 +133,37 @@ def test_telemetry_counts_what_is_sent_of_watched_cameras_only(operator, vehicle
 
 @pytest.fixture(params=["recording", "gstreamer"])
 def live(request, broker, monkeypatch):
-    """An operator's side that runs beside a real vehicle, and what its station has said."""
+    """An operator's side beside a real vehicle, and a listener to its station."""
     if request.param == "recording":
         monkeypatch.setattr(apply, "OperatorSide", RecordingOperator)
     words = [*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"]
     with process("vehicle", *words) as vehicle, live_operator(words) as operator:
-        heard = Heard()
-        operator.station.listeners.append(heard)
+        listener = RecordingListener()
+        operator.station.listeners.append(listener)
         operator.start()
         until(lambda: operator.station.state)
-        yield operator, heard, vehicle
+        yield operator, listener, vehicle
 
 
-def samples(heard):
-    return [record for kind, record in heard.said if kind == "sample"]
+def samples(listener):
+    return [record for kind, record in listener.received if kind == "sample"]
 
 
-def cameras(heard):
-    return samples(heard)[-1].cameras
+def cameras(listener):
+    return samples(listener)[-1].cameras
 
 
 def test_every_camera_that_should_send_arrives(live):
-    operator, heard, _ = live
-    until(lambda: samples(heard) and all(camera.fps and camera.allocated_kbps for camera in cameras(heard).values()))
-    last = samples(heard)[-1]
+    operator, listener, _ = live
+    until(
+        lambda: samples(listener) and all(camera.fps and camera.allocated_kbps for camera in cameras(listener).values())
+    )
+    last = samples(listener)[-1]
     assert set(last.cameras) == {row.name for row in operator.station.rows()} == set(CAMERAS)
     assert all(camera.width and camera.frames and camera.bytes for camera in last.cameras.values())
     assert not any(camera.rebuilt for camera in last.cameras.values())
     assert last.allocated_kbps == sum(camera.allocated_kbps for camera in last.cameras.values())
-    assert "the vehicle is online, mode automatic" in heard.notes
+    assert "the vehicle is online, mode automatic" in listener.notes
 
 
 def test_requests_are_answered_and_change_the_state(live):
@@ -176,20 +178,20 @@ def test_requests_are_answered_and_change_the_state(live):
 
 
 def test_a_camera_that_is_switched_off_is_no_fault(live):
-    operator, heard, _ = live
-    until(lambda: samples(heard) and samples(heard)[-1].cameras["rear"].fps > 0)
+    operator, listener, _ = live
+    until(lambda: samples(listener) and samples(listener)[-1].cameras["rear"].fps > 0)
     operator.station.ask({"event": "camera_switched", "camera": "rear", "on": False})
     until(lambda: not operator.station.sending()["rear"])
-    until(lambda: samples(heard)[-1].cameras["rear"].fps == 0)
-    assert samples(heard)[-1].cameras["rear"].rebuilt == 0
+    until(lambda: samples(listener)[-1].cameras["rear"].fps == 0)
+    assert samples(listener)[-1].cameras["rear"].rebuilt == 0
     assert operator.runs()
 
 
 def test_a_vehicle_that_is_killed_is_offline_and_all_rates_fall_to_zero(live):
-    operator, heard, vehicle = live
-    until(lambda: samples(heard) and samples(heard)[-1].cameras["rear"].fps > 0)
+    operator, listener, vehicle = live
+    until(lambda: samples(listener) and samples(listener)[-1].cameras["rear"].fps > 0)
     vehicle.kill()
     until(lambda: operator.station.state is None)
-    until(lambda: all(camera.fps == 0 for camera in samples(heard)[-1].cameras.values()))
-    assert samples(heard)[-1].allocated_kbps == 0
+    until(lambda: all(camera.fps == 0 for camera in samples(listener)[-1].cameras.values()))
+    assert samples(listener)[-1].allocated_kbps == 0
     assert operator.runs()

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from rig import CHECKOUT, Heard, Operator, free_port, process, run, until
+from rig import CHECKOUT, Operator, RecordingListener, free_port, process, run, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import find_mosquitto, private_broker
@@ -42,7 +42,7 @@ def stack():
 
 
 class Present:
-    """An operator that gives its sign of life until it is left."""
+    """An operator that sends signs of life until it leaves."""
 
     def __init__(self, broker, stack, name=""):
         self.operator = Operator(broker, name=name)
@@ -98,7 +98,7 @@ def test_other_operators_do_not_stop_the_video_of_one_who_is_present(broker, veh
 
 @pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
 def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_s, tmp_path):
-    """Its connection may have been closed by the broker meanwhile, or not."""
+    """The broker may or may not have closed its connection meanwhile."""
     onlooker = Operator(broker)
     with process("operator", *ROBOT, *ports, stdout=subprocess.DEVNULL) as operator:
         onlooker.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
@@ -130,7 +130,7 @@ def test_a_request_that_comes_late_is_not_carried_out(broker, vehicle):
     assert operator.state(lambda state: state["total_kbps"] not in (3000, 1000))["total_kbps"] == 1200
 
 
-def test_a_request_must_say_as_of_when_and_is_never_retained(broker, vehicle):
+def test_a_request_must_state_as_of_and_is_never_retained(broker, vehicle):
     operator = Operator(broker)
     as_of = operator.as_of()
     rule = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
@@ -144,8 +144,8 @@ def test_a_request_must_say_as_of_when_and_is_never_retained(broker, vehicle):
         assert until(lambda i=identity: operator.replies.get(i))["reason"] == reason
     strange = Operator(broker, name="anyone else")
     strange.publish(json.dumps({"id": "1", "as_of": as_of, "event": "operator_connected"}).encode())
-    said = until(lambda: strange.replies.get(""))
-    assert said["reason"] == "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
+    reply = until(lambda: strange.replies.get(""))
+    assert reply["reason"] == "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
     ahead = operator.ask("5", event="total_set", kbps=1, as_of=as_of + 100)
     assert ahead["result"] == "expired" and "is ahead of the vehicle's time" in ahead["reason"]
     retained = json.dumps({"id": "6", "as_of": as_of, "event": "mode_selected", "mode": "single"}).encode()
@@ -154,8 +154,8 @@ def test_a_request_must_say_as_of_when_and_is_never_retained(broker, vehicle):
         late.as_of()
     late.publish(retained, retain=True)
     with process("vehicle", *ROBOT, "name=late", f"control.port={broker.port}", f"media.port={free_port()}"):
-        said = until(lambda: late.replies.get("6"))
-        assert (said["result"], said["reason"]) == ("refused", "must not be retained: a request is for now")
+        reply = until(lambda: late.replies.get("6"))
+        assert (reply["result"], reply["reason"]) == ("refused", "must not be retained: a request is for now")
     late.publish(b"", retain=True)
 
 
@@ -179,16 +179,16 @@ print(sent)
 
 
 @pytest.mark.alone
-def test_a_flood_of_one_operator_holds_up_no_other(broker, vehicle):
+def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
     good = Operator(broker)
     good.ask("0", event="mode_selected", mode="collective")
     with subprocess.Popen([sys.executable, "-c", FLOOD, str(broker.port)], stdout=subprocess.PIPE, text=True) as flood:
         waits = []
         while flood.poll() is None:
             began = time.monotonic()
-            said = good.ask(str(began), event="camera_switched", camera="rear", on=len(waits) % 2 == 0)
+            reply = good.ask(str(began), event="camera_switched", camera="rear", on=len(waits) % 2 == 0)
             waits.append(time.monotonic() - began)
-            assert said["result"] == "applied", said
+            assert reply["result"] == "applied", reply
             time.sleep(0.05)
         assert int(flood.communicate()[0]) > 20_000
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
@@ -202,24 +202,24 @@ def test_a_flood_of_one_operator_holds_up_no_other(broker, vehicle):
 def test_both_sides_wait_for_a_broker(stack):
     broker = Endpoint("127.0.0.1", free_port())
     ports = (f"control.port={broker.port}", f"media.port={free_port()}")
-    said = {}
+    output = {}
     for verb in ("vehicle", "operator"):
         child = stack.enter_context(process(verb, *ROBOT, *ports))
-        said[verb] = []
-        reader = threading.Thread(target=lambda c=child, v=verb: said[v].extend(c.stdout), daemon=True)
+        output[verb] = []
+        reader = threading.Thread(target=lambda c=child, v=verb: output[v].extend(c.stdout), daemon=True)
         reader.start()
     wanted = f"no control link: MQTT broker at {broker}: connection refused; trying again"
-    until(lambda: any(wanted in line for line in said["vehicle"]))
+    until(lambda: any(wanted in line for line in output["vehicle"]))
     time.sleep(2)
     with private_broker(broker):
         operator = Operator(broker)
         operator.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
-        assert sum(wanted in line for line in said["vehicle"]) == 1
-        assert any(f"connected to the MQTT broker at {broker}" in line for line in said["vehicle"])
+        assert sum(wanted in line for line in output["vehicle"]) == 1
+        assert any(f"connected to the MQTT broker at {broker}" in line for line in output["vehicle"])
 
 
 def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
-    """A broker that hangs takes connections and answers nothing, as a link that is cut does."""
+    """A broker that hangs accepts connections and answers nothing, like a link that is cut."""
     broker = Endpoint("127.0.0.1", free_port())
     file = tmp_path / "mosquitto.conf"
     file.write_text(f"listener {broker.port} {broker.host}\nallow_anonymous true\n")
@@ -236,7 +236,7 @@ def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
                 resumed = time.monotonic()
                 until(lambda: station.take({}) is None and station.state, every_s=0.2)
                 assert time.monotonic() - resumed < 5
-                retained = station._vehicle_time  # perhaps; a request as of a time that old would expire
+                retained = station._vehicle_time  # it may be; a request as of a time that old would expire
                 until(lambda: station._vehicle_time != retained)
                 replies = []
                 station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
@@ -257,7 +257,7 @@ def test_a_second_vehicle_of_the_same_name_is_refused(broker, vehicle):
     assert operator.states.queue[-1]["online"]
 
 
-# --- what is received -------------------------------------------------------------------------------------------------
+# --- received messages ------------------------------------------------------------------------------------------------
 
 GARBAGE = (
     b"",
@@ -276,14 +276,14 @@ GARBAGE = (
 @pytest.fixture
 def station(broker):
     station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).vehicle(), {})
-    heard = Heard()
-    station.listeners.append(heard)
-    yield station, heard
+    listener = RecordingListener()
+    station.listeners.append(listener)
+    yield station, listener
     station.close()
 
 
 def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
-    station, heard = station
+    station, listener = station
     station.connect()
     until(lambda: station.state)
     stranger = Operator(broker)
@@ -293,7 +293,7 @@ def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
     stranger.link._client.publish("tod/delivery_robot/state", b'{"online": "x"}', qos=1, retain=True)
     until(lambda: station._link.dropped >= 4 * len(GARBAGE))
     why = "not JSON: Expecting value: line 1 column 1 (char 0)"
-    assert f"a message on tod/delivery_robot/state was dropped: {why}" in heard.notes
+    assert f"a message on tod/delivery_robot/state was dropped: {why}" in listener.notes
     until(lambda: station.take({}) is None and station.state, every_s=0.2)
     replies = []
     station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
@@ -303,20 +303,20 @@ def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
 def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(broker, vehicle):
     Operator(broker).as_of()
     station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).vehicle(), {})
-    heard = Heard()
-    station.listeners.append(heard)
+    listener = RecordingListener()
+    station.listeners.append(listener)
     station.connect()
     try:
-        until(lambda: station.take({}) is None and heard.notes, every_s=0.2)
-        assert heard.notes == ["the broker knows no vehicle named delivery_robott, online are delivery_robot"]
+        until(lambda: station.take({}) is None and listener.notes, every_s=0.2)
+        assert listener.notes == ["the broker knows no vehicle named delivery_robott, online are delivery_robot"]
     finally:
         station.close()
 
 
 def test_sides_of_different_configuration_name_the_difference(broker, vehicle, ports):
     with process("operator", *ROBOT, *ports, "fps_max=10", "duration_s=4") as operator:
-        said, _ = operator.communicate(timeout=60)
-    assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(said.split())
+        output, _ = operator.communicate(timeout=60)
+    assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(output.split())
 
 
 # --- rules of the user's own ------------------------------------------------------------------------------------------
@@ -373,27 +373,27 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
         until(lambda: "the control loop runs again" in notes(tmp_path))
         vehicle.send_signal(signal.SIGTERM)
         assert vehicle.wait(15) == 0
-    told = notes(tmp_path)
-    assert "rule mine failed: ZeroDivisionError: division by zero; the decision before stays in force" in told
-    assert told.index("the control loop hangs in bitrate_predicted") < told.index("the control loop runs again")
+    messages = notes(tmp_path)
+    assert "rule mine failed: ZeroDivisionError: division by zero; the decision before stays in force" in messages
+    assert messages.index("the control loop hangs in bitrate_predicted") < messages.index("the control loop runs again")
     replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
     faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}
     assert len(faults) == 4, replayed.stderr
 
 
-def test_nothing_waits_for_a_broker_that_is_away():
-    """After a reconnection the present counts, not the past."""
+def test_no_message_is_queued_for_a_broker_that_is_away():
+    """After a reconnection only new messages are sent."""
     endpoint = Endpoint("127.0.0.1", free_port())
-    told, seen = [], []
+    messages, seen = [], []
     own = {topic("x", "request", "+"): lambda message: None}
-    link = ControlLink(endpoint, (topic("x", "state"), OFFLINE), own, lambda here: None, told.append)
+    link = ControlLink(endpoint, (topic("x", "state"), OFFLINE), own, lambda here: None, messages.append)
     link.connect()
-    until(lambda: told)
+    until(lambda: messages)
     link.publish(topic("x", "state"), {"online": "past"})
     with private_broker(endpoint):
         assert link.wait_connected(15)
         listen = {topic("x", "+"): lambda message: seen.append(json.loads(message.payload))}
-        watcher = ControlLink(endpoint, (topic("y", "state"), OFFLINE), listen, lambda here: None, told.append)
+        watcher = ControlLink(endpoint, (topic("y", "state"), OFFLINE), listen, lambda here: None, messages.append)
         watcher.connect()
         assert watcher.wait_connected(15)
         link.publish(topic("x", "state"), {"online": "present"})

@@ -20,7 +20,7 @@ from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
 CUT_S, BACK_S = 20, 5
-CONTROL_S = 1.0  # the control link takes so long to be back; until then nobody knows which cameras should send
+CONTROL_S = 1.0  # until the control link is back; before, it is unknown which cameras should send
 COMMON = ("source=test", "fps_max=15", "pqos=constant", "pqos.kbps=1000", "modes=paper", "page.serve=false")
 # Each vehicle with one camera.
 RTSP = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast")
@@ -41,15 +41,15 @@ needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 
 @contextmanager
 def received(*words):
-    """One camera at the operator. Yields (frames so far, by whether it is known to send; what was reported)."""
+    """One camera at the operator. Yields (frames so far, given whether it is known to send; messages)."""
     from runner.apply import OperatorSide
 
     plans = compile_plans(configuration([*COMMON, *words]).vehicle())
-    told = []
-    side = OperatorSide(plans, lambda cameras, what: told.append(f"{cameras}: {what}"))
+    messages = []
+    side = OperatorSide(plans, lambda cameras, what: messages.append(f"{cameras}: {what}"))
     name = plans[0].camera.name
     try:
-        yield lambda known: side.sample({name: True} if known else {})[name].frames, told
+        yield lambda known: side.sample({name: True} if known else {})[name].frames, messages
     finally:
         side.stop()
 
@@ -80,20 +80,20 @@ def test_after_a_cut_of_20_s_everything_is_back_within_5_s():
             _forward(router, 0)
             cut = time.monotonic()
             while time.monotonic() < cut + CUT_S:
-                stood = frames(False)
+                before = frames(False)
                 time.sleep(0.1)
             _forward(router, 1)
             began, back = time.monotonic(), {}
             while len(back) < len(cameras) and time.monotonic() < began + 3 * BACK_S:
                 passed = time.monotonic() - began
                 now = frames(passed > CONTROL_S)
-                back |= {name: passed for name in cameras if now[name] > stood[name] + 5 and name not in back}
+                back |= {name: passed for name in cameras if now[name] > before[name] + 5 and name not in back}
                 time.sleep(0.05)
             assert set(back) == {"rtsp", "srt"}
             assert max(back.values()) < BACK_S
 
 
 def _forward(router, on):
-    """Let the router pass packets on, or drop them all without a word."""
+    """Let the router forward packets, or silently drop them all."""
     command = ["ip", "netns", "exec", router, "sh", "-c", f"echo {on} > /proc/sys/net/ipv4/ip_forward"]
     subprocess.run(command, check=True)

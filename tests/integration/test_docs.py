@@ -1,4 +1,4 @@
-"""The commands of README and docs run as they stand there, but for the length of drives and the size of pictures."""
+"""The commands in README and docs run as written, except for the length of drives and the size of pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from runner.mqtt.broker import private_broker
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
-# `make test` runs this; test_api.py installs the wheel; a player takes a screen, and test_lines.py plays without one
+# `make test` runs this; test_api.py installs the wheel; a player needs a screen, and test_lines.py plays without one
 NOT_RUN = ("make", "pip", "ffplay")
 LONG = ("tod-runner demo experiment=bottleneck", "tod-runner model vehicle=")  # `make soak` runs these
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
@@ -47,7 +47,7 @@ STANDS_FOR = {
 
 
 def commands(document: Path) -> list[str]:
-    """The command lines of a document: in blocks of no stated language."""
+    """The command lines of a document: in blocks without a language."""
     found, fence = [], None
     for line in document.read_text().splitlines():
         if line.startswith("```"):
@@ -57,7 +57,7 @@ def commands(document: Path) -> list[str]:
     return found
 
 
-# What two documents say is run for the first.
+# A command of two documents is run for the first.
 COMMANDS = {line: document for document in reversed(DOCUMENTS) for line in commands(document)}
 
 
@@ -67,7 +67,7 @@ def test_commands_are_found() -> None:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with what the documents speak of: clips, maps, vehicles, drives."""
+    """A directory with what the documents mention: clips, maps, vehicles, drives."""
     directory = tmp_path_factory.mktemp("docs")
     frames = "videotestsrc num-buffers=30 ! video/x-raw,width=320,height=192,framerate=25/1"
     line = [*f"{frames} ! x264enc ! mp4mux ! filesink location={directory / 'clip.mp4'}".split()]
@@ -93,7 +93,7 @@ def ports() -> tuple[str, str]:
 
 
 def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
-    """A command line of tod-runner, cut short, of four cameras. words: further ones of those verbs that stream."""
+    """A command line of tod-runner, shortened, with four cameras. words: further ones for the verbs that stream."""
     for text, meaning in STANDS_FOR.items():
         line = line.replace(text, meaning)
     _, verb, *rest = shlex.split(line)
@@ -107,7 +107,7 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     if "source=synthetic" in rest:
         own.append(LOOP)
     elif verb != "model" and not any(word.startswith("source=") for word in rest):
-        own.append("source=test")  # a drive is rendered for `kept` once
+        own.append("source=test")  # a drive is rendered once, for `kept`
     if not robot:
         own += FEWER
         small = SMALL if verb != "model" or "source=synthetic" in rest else []
@@ -122,16 +122,16 @@ def check_sides(line: str, place: Path) -> None:
         running = []
         for number, part in enumerate(line.split(";")):
             verb, *rest = adapted(part, words)
-            said = stack.enter_context((place / f"said.{number}").open("w+"))
-            running.append(stack.enter_context(process(verb, *rest, stdout=said.fileno(), cwd=place)))
-        until(lambda: all((place / f"said.{number}").stat().st_size for number in range(len(running))), seconds=30)
+            output = stack.enter_context((place / f"output.{number}").open("w+"))
+            running.append(stack.enter_context(process(verb, *rest, stdout=output.fileno(), cwd=place)))
+        until(lambda: all((place / f"output.{number}").stat().st_size for number in range(len(running))), seconds=30)
         for child in running:
             child.send_signal(signal.SIGINT)
             assert child.wait(timeout=30) in (0, 130), line
 
 
 def check_shell(lines: list[str], place: Path) -> None:
-    """Lines for a shell, beside a demo whose broker they speak to."""
+    """Shell lines, beside a demo whose broker they use."""
     words = ports()
     port = words[1].partition("=")[2]
     with process(

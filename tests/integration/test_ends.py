@@ -21,7 +21,7 @@ from runner.mqtt.broker import private_broker
 
 pytestmark = pytest.mark.gst
 
-PARTS = {  # by what a person calls it, how its command line is known
+PARTS = {  # by name in messages: a pattern for the command line
     "the vehicle's side": r"-m runner vehicle ",
     "the operator's side": r"-m runner operator ",
     "the MQTT broker": r"/mosquitto -c ",
@@ -41,14 +41,14 @@ def demo(tmp_path, *words):
     command = (sys.executable, "-m", "runner", "demo", *ROBOT, *ports, "link=relay", f"log={tmp_path / 'drive'}")
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark}
     with (
-        (tmp_path / "said").open("w+") as said,
+        (tmp_path / "output").open("w+") as output,
         subprocess.Popen(
-            [*command, "duration_s=60", *words], stdout=said, stderr=said, env=environment, cwd=CHECKOUT
+            [*command, "duration_s=60", *words], stdout=output, stderr=output, env=environment, cwd=CHECKOUT
         ) as child,
     ):
         try:
-            until(lambda: (tmp_path / "drive" / "link.jsonl").exists() and "front" in (tmp_path / "said").read_text())
-            yield child, _parts(mark), (tmp_path / "said").read_text
+            until(lambda: (tmp_path / "drive" / "link.jsonl").exists() and "front" in (tmp_path / "output").read_text())
+            yield child, _parts(mark), (tmp_path / "output").read_text
         finally:
             for pid in marked(mark):
                 with suppress(ProcessLookupError):
@@ -63,7 +63,7 @@ def _parts(mark):
 
 
 def _alive(pids):
-    """Which of some processes still run; zombies do not."""
+    """The processes that still run; zombies do not count."""
     alive = []
     for pid in pids:
         with suppress(OSError), open(f"/proc/{pid}/stat") as stat:
@@ -71,38 +71,39 @@ def _alive(pids):
     return alive
 
 
-def test_a_demo_that_is_killed_leaves_nobody_behind(tmp_path):
+def test_a_demo_that_is_killed_leaves_no_process_behind(tmp_path):
     with demo(tmp_path) as (child, parts, _):
         child.kill()
         until(lambda: not _alive(parts.values()), seconds=LIMIT_S)
     lines = (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()
-    assert '"ended"' in lines[-1]  # the vehicle's side had its orderly end
+    assert '"ended"' in lines[-1]  # the vehicle's side shut down properly
 
 
 @pytest.mark.parametrize("part", PARTS)
 def test_a_part_of_a_demo_that_dies_is_named_and_ends_it(tmp_path, part):
-    with demo(tmp_path) as (child, parts, said):
+    with demo(tmp_path) as (child, parts, output):
         os.kill(parts[part], signal.SIGKILL)
         assert child.wait(20) == 1
-        assert re.search(f"^{part}.* ended.*killed by SIGKILL", said(), re.MULTILINE), said()
-        assert "Traceback" not in said()
+        assert re.search(f"^{part}.* ended.*killed by SIGKILL", output(), re.MULTILINE), output()
+        assert "Traceback" not in output()
         assert not _alive(parts.values())
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_of_a_demo_that_hangs_does_not_hold_up_its_end(tmp_path, part):
-    with demo(tmp_path) as (child, parts, said):
+def test_a_part_of_a_demo_that_hangs_does_not_delay_its_end(tmp_path, part):
+    with demo(tmp_path) as (child, parts, output):
         os.kill(parts[part], signal.SIGSTOP)
         child.send_signal(signal.SIGINT)
         began = time.monotonic()
         until(lambda: child.poll() is not None and not _alive(parts.values()), seconds=20)
         assert time.monotonic() - began < LIMIT_S
         assert child.returncode == 130
-        assert "Traceback" not in said()
+        assert "Traceback" not in output()
 
 
 def test_the_broker_serves_any_number_of_connections():
-    """Each would be a line on a pipe that holds 64 KB."""
+    """Each would write a line to a pipe that holds 64 KB."""
     endpoint = Endpoint("127.0.0.1", free_port())
     with private_broker(endpoint) as broker:
         for number in range(1200):

@@ -81,7 +81,7 @@ def write(directory, file, *lines, end="\n"):
 
 
 def messages(path):
-    """By topic: schema, channel and messages; checksums are compared."""
+    """By topic: schema, channel and messages; checksums are verified."""
     topics = {}
     with path.open("rb") as file:
         for schema, channel, message in reader.make_reader(file, validate_crcs=True).iter_messages():
@@ -129,18 +129,18 @@ def stamp(field):
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
-    """Two cameras that were really streamed and received, in a drive on both sides; the frames of each file."""
-    drive, told, arrived = tmp_path_factory.mktemp("filmed"), [], []
+    """Two cameras, really streamed and received, in a drive of both sides; the first frame of each file."""
+    drive, first_frames, arrived = tmp_path_factory.mktemp("filmed"), [], []
     words = ["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"]
     vehicle = configuration(words, check=check_plan).vehicle()
     vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in CAMERAS})
-    plans, files = compile_plans(vehicle), VideoFiles(drive, lambda *first: told.append(first))
+    plans, files = compile_plans(vehicle), VideoFiles(drive, lambda *first: first_frames.append(first))
     reported = []
     sending = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(what), files)
     try:
         sending.turn(Command(name, "size", (320, 180)) for name in CAMERAS)
         for _ in range(2):
-            receiving = OperatorSide(plans, lambda camera, what: None, lambda *came: arrived.append(came), video=files)
+            receiving = OperatorSide(plans, lambda camera, what: None, lambda *unit: arrived.append(unit), video=files)
             try:
                 until(lambda r=receiving: all(c.decoded > 20 for c in r.sample({}).values()))
                 sending.turn(Command(name, "size", (160, 90)) for name in CAMERAS)
@@ -151,21 +151,21 @@ def filmed(tmp_path_factory):
     finally:
         sending.stop()
     for side, name in (("vehicle", "drive.jsonl"), ("operator", "operator.jsonl")):
-        start = told[0][2] - 1
+        start = first_frames[0][2] - 1
         lines = [
             {"t": max(0.0, captured - start), "log": "video", "camera": camera, "file": file, "captured": captured}
-            for camera, file, captured in sorted(told, key=lambda first: first[2])
+            for camera, file, captured in sorted(first_frames, key=lambda first: first[2])
             if f".{side}." in file
         ]
         assert len(lines) == 4
         if side == "operator":
-            lines.append({**SAMPLE, "t": 90.0, "position": None, "cameras": _came(arrived, start)})
+            lines.append({**SAMPLE, "t": 90.0, "position": None, "cameras": _camera_samples(arrived, start)})
         write(drive, name, began(side, start), *lines)
-    return drive, told
+    return drive, first_frames
 
 
-def _came(units, start):
-    """What a sample says of access units."""
+def _camera_samples(units, start):
+    """The cameras of a sample with the arrivals of access units."""
     arrivals = {name: [] for name in CAMERAS}
     for camera, unit in units:
         arrivals[camera].append((round(unit.arrived - start, 4), round(1000 * (unit.arrived - unit.captured), 2)))
@@ -175,7 +175,7 @@ def _came(units, start):
 
 
 def counted(path):
-    """Access units of a file, and pictures that ffmpeg makes of them."""
+    """Access units of a file, and pictures that ffmpeg decodes from them."""
     what = ["-count_frames", "-count_packets", "-select_streams", "v", "-show_entries"]
     what += ["stream=nb_read_frames,nb_read_packets", "-of", "default=noprint_wrappers=1"]
     shown = subprocess.run(["ffprobe", "-v", "error", *what, path], capture_output=True, text=True, check=True)
@@ -184,7 +184,7 @@ def counted(path):
 
 
 def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
-    drive, told = filmed
+    drive, first_frames = filmed
     output = tmp_path / "out.mcap"
     done = run("export", str(drive), f"output={output}")
     assert done.returncode == 0, done.stderr
@@ -198,14 +198,16 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
             assert [stamp(unit[1]) for unit in units] == [picture.log_time for picture in pictures]
             times = [picture.log_time for picture in pictures]
             assert all(a < b for a, b in pairwise(times))
-            firsts = sorted(captured for camera, file, captured in told if camera == name and f".{side}." in file)
+            firsts = sorted(
+                captured for camera, file, captured in first_frames if camera == name and f".{side}." in file
+            )
             assert abs(times[0] / 1e9 - firsts[0]) < 2e-4
             assert any(abs(time / 1e9 - firsts[1]) < 2e-4 for time in times)
             written = tmp_path / f"{name}.{side}.h264"
             written.write_bytes(b"".join(unit[3] for unit in units))
             kept = [counted(drive / f"video/{name}.{side}.{n}.ts") for n in range(2)]
             assert len(units) == kept[0][0] + kept[1][0] > 40
-            # On a busy machine packets get lost on loopback, too; what was sent is whole.
+            # On a busy machine packets get lost on loopback, too; what was sent is complete.
             if side == "vehicle" or all(units == pictures for units, pictures in kept):
                 assert counted(written) == (len(units), len(units))
 
@@ -216,13 +218,13 @@ def test_what_was_received_has_the_times_at_which_it_was_sent(filmed, tmp_path):
     run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
     topics = messages(tmp_path / "out.mcap")
     for name in CAMERAS:
-        sent, came = (
+        sent, received = (
             {fields(picture.data)[3][-40:]: picture.log_time for picture in topics[topic][2]}
             for topic in (f"/{name}/video", f"/{name}/video_received")
         )
-        same = sent.keys() & came.keys()
+        same = sent.keys() & received.keys()
         assert len(same) > 30
-        assert max(abs(sent[end] - came[end]) for end in same) < 1_000_000  # 1 ms: clocks are read, numbers rounded
+        assert max(abs(sent[end] - received[end]) for end in same) < 1_000_000  # 1 ms: clocks are read, numbers rounded
 
 
 def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed, tmp_path):
@@ -233,12 +235,12 @@ def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed
         data = fields(picture.data)[3]
         assert data.startswith((b"\0\0\0\1", b"\0\0\1"))
         kinds = [part[0] & 31 for part in data.split(b"\0\0\1")[1:]]
-        assert sum(kind in (1, 5) for kind in kinds) == 1  # the encoder makes one slice of a picture
+        assert sum(kind in (1, 5) for kind in kinds) == 1  # the encoder makes one slice per picture
         assert 5 not in kinds or {7, 8} <= set(kinds)
     assert 5 in [part[0] & 31 for part in fields(pictures[0].data)[3].split(b"\0\0\1")[1:]]
 
 
-def test_a_video_that_is_missing_or_damaged_is_told_and_the_rest_exported(filmed, tmp_path):
+def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(filmed, tmp_path):
     drive = tmp_path / "drive"
     shutil.copytree(filmed[0], drive)
     (drive / "video/front.vehicle.0.ts").unlink()
@@ -248,8 +250,8 @@ def test_a_video_that_is_missing_or_damaged_is_told_and_the_rest_exported(filmed
     cut.write_bytes(cut.read_bytes()[:20_000])
     done = run("export", str(drive))
     assert done.returncode == 0
-    told = sorted(line for line in done.stderr.splitlines() if "video/" in line)
-    assert told == [
+    warnings = sorted(line for line in done.stderr.splitlines() if "video/" in line)
+    assert warnings == [
         f"{drive}/video/front.vehicle.0.ts: no such file; the export continues without it",
         f"{drive}/video/rear.vehicle.0.ts: contains no readable video; the export continues without it",
         f"{drive}/video/rear.vehicle.1.ts: contains no readable video; the export continues without it",
@@ -330,7 +332,7 @@ def test_an_operator_alone_knows_the_position_too(tmp_path):
 def test_frames_are_found_in_the_log_though_times_were_smoothed_and_frames_are_missing():
     ms = 1_000_000
     captured = [n * 50 * ms for n in range(100)]
-    known = [captured[n] for n in range(100) if n % 7]  # of the others the log says nothing
+    known = [captured[n] for n in range(100) if n % 7]  # the log lacks the others
     offset, found = 0, []
     for n in range(100):
         if n % 11 != 10:  # these are not in the file
@@ -358,10 +360,10 @@ def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
     assert len(times) == summary.statistics.message_count == 32_000
 
 
-# --- what is wrong ----------------------------------------------------------------------------------------------------
+# --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
+def test_a_drive_that_was_cut_off_is_reported_and_exported(tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, end='\n{"t": 1.6, "ev')
     done = run("export", str(drive))
@@ -371,7 +373,7 @@ def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "lines, told",
+    "lines, expected",
     [
         (["{"], "drive.jsonl: line 1: not JSON: "),
         ([json.dumps(began("vehicle")), "garbage", "{}"], "drive.jsonl: line 2: not JSON: "),
@@ -380,11 +382,11 @@ def test_a_drive_that_was_cut_off_is_told_and_exported(tmp_path):
         ([], "drive.jsonl: is empty"),
     ],
 )
-def test_what_is_no_drive_is_one_line(tmp_path, lines, told):
+def test_an_invalid_drive_is_reported_in_one_line(tmp_path, lines, expected):
     (tmp_path / "drive.jsonl").write_text("".join(f"{line}\n" for line in lines))
     done = run("export", str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert done.stderr.startswith(f"{tmp_path}/{told}")
+    assert done.stderr.startswith(f"{tmp_path}/{expected}")
     assert [path.name for path in tmp_path.iterdir()] == ["drive.jsonl"]
 
 
@@ -395,7 +397,7 @@ def test_words_that_are_no_export(tmp_path):
     (tmp_path / "there.mcap").write_text("precious")
     there = "already exists; remove it, or name another file by output="
     name = "must name one drive: a directory that log= wrote"
-    for words, told in (
+    for words, expected in (
         ([], f"command line: {name}"),
         ([str(drive), str(drive)], f"command line: {drive} {drive}: {name}"),
         ([f"{tmp_path}/none"], f"{tmp_path}/none: no such directory"),
@@ -411,13 +413,13 @@ def test_words_that_are_no_export(tmp_path):
         ),
     ):
         done = run("export", *words)
-        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{told}\n")
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{expected}\n")
     assert (tmp_path / "there.mcap").read_text() == "precious"
     assert [path.name for path in drive.iterdir()] == ["drive.jsonl"]
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd):
-    """The file that takes the bytes is one that has no room."""
+    """The output goes to a device without space."""
     from runner.__main__ import main
 
     drive = tmp_path / "drive"

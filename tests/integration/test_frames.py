@@ -59,7 +59,7 @@ def test_a_slow_program_gets_the_newest_and_ends_when_it_is_closed(robot):
     assert list(frames) == []
 
 
-def test_an_unknown_camera_is_told(robot):
+def test_an_unknown_camera_is_reported(robot):
     _, overrides = robot
     with (
         pytest.raises(UserError, match=r"raer: unknown camera, did you mean rear\?"),

@@ -1,4 +1,4 @@
-"""An IP camera that freezes, disappears or is switched off, in front of viewers who stay."""
+"""An IP camera that freezes, disappears or is switched off, while its viewers stay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def driving(*words):
 
 @contextmanager
 def ffmpeg(vehicle, transport):
-    """A foreign viewer. Yields how many frames it has decoded, as a function."""
+    """A third-party viewer. Yields a function: how many frames it has decoded."""
     url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"
     command = ["ffmpeg", "-v", "error", "-progress", "-", "-rtsp_transport", transport, "-i", url, "-f", "null", "-"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
@@ -69,15 +69,15 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session():
         until(side.sources)
         assert side.sources() == {"rear": "source: no frame for 1 s"}
         time.sleep(FROZEN_S - 1)
-        stood = counts()
+        frozen = counts()
         camera.send_signal(signal.SIGCONT)
         until(lambda: not side.sources(), seconds=12)  # 10 s between two attempts, at most
-        until(lambda: all(now > then + 10 for now, then in zip(counts(), stood, strict=True)))
+        until(lambda: all(now > then + 10 for now, then in zip(counts(), frozen, strict=True)))
         assert client.errors == []
-        told = [line.removeprefix("rear: ") for line in reported]
-    assert told[:2] == ["pipeline built", "source: no frame for 1 s"]
-    assert told[-1].startswith("works again after 1")
-    assert len(set(told)) == len(told) <= 5  # each reason once, however many attempts
+        messages = [line.removeprefix("rear: ") for line in reported]
+    assert messages[:2] == ["pipeline built", "source: no frame for 1 s"]
+    assert messages[-1].startswith("works again after 1")
+    assert len(set(messages)) == len(messages) <= 5  # each reason once, however many attempts
 
 
 def test_a_camera_that_is_off_is_watched_all_the_same():
@@ -85,7 +85,7 @@ def test_a_camera_that_is_off_is_watched_all_the_same():
         until(lambda: len(client.sizes) > 10)
         knobs(side, sending=False)
         until(lambda: side.applied()["rear"]["sending"] is False)
-        time.sleep(2)  # twice what a frozen source is allowed
+        time.sleep(2)  # twice the limit for a frozen source
         assert side.sources() == {}
         camera.kill()
         until(side.sources)
@@ -100,7 +100,7 @@ def test_frames_that_are_held_up_behind_the_source_are_no_fault_of_it():
         until(lambda: len(client.sizes) > 10)
         below = side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src")
         held = below.add_probe(Gst.PadProbeType.BLOCK_DOWNSTREAM, lambda *_: Gst.PadProbeReturn.OK)
-        time.sleep(2)  # twice what a frozen source is allowed
+        time.sleep(2)  # twice the limit for a frozen source
         assert side.sources() == {}
         before = len(client.sizes)
         below.remove_probe(held)
@@ -127,7 +127,7 @@ def test_a_camera_that_restarts_is_connected_again():
         assert reported.count("rear: pipeline built") == 1
 
 
-def test_a_viewer_of_a_camera_that_is_not_there_is_refused_and_served_when_it_is_back():
+def test_a_viewer_of_a_missing_camera_is_refused_and_served_when_it_is_back():
     with driving() as (camera, side, _, plan, reported):
         camera.send_signal(signal.SIGSTOP)
         with watching(plan) as client:

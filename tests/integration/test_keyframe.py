@@ -43,8 +43,8 @@ def test_a_grey_picture_starts_a_decoder_and_waves_make_it_exact(width, height, 
     join = next(n for n in range(5, 40) if b"\0\0\1\x67" in units[n])
     grey = grey_idr(units[join])
     assert read_unit(grey, None, 0).key
-    alone, said = decoded([grey], width, height)
-    assert said == ""
+    alone, errors = decoded([grey], width, height)
+    assert errors == ""
     assert (alone == 128).all()
     late, _ = decoded([grey, *units[join:]], width, height)
     assert len(late) == 1 + len(units) - join
@@ -66,7 +66,7 @@ def test_the_burst_of_a_late_viewer_is_exact_though_shorter_than_two_periods():
     assert sum(lengths[20:]) / 20 < 18
 
 
-def test_what_has_no_parameter_set_makes_no_picture():
+def test_data_without_a_parameter_set_makes_no_picture():
     assert grey_idr(b"") is None
     assert grey_idr(b"\0\0\0\1\x41\x9a") is None
     assert grey_idr(b"\0\0\0\1\x67") is None

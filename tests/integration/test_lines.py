@@ -1,4 +1,4 @@
-"""What `print` shows runs as it is, and the streams play in foreign clients."""
+"""The lines that `print` shows run unchanged, and the streams play in third-party clients."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(graph):
 
 @pytest.mark.parametrize("source", ["test", "appsrc", "synthetic"])
 def test_every_line_of_the_paper_s_vehicle_runs(source, tmp_path):
-    """Also where a stand-in is printed: frames born in Python, a drive that is not rendered."""
+    """Also with a stand-in: for frames generated in Python, and for a drive that is not rendered."""
     done = run("print", "format=json", f"source={source}", env={"XDG_CACHE_HOME": str(tmp_path)})
     cameras = json.loads(done.stdout)["cameras"]
     assert ("stands in" in done.stderr) == (source != "test")

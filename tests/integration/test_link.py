@@ -1,4 +1,4 @@
-"""Limited links between real sides: what comes through, what does not, and that nothing stays behind."""
+"""Limited links between real sides: what passes, what is dropped, and that nothing is left behind."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from runner.plans import compile_plans
 NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
 RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
 ROBOT = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "fps_max=15", "page.serve=false", "pqos=constant")
-SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs what it is allowed
+SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs all of its bitrate
 SETTLE_S, MEASURE_S = 2.0, 4.0
 
 
@@ -53,29 +53,29 @@ class Drive:
         return self.side.sample({})["rear"]
 
     def measure(self, seconds=MEASURE_S):
-        """First and last line of the log, and frames that came, of a stretch of the drive."""
+        """First and last log line of a stretch of the drive, and the frames received in it."""
         begun, first = self.received().frames, len(self.lines) - 1
         until(lambda: self.lines[-1].t >= self.lines[first].t + seconds)
         return self.lines[first], self.lines[-1], self.received().frames - begun
 
     def kbps(self, seconds=MEASURE_S):
-        """What the link passed on."""
+        """kbit/s that the link forwarded."""
         first, last, _ = self.measure(seconds)
         return rate(first, last)
 
     def settle(self):
-        """Until the queue is as the rate makes it."""
+        """Wait until the queue matches the rate."""
         self.measure(SETTLE_S)
 
 
 def rate(first, last):
-    """kbit/s that the link passed on between two lines of its log."""
+    """kbit/s that the link forwarded between two lines of its log."""
     return 8 * (last.bytes - first.bytes) / 1000 / (last.t - first.t)
 
 
 @contextmanager
 def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
-    """One camera that sends as much as it is let, through a link, to a receiver."""
+    """One camera that sends as much as it may, through a link, to a receiver."""
     from runner.apply import OperatorSide
 
     lines = []
@@ -110,9 +110,9 @@ def _ends():
 
 
 def _names():
-    """Of every namespace and network device."""
-    said = [subprocess.check_output(["ip", *words], text=True) for words in (("netns",), ("-br", "link"))]
-    return {line.split()[0].partition("@")[0] for lines in said for line in lines.splitlines()}
+    """Names of all namespaces and network devices."""
+    outputs = [subprocess.check_output(["ip", *words], text=True) for words in (("netns",), ("-br", "link"))]
+    return {line.split()[0].partition("@")[0] for lines in outputs for line in lines.splitlines()}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,7 +184,7 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
         return made
 
     monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
-    # A queue that takes most of a frame and not all of it: the rest comes as soon as it is asked for.
+    # A queue that holds most of a frame but not all of it: the rest arrives as soon as it is requested again.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
     overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
     with (
@@ -193,19 +193,19 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     ):
         side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
         with watching(_at(plans[0], link.operator_overrides)) as client:
-            until(lambda: _sent_again(client) > 5 and len(client.sizes) > 5, seconds=30)
+            until(lambda: _retransmitted(client) > 5 and len(client.sizes) > 5, seconds=30)
 
 
 def _at(plan, overrides):
-    """The plan for an operator who finds the server elsewhere."""
+    """The plan for an operator that reaches the server at another address."""
     port = dict(word.split("=") for word in overrides)["media.port"]
     client, *rest = plan.operator
     properties = {**client.properties, "location": f"rtsp://127.0.0.1:{port}/{plan.camera.name}", "latency": 100}
     return replace(plan, operator=(replace(client, properties=properties), *rest))
 
 
-def _sent_again(client):
-    """Lost packets that came after all."""
+def _retransmitted(client):
+    """Lost packets that were retransmitted."""
     iterator, found = client.pipeline.iterate_recurse(), []
     iterator.foreach(lambda element: found.append(element) if element.get_factory() else None)
     buffers = [element for element in found if element.get_factory().get_name() == "rtpjitterbuffer"]
@@ -213,7 +213,7 @@ def _sent_again(client):
 
 
 @needs_root
-def test_what_waits_does_not_hold_up_who_sent_it():
+def test_queued_packets_do_not_block_their_sender():
     """A socket's buffer holds some 90 packets; the queue is behind it."""
     code = (
         "import socket, sys\n"
@@ -224,9 +224,9 @@ def test_what_waits_does_not_hold_up_who_sent_it():
     slow = Limit(lambda t: 1000, queue_ms=8000, delay_ms=0)
     with limited_link("netns", slow, *_ends(), print) as link:
         command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
-        said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
         waits = link._shaper.limit(1000)
-    assert said.stdout.strip() == str(300 * 1200)
+    assert done.stdout.strip() == str(300 * 1200)
     assert waits.dropped == 0
     assert waits.queue_ms > 1000
 
@@ -267,7 +267,7 @@ def test_the_next_run_removes_what_a_killed_one_left():
 
 def _runs(pid):
     try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()  # the dead may lack somebody to bury them
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()  # a zombie may lack a parent to reap it
     except OSError:
         return False
 
@@ -279,7 +279,7 @@ def _python(code):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_link_that_fails_says_so(kind):
+def test_a_link_that_fails_is_reported(kind):
     lines = []
     with (
         pytest.raises(RunError, match="it ended: killed by SIGKILL"),
@@ -317,7 +317,7 @@ def test_without_root_the_relay_is_recommended():
     assert _python(code).stdout.strip() == f"link=netns may not make a network namespace: {rule}"
 
 
-def test_without_iproute2_it_says_what_to_install(monkeypatch):
+def test_without_iproute2_the_error_names_what_to_install(monkeypatch):
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)
     with pytest.raises(RunError) as raised, limited_link("netns", WIDE, *_ends(), print):
         pass
@@ -338,8 +338,8 @@ def test_a_delay_needs_netem():
 
 
 def test_a_relay_stays_on_this_machine():
-    said = "relay: cannot listen on 192.0.2.77: .*with link=relay both sides and the broker are here"
-    with pytest.raises(RunError, match=said):
+    expected = "relay: cannot listen on 192.0.2.77: .*with link=relay both sides and the broker are here"
+    with pytest.raises(RunError, match=expected):
         limited_link("relay", WIDE, Endpoint("192.0.2.77", 8554), *_ends()[:1], print).__enter__()
 
 

@@ -60,7 +60,7 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
 
     for payload in (b"", b"{", b"[1]", b"x" * 100_000, b'{"event": "total_set", "kbps": 1}', b"\xff\xfe", NAN, HUGE):
         operator.publish(payload)
-    assert operator.ask("9", event="total_set", kbps=1500)["result"] == "applied"  # it lives
+    assert operator.ask("9", event="total_set", kbps=1500)["result"] == "applied"  # still alive
     assert vehicle.poll() is None
 
     vehicle.send_signal(signal.SIGTERM)
@@ -68,11 +68,11 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
     assert operator.state(lambda state: not state["online"]) == {"online": False}
     lines = [json.loads(line) for line in (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()]
     assert [line["kbps"] for line in lines if line.get("event") == "total_set"] == [2000, 1500]
-    times = [line["t"] for line in lines if "event" in line]  # what other threads tell may stand a moment later
+    times = [line["t"] for line in lines if "event" in line]  # lines of other threads may come a moment later
     assert times == sorted(times)
 
 
-def test_the_state_says_what_is_applied_and_a_late_listener_hears_it(broker, vehicle):
+def test_the_state_holds_what_is_applied_and_late_subscribers_receive_it(broker, vehicle):
     operator = Operator(broker)
     state = operator.state(lambda state: state["online"])
     assert {name: camera["applied"] for name, camera in state["cameras"].items()} == {
@@ -80,10 +80,10 @@ def test_the_state_says_what_is_applied_and_a_late_listener_hears_it(broker, veh
         "rear": {},
         "mast": {},
     }
-    said = operator.ask("1", event="mode_selected", mode="collective")
-    assert (said["result"], said["reason"]) == ("applied", "")
-    said = operator.ask("2", event="total_set", kbps=1200)
-    assert said["reason"] == "nobody watches front, rear, mast: kept until somebody does"
+    reply = operator.ask("1", event="mode_selected", mode="collective")
+    assert (reply["result"], reply["reason"]) == ("applied", "")
+    reply = operator.ask("2", event="total_set", kbps=1200)
+    assert reply["reason"] == "nobody watches front, rear, mast: kept until somebody does"
 
     media = f"media.port={vehicle.args[-2].partition('=')[2]}"
     with live_frames([*ROBOT, media], cameras=["rear"]) as frames:
@@ -114,7 +114,7 @@ def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
     operator.state(lambda state: all(camera["sending"] for camera in state["cameras"].values()))
 
 
-def test_a_killed_vehicle_is_told_by_its_last_will(broker, vehicle):
+def test_a_killed_vehicle_is_reported_by_its_last_will(broker, vehicle):
     operator = Operator(broker)
     operator.state(lambda state: state["online"])
     vehicle.kill()
@@ -173,8 +173,8 @@ def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
     table = [line.split() for line in summary.splitlines()]
     rows = {words[0]: words for words in table if words and words[0] in ("front", "rear")}
     for words in rows.values():
-        assert int(words[1]) > 60  # frames of both lives
-        assert int(words[-1]) >= 1  # pipelines built anew
+        assert int(words[1]) > 60  # frames of both vehicles
+        assert int(words[-1]) >= 1  # rebuilt pipelines
         good, _, windows = words[7:10]
         assert int(windows) >= 2
         assert int(good) >= int(windows) - 1
@@ -282,7 +282,7 @@ def test_an_encoder_whose_hardware_is_missing_is_named(broker):
     assert done.stderr.splitlines() == [rule]
 
 
-def test_a_broker_that_cannot_start_is_told(tmp_path, monkeypatch):
+def test_a_broker_that_cannot_start_is_reported(tmp_path, monkeypatch):
     broken = tmp_path / "mosquitto"
     broken.write_text("#!/bin/sh\necho 'Error: Address not available'\nexit 1\n")
     broken.chmod(0o755)

@@ -1,4 +1,4 @@
-"""Lost packets: no half picture reaches a viewer, whatever is lost."""
+"""Lost packets: no incomplete picture reaches a viewer, whatever is lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
 
     monkeypatch.setattr("runner.apply.Receiver", Lossy)
     units = []
-    overrides = (f"graph={graph}", "graph.retransmission_ms=0", "fps_max=15")  # what is lost stays lost
+    overrides = (f"graph={graph}", "graph.retransmission_ms=0", "fps_max=15")  # lost packets stay lost
     with streaming(*overrides) as (side, _, plans, _):
         knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
         side.turn([Command("front_left", *knob) for knob in knobs.items()])
@@ -47,13 +47,13 @@ def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
     assert 0 < received.frames - len(units) < received.frames / 2
     command = ["ffmpeg", "-v", "warning", "-threads", "1", "-err_detect", "explode", "-f", "h264", "-i", "-"]
     data = b"".join(unit.data for unit in units)
-    said = subprocess.run([*command, "-f", "null", "-"], input=data, capture_output=True, check=False).stderr.decode()
-    assert "error while decoding" not in said
-    assert "concealing" not in said
+    errors = subprocess.run([*command, "-f", "null", "-"], input=data, capture_output=True, check=False).stderr.decode()
+    assert "error while decoding" not in errors
+    assert "concealing" not in errors
 
 
 def test_lost_packets_are_sent_again(monkeypatch):
-    """Of those that are lost on the way most come a second time (RFC 4588), and few pictures are left out."""
+    """Most packets lost in transit are retransmitted (RFC 4588), and few pictures are left out."""
     from runner.apply import OperatorSide
     from runner.gst import Gst
 
@@ -85,6 +85,6 @@ def test_lost_packets_are_sent_again(monkeypatch):
             lost = operator.sample({"front_left": True})["front_left"].lost
         finally:
             operator.stop()
-    came_again = sum(buffer.get_property("stats").get_value("rtx-success-count") for buffer in buffers)
-    assert came_again > len(dropped) / 2
+    retransmitted = sum(buffer.get_property("stats").get_value("rtx-success-count") for buffer in buffers)
+    assert retransmitted > len(dropped) / 2
     assert lost < len(dropped) / 2

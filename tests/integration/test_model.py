@@ -32,7 +32,7 @@ pytest.importorskip("scipy")
 WIDTH, HEIGHT, FPS, FRAMES = 320, 192, 25, 60
 CAMERA = ("camera=front_center",)
 SMALL = ("scalings=[0.25,0.5,1.0]", "bitrates_kbps=[50,100,200,400,800]")
-TINY = ("scalings=[0.5,1.0]", "bitrates_kbps=[100,400]")  # where any points will do
+TINY = ("scalings=[0.5,1.0]", "bitrates_kbps=[100,400]")  # when any points will do
 
 
 def picture(number: int, texture: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ def picture(number: int, texture: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds and a half of 320x192 at 25 Hz, nearly without loss."""
+    """Two and a half seconds of 320x192 at 25 Hz, nearly lossless."""
     from runner.gst.clip_writer import write_clip
 
     noise = np.random.default_rng(1).integers(0, 256, (HEIGHT, 2 * WIDTH)).astype(np.uint8)
@@ -75,7 +75,7 @@ def model(*words: str, cache: dict[str, str]) -> subprocess.CompletedProcess[str
 
 @pytest.fixture(scope="module")
 def measured(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
-    """The full plan on the clip, measured once: directory, model file, what was printed."""
+    """The full plan on the clip, measured once: directory, model file, output."""
     directory = tmp_path_factory.mktemp("measured")
     words = (
         "camera=front_center",
@@ -90,7 +90,7 @@ def measured(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return directory, json.loads((directory / "front_center.model.json").read_text()), done.stdout
 
 
-def test_a_model_leaves_what_the_contract_says(measured):
+def test_a_model_writes_what_the_contract_requires(measured):
     directory, document, printed = measured
     assert schema.findings(document, "rate_quality") == []
     assert len(document["points"]) == 15
@@ -149,7 +149,7 @@ def luma_of(path: Path) -> list[np.ndarray]:
 
 
 def received(plan, count: int) -> list[np.ndarray]:
-    """The first pictures that come over RTSP."""
+    """The first pictures received over RTSP."""
     return pulled(f"{plan.decoder} ! videoconvert ! video/x-raw,format=I420", count)
 
 
@@ -163,7 +163,7 @@ def pulled(line: str, count: int) -> list[np.ndarray]:
         pictures: list[np.ndarray] = []
         while len(pictures) < count:
             sample = pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND)
-            assert sample, f"{len(pictures)} of {count} pictures came"
+            assert sample, f"{len(pictures)} of {count} pictures arrived"
             pictures.append(_luma(sample.get_buffer(), sample.get_caps()))
         return pictures
     finally:
@@ -191,7 +191,7 @@ def test_what_was_measured_is_not_measured_again_and_another_metric_keeps_the_fi
     assert "(4 encoded, 0 known)" in model(*words, "graph=openh264_rtsp", cache=cache).stdout  # another encoder
 
 
-def test_a_cache_file_that_is_cut_in_half_is_told_and_measured_again(clip, tmp_path, cache):
+def test_a_cache_file_that_is_cut_in_half_is_reported_and_measured_again(clip, tmp_path, cache):
     words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *TINY)
     model(*words, cache=cache)
     before = points_of(tmp_path)
@@ -205,12 +205,12 @@ def test_a_cache_file_that_is_cut_in_half_is_told_and_measured_again(clip, tmp_p
 
 
 def points_of(directory: Path) -> list[dict]:
-    """All points but for the time they took."""
+    """All points without their encoding times."""
     document = json.loads((directory / "front_center.model.json").read_text())
     return [{key: value for key, value in point.items() if key != "encode_ms"} for point in document["points"]]
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(clip, measured, tmp_path, cache):
+def test_an_interrupted_run_continues_where_it_stopped(clip, measured, tmp_path, cache):
     words = (
         "camera=front_center",
         f"sequence={clip}",
@@ -242,7 +242,7 @@ def test_other_workers_find_the_same(clip, measured, tmp_path, cache, workers):
 
 def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, cache, monkeypatch):
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))  # of the workers
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))  # for the workers
     words = ("plan=full", "metric=[mssim,psnr]", "workers=dask")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         where = f"scheduler={cluster.scheduler_address}"
@@ -266,15 +266,15 @@ def watch():
         sys._current_frames()
         time.sleep(0.002)
 
-gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # others run meanwhile
+gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # other threads run meanwhile
 gc.set_threshold(50)
 threading.Thread(target=watch, daemon=True).start()
 sys.exit(without_cycle_collection(main, sys.argv[1:]))
 """
 
 
-def test_measuring_goes_on_under_the_eyes_of_a_dask_worker(clip, measured, tmp_path, cache):
-    """Of a worker the part that looks at its threads, and collects cycles while it does, but all the time."""
+def test_measuring_works_while_a_dask_worker_inspects_its_threads(clip, measured, tmp_path, cache):
+    """As in a worker, but all the time: threads are inspected, and cycles collected meanwhile."""
     words = ("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
     environment = {**os.environ, **cache, "PYTHONPATH": str(CHECKOUT)}
     command = [sys.executable, "-c", WATCHED, *words, "metric=[mssim,psnr]"]
@@ -284,7 +284,7 @@ def test_measuring_goes_on_under_the_eyes_of_a_dask_worker(clip, measured, tmp_p
 
 
 @pytest.mark.soak
-def test_the_adaptive_plan_comes_to_the_same_as_the_full_one(clip, tmp_path, cache):
+def test_the_adaptive_plan_finds_the_same_as_the_full_one(clip, tmp_path, cache):
     words = ("camera=front_center", f"sequence={clip}")
     found = {}
     for plan in ("full", "adaptive"):
@@ -293,15 +293,15 @@ def test_the_adaptive_plan_comes_to_the_same_as_the_full_one(clip, tmp_path, cac
         found[plan] = read_model(tmp_path / plan / "front_center.model.json")
     full, adaptive = found["full"], found["adaptive"]
     assert len(adaptive["points"]) <= len(full["points"]) / 3
-    assert adaptive["metric_every"] < 5  # of a short sequence more is looked at
-    assert lost(full, adaptive) < 3e-3  # of the 0.6 that these curves span; drives that were recorded span 0.1
+    assert adaptive["metric_every"] < 5  # more frames of a short sequence are scored
+    assert lost(full, adaptive) < 3e-3  # these curves span 0.6, those of recorded drives 0.1
     done = run("model", "compare", *(str(tmp_path / plan / "front_center.model.json") for plan in ("full", "adaptive")))
     assert "plan       full -> adaptive" in done.stdout
     assert "on the same sequences by the same encoder" in done.stdout
 
 
 def lost(full: dict, other: dict) -> float:
-    """The most quality that another model's choice loses against the full plan's, on the curves of the full plan."""
+    """Largest quality loss of another model's choice against the full plan's, on the curves of the full plan."""
     points = [
         Point(Fraction(p["scaling"]), p["target_kbps"], p["actual_kbps"], p["encode_ms"], {"mssim": (p["mssim"],)})
         for p in full["points"]
@@ -364,7 +364,7 @@ def two_sizes(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "expected"),
     [
         ("gone.mp4", None, "no such file"),
         ("/dev/zero", None, "must be a file"),
@@ -373,7 +373,7 @@ def two_sizes(path: Path) -> None:
         ("two.ts", two_sizes, "the size changes from 320x192 to 160x96 within the sequence"),
     ],
 )
-def test_what_is_no_sequence_is_told(tod, tmp_path, cache, monkeypatch, name, content, said):
+def test_an_invalid_sequence_is_reported(tod, tmp_path, cache, monkeypatch, name, content, expected):
     path = tmp_path / name
     if callable(content):
         content(path)
@@ -384,10 +384,10 @@ def test_what_is_no_sequence_is_told(tod, tmp_path, cache, monkeypatch, name, co
     assert (status, out) == (2, "")
     line = err.splitlines()[-1]
     assert line.startswith("command line: sequence: ")
-    assert said in line
+    assert expected in line
 
 
-def test_a_short_sequence_is_told(tmp_path, cache):
+def test_a_short_sequence_is_reported(tmp_path, cache):
     path = tmp_path / "short.mkv"
     launch("videotestsrc num-buffers=9 ! video/x-raw,width=320,height=192,framerate=25/1 ! x264enc ! matroskamux", path)
     done = model("camera=front_center", f"sequence={path}", f"output={tmp_path}", cache=cache)
@@ -396,7 +396,7 @@ def test_a_short_sequence_is_told(tmp_path, cache):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (["bitrates_kbps=[100]"], "study.bitrates_kbps: [100]: must have at least 2 entries"),
         (["bitrates_kbps=[200,100]"], "study.bitrates_kbps: [200, 100]: must rise"),
@@ -411,11 +411,11 @@ def test_a_short_sequence_is_told(tmp_path, cache):
         (["scheduler=tcp://127.0.0.1:1"], "is for workers=dask"),
     ],
 )
-def test_a_wrong_wish_is_told(tod, clip, tmp_path, cache, monkeypatch, words, said):
+def test_a_wrong_argument_is_reported(tod, clip, tmp_path, cache, monkeypatch, words, expected):
     monkeypatch.setenv("XDG_CACHE_HOME", cache["XDG_CACHE_HOME"])
     status, _, err = tod("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *words)
     assert status == 2
-    assert said in err
+    assert expected in err
     assert list(tmp_path.glob("out/*")) == []
 
 
@@ -432,7 +432,7 @@ def test_a_camera_of_the_users_own_is_not_overwritten(tod, clip, tmp_path):
     assert (status, err.count("command line: output: '/proc/models': cannot be written to: ")) == (2, 1)
 
 
-def test_a_missing_tool_and_a_missing_scheduler_are_told(clip, tmp_path, cache):
+def test_a_missing_tool_and_a_missing_scheduler_are_reported(clip, tmp_path, cache):
     words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *SMALL)
     done = model(*words, "metric=vmaf", cache={**cache, "TOD_FFMPEG": "/bin/true"})
     assert done.returncode == 1

@@ -48,7 +48,7 @@ def demo():
         f"control.port={free_port()}",
         "duration_s=1200",
         "source.render.seconds=6",
-        "fps_max=5",  # so that counts say something on two cores that also run the tests
+        "fps_max=5",  # so that counts mean something on two cores that also run the tests
         *(f"cameras.{name}.width_px={width}" for name, (width, _) in SIZES.items()),
         *(f"cameras.{name}.height_px={height}" for name, (_, height) in SIZES.items()),
         "pqos.position.speed_mps=32",  # the loop in 25 s
@@ -71,12 +71,12 @@ def page(chromium, demo):
 
 
 def apart(coroutine):
-    """Run to its end in a thread of its own, since this one is the browser's."""
+    """Run to completion in its own thread, since this one is the browser's."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(asyncio.run, coroutine).result(timeout=60)
 
 
-def goes_on(page, counted, pictures=2, seconds=5):
+def pictures_continue(page, counted, pictures=2, seconds=5):
     """Every camera draws more than so many pictures after it was counted, and no decoder fails."""
 
     def waiting():
@@ -98,7 +98,7 @@ def choose(page, mode):
 
 def test_eight_pictures_move(page):
     before = {name: luma(page, name)[0] for name in TUM}
-    goes_on(page, measure(page), pictures=10)
+    pictures_continue(page, measure(page), pictures=10)
     for name in TUM:
         now, _ = luma(page, name)
         assert now.shape != before[name].shape or (now != before[name]).mean() > 0.1, name
@@ -127,7 +127,7 @@ def test_single_a_dragged_region_changes_what_is_received(page):
     assert size[0] < full.shape[0]
     until(lambda: luma(page, "front_center")[0].shape == size)
     shot(page, "single")
-    # What is seen is the middle of what was seen, as sharp as the factor allows.
+    # The picture is the middle of the one before, as sharp as the factor allows.
     middle = full[full.shape[0] // 4 : -full.shape[0] // 4, full.shape[1] // 4 : -full.shape[1] // 4]
     assert middle.shape[0] == pytest.approx(size[0], abs=16)
     applied = state_when(page, lambda now: now["cameras"]["front_center"]["applied"]["roi"] == roi)
@@ -190,16 +190,16 @@ def test_automatic_the_drop_of_the_map_lowers_factors(page):
 
 
 def test_a_page_opened_in_the_middle_of_a_drive_begins_with_true_pictures(chromium, demo):
-    """The first drawn picture of each camera against a clean decode, in mode single: sizes stay."""
+    """The first drawn picture of each camera against a clean decode, in mode single: sizes do not change."""
     single = ({"take_control": True}, {"id": "1", "event": "mode_selected", "mode": "single"})
     with recorded(demo, *single, viewer="holder"):
-        time.sleep(1.5)  # what changes its size just then has done so
+        time.sleep(1.5)  # until changes of size have ended
         with recorded(demo) as units:
             time.sleep(4)
             with opened(chromium, f"{demo}#measure") as late:
                 until(lambda: all(camera["first_drawn_ms"] for camera in measure(late).values()))
                 first = {name: camera["first_drawn_ms"] for name, camera in measure(late).items()}
-                assert max(first.values()) < 10_000, first  # ten times what it takes
+                assert max(first.values()) < 10_000, first  # ten times what is normal
                 pictures = {name: luma_first(late, name) for name in TUM}
                 assert late.evaluate("tod.control") == "another"
             time.sleep(0.5)
@@ -273,7 +273,7 @@ def test_charts_and_map_are_drawn(page):
     until(lambda: page.evaluate("document.querySelectorAll('.js-plotly-plot').length >= 4"), seconds=30)
     shot(page, "wide")
     page.locator("#theme").click()
-    time.sleep(1.0)  # drawn anew
+    time.sleep(1.0)  # until redrawn
     shot(page, "wide-other-theme")
     page.locator("#theme").click()
 
@@ -301,7 +301,7 @@ def test_requests_that_are_wrong_are_refused_with_the_reason(page):
     assert "ROI 100x100 at 900,0" in reply["reason"]
 
 
-def test_whatever_a_socket_sends_the_streams_go_on(page, demo):
+def test_whatever_a_socket_sends_the_streams_continue(page, demo):
     async def attack():
         answers = []
         async with (
@@ -329,7 +329,7 @@ def test_whatever_a_socket_sends_the_streams_go_on(page, demo):
                 message = await asyncio.wait_for(ws.receive(), 10)
                 if message.type == aiohttp.WSMsgType.TEXT and '"reply"' in message.data:
                     answers.append(json.loads(message.data))
-            with suppress(ConnectionError):  # cut off before it has been sent to its end
+            with suppress(ConnectionError):  # closed before all of it is sent
                 await ws.send_bytes(b"x" * 2_000_000)
             while (message := await asyncio.wait_for(ws.receive(), 10)).type not in (
                 aiohttp.WSMsgType.CLOSE,
@@ -343,8 +343,8 @@ def test_whatever_a_socket_sends_the_streams_go_on(page, demo):
     assert {answer["result"] for answer in answers} == {"refused"}
     assert answers[6]["reason"] == "this page does not hold control; take it first"
     assert answers[8]["reason"] == "100000 bytes: must be at most 65536"
-    assert code in (1009, 1006)  # message too big, or cut off while it was still being sent
-    goes_on(page, counted)
+    assert code in (1009, 1006)  # message too big, or closed while it was being sent
+    pictures_continue(page, counted)
     assert page.evaluate("tod.control") == "you"
 
 
@@ -371,7 +371,7 @@ def test_a_viewer_that_does_not_read_harms_nobody(page, demo):
     counted = measure(page)
     with upgraded(demo, "lazy"):
         time.sleep(6)
-    goes_on(page, counted, pictures=20)
+    pictures_continue(page, counted, pictures=20)
 
 
 def test_another_page_watches_and_may_take_control(chromium, demo, page):
@@ -391,7 +391,7 @@ def test_another_page_watches_and_may_take_control(chromium, demo, page):
 
 def test_a_copy_of_a_page_only_watches(page):
     with page.expect_popup() as opening:
-        page.evaluate("void open(location.href)")  # takes the storage of its tab with it, as a duplicated tab does
+        page.evaluate("void open(location.href)")  # copies the storage of its tab, as duplicating a tab does
     copy = opening.value
     until(lambda: copy.evaluate("window.tod?.state"))
     until(lambda: copy.evaluate("tod.control") == "another")
@@ -399,7 +399,7 @@ def test_a_copy_of_a_page_only_watches(page):
     assert page.evaluate("tod.control") == "you"
 
 
-def test_without_webcodecs_one_sentence_says_what_it_needs(chromium, demo):
+def test_without_webcodecs_one_sentence_names_what_it_needs(chromium, demo):
     with chromium.new_context() as tab:
         tab.add_init_script("delete window.VideoDecoder")
         blind = tab.new_page()
@@ -427,7 +427,7 @@ def test_a_viewer_that_answers_no_ping_is_dropped(demo):
     with upgraded(demo, "silent") as viewer:
         began = time.monotonic()
         with suppress(ConnectionResetError):
-            while viewer.recv(65_536):  # reads, and says nothing
+            while viewer.recv(65_536):  # reads, and sends nothing
                 pass
         assert 1 < time.monotonic() - began < 6
 
@@ -452,7 +452,7 @@ def test_a_viewer_that_reads_slowly_and_answers_stays(demo):
 
 @contextmanager
 def upgraded(url, viewer):
-    """A bare socket that has become a viewer."""
+    """A bare socket, upgraded to a viewer."""
     host = url.removeprefix("http://").rstrip("/")
     with socket.create_connection(("127.0.0.1", int(host.rpartition(":")[2])), timeout=20) as line:
         line.sendall(
@@ -475,7 +475,7 @@ def upgraded(url, viewer):
 def test_the_codec_is_named_as_webcodecs_wants_it(chromium, demo, codec, start, string):
     with opened(chromium, demo) as page:
         unit = [0, 0, 0, 1, *bytes.fromhex(start), 0xA0]
-        asked = (
+        script = (
             f"import('/static/codec.js').then((m) => m.codecOf(m.spsOf(new Uint8Array({unit}), '{codec}'), '{codec}'))"
         )
-        assert page.evaluate(asked) == string
+        assert page.evaluate(script) == string

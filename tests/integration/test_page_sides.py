@@ -62,13 +62,13 @@ def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
             assert page.locator("#banner").is_hidden()
 
 
-def test_a_station_that_stands_still_is_left_and_found_again(chromium):
+def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
         operator.send_signal(signal.SIGSTOP)
         stopped = time.monotonic()
         page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
-        assert time.monotonic() - stopped < 3  # 2 s without a word
+        assert time.monotonic() - stopped < 3  # 2 s without a message
         assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
         until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4, seconds=12)  # each gives up after 1 s
         shot(page, "station-gone")
@@ -107,9 +107,9 @@ def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
 
 @pytest.mark.soak
 def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
-    """`make soak` does it for longer."""
+    """`make soak` runs it for longer."""
     turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
-    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # key frames there, refresh waves elsewhere
+    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # keyframes there, refresh waves elsewhere
     with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page, seconds=30)
         counted = measure(page)
@@ -157,7 +157,7 @@ time_t time(time_t *at) {
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_told(chromium, tmp_path):
+def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_shown(chromium, tmp_path):
     (tmp_path / "shifted.c").write_text(SHIFTED)
     subprocess.run(["cc", "-shared", "-fPIC", "-o", "shifted.so", "shifted.c", "-ldl"], cwd=tmp_path, check=True)
     ahead = {"LD_PRELOAD": str(tmp_path / "shifted.so")}
@@ -165,15 +165,15 @@ def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_told(chromium
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
         all_live(page, seconds=30)
         page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
-        told = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
-        assert re.fullmatch(told, page.locator("#warning").inner_text())
+        expected = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
+        assert re.fullmatch(expected, page.locator("#warning").inner_text())
         until(lambda: "– ms" in page.locator("[data-camera=front] .form").inner_text())
         assert {camera["latency_ms"] for camera in page.evaluate("tod.sample")["cameras"].values()} == {None}
         assert "late" not in {status for _, _, status in page.evaluate("tod.measure()")["status_log"]}
         shot(page, "clock-ahead")
         operator.terminate()
-        said, _ = operator.communicate(timeout=20)
-    assert "the vehicle's clock is ahead by at least " in said
+        output, _ = operator.communicate(timeout=20)
+    assert "the vehicle's clock is ahead by at least " in output
     lines = [json.loads(line) for line in (tmp_path / "drive" / "operator.jsonl").read_text().splitlines()]
     samples = [line for line in lines if line.get("log") == "sample"]
     assert 3500 < samples[-1]["clock_ahead_ms"] < 4001
@@ -214,7 +214,7 @@ element: x265enc
 
 @pytest.fixture
 def h265(tmp_path):
-    """A user's directory with a graph of H.265, made of the packaged one by element swap."""
+    """A user's directory with a graph of H.265, made from the packaged one by swapping elements."""
     text = (CHECKOUT / "conf" / "graph" / "h264_rtsp.yaml").read_text()
     text = re.sub(r"element: x264enc\n    properties:\n(      .*\n)+", X265, text)
     for old, new in {"h264depay": "h265depay", "h264pay": "h265pay", "x-h264": "x-h265", "=H264": "=H265"}.items():
@@ -235,10 +235,10 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
             all_live(page)
             return
         tile = page.locator("[data-camera=rear]")
-        told = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Choose a graph of H\.264, or .*"
-        until(lambda: re.fullmatch(told, tile.locator(".refused").inner_text()))
+        expected = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Choose a graph of H\.264, or .*"
+        until(lambda: re.fullmatch(expected, tile.locator(".refused").inner_text()))
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
-        assert not tile.locator(".rates").inner_text().startswith("–")  # its rates are those of what comes
+        assert not tile.locator(".rates").inner_text().startswith("–")  # it shows the rates of the received stream
         for camera in ("front", "mast"):
             until(lambda camera=camera: measure(page)[camera]["status"] == "live")
             assert page.locator(f"[data-camera={camera}] .refused").is_hidden()
@@ -246,6 +246,6 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
         tile.locator(".head b").click()
         assert "no decoder for H.265" in page.locator("#camera-panel .why-decided").inner_text()
         received = measure(page)["rear"]["received"]
-        until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts other key pictures
+        until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts further keyframes
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         shot(page, "h265")

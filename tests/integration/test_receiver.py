@@ -43,11 +43,11 @@ def sending(vehicle, plans):
 
 @contextmanager
 def receiving(plans):
-    """Yields (side, what was reported, a function: whether every camera has brought n more frames)."""
+    """Yields (side, messages, a function that waits for n more frames of every camera)."""
     from runner.apply import OperatorSide
 
-    told = []
-    side = OperatorSide(plans, lambda cameras, what: told.append(f"{cameras}: {what}"))
+    messages = []
+    side = OperatorSide(plans, lambda cameras, what: messages.append(f"{cameras}: {what}"))
 
     def frames():
         return {name: received.frames for name, received in side.sample(SENDING).items()}
@@ -57,14 +57,14 @@ def receiving(plans):
         until(lambda: all(now - before[name] >= n for name, now in frames().items()), every_s=0.1)
 
     try:
-        yield side, told, more
+        yield side, messages, more
     finally:
         side.stop()
 
 
 def test_a_vehicle_that_starts_later_is_waited_for_in_silence():
     vehicle, plans = compiled()
-    with receiving(plans) as (side, told, more):
+    with receiving(plans) as (side, messages, more):
         end = time.monotonic() + 3
         while time.monotonic() < end:
             side.sample({})
@@ -72,32 +72,32 @@ def test_a_vehicle_that_starts_later_is_waited_for_in_silence():
         with sending(vehicle, plans):
             more()
             assert {received.rebuilt for received in side.sample(SENDING).values()} == {0}
-            assert told == []
+            assert messages == []
 
 
 def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
     vehicle, plans = compiled()
-    with receiving(plans) as (side, told, more):
+    with receiving(plans) as (side, messages, more):
         with sending(vehicle, plans):
             more()
         end = time.monotonic() + 8
         while time.monotonic() < end:
             side.sample(SENDING)
             time.sleep(0.1)
-        away = list(told)
+        away = list(messages)
         with sending(vehicle, plans):
             more()
-            until(lambda: any("works again" in what for what in told))
+            until(lambda: any("works again" in what for what in messages))
             assert {received.rebuilt for received in side.sample(SENDING).values()} == {1}
-            back = told[len(away) :]
-    assert 1 <= len(away) <= 4  # each reason once; cameras that say the same are named together
+            back = messages[len(away) :]
+    assert 1 <= len(away) <= 4  # each reason once; cameras with the same one are named together
     assert len(set(away)) == len(away)
     assert all(" works again after " in what for what in back)
 
 
 def test_packets_of_strangers_are_dropped_and_counted():
     vehicle, plans = compiled()
-    with sending(vehicle, plans), receiving(plans) as (side, told, more):
+    with sending(vehicle, plans), receiving(plans) as (side, messages, more):
         more()
         sockets = [taken for r in side._receivers.values() for taken in r._filter._sockets.values()]
         assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
@@ -112,25 +112,25 @@ def test_packets_of_strangers_are_dropped_and_counted():
         samples = side.sample(SENDING)
         assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
         assert {(received.lost, received.rebuilt) for received in samples.values()} == {(0, 0)}
-        until(lambda: told)
-    assert told == ["front, rear: packets from other hosts than the vehicle are dropped"]
+        until(lambda: messages)
+    assert messages == ["front, rear: packets from other hosts than the vehicle are dropped"]
 
 
 def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
-    """Accepts connections and says nothing, as a vehicle does that stands still."""
+    """Accepts connections and sends nothing, like a vehicle that hangs."""
     vehicle, plans = compiled()
     with socket.create_server((vehicle.media.host, vehicle.media.port)) as server:
         server.settimeout(30)
-        with receiving(plans[:1]) as (_, told, _more), ExitStack() as connections:
-            came = []
+        with receiving(plans[:1]) as (_, messages, _more), ExitStack() as connections:
+            connected = []
             for _ in range(4):
                 connections.enter_context(server.accept()[0])
-                came.append(time.monotonic())
-            assert told == []
-    assert came[-1] - came[0] < 3 * 2.0
+                connected.append(time.monotonic())
+            assert messages == []
+    assert connected[-1] - connected[0] < 3 * 2.0
 
 
-def test_a_receiver_that_locks_up_holds_up_nobody(monkeypatch):
+def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     """As rtspsrc can on network faults, on its way to NULL."""
     from runner.gst import Gst, aside, receiver
 
@@ -153,17 +153,17 @@ def test_a_receiver_that_locks_up_holds_up_nobody(monkeypatch):
     vehicle, plans = compiled()
     with sending(vehicle, plans):
         try:
-            with receiving(plans) as (side, told, more):
+            with receiving(plans) as (side, messages, more):
                 more()
                 side._glib.call("a fault", lambda: side._receivers["front"]._supervised.restart("locked up"))
-                more(30)  # both: another receiver takes the place of the stuck one
-                until(lambda: any("has not stopped" in what for what in told))
+                more(30)  # both: another receiver replaces the stuck one
+                until(lambda: any("has not stopped" in what for what in messages))
                 began = time.monotonic()
             assert time.monotonic() - began < 3
         finally:
             freed.set()
-    assert told[0] == "front: locked up"
-    assert f"front: {aside.HUNG}" in told
+    assert messages[0] == "front: locked up"
+    assert f"front: {aside.HUNG}" in messages
 
 
 def test_work_that_hangs_in_gstreamer_s_thread_is_named(monkeypatch):

@@ -1,4 +1,4 @@
-"""Lossless recordings: every bit, complete files or none, and what is said where something is lost."""
+"""Lossless recordings: every bit, complete files or none, and messages about losses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RAW = '{name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}'
 
 @pytest.fixture
 def conf(tmp_path: Path) -> Path:
-    """Sources of the user's own, one ends and one fails; and an encoder that takes 0.2 s for each frame."""
+    """The user's own sources, one that ends and one that fails; and an encoder that takes 0.2 s for each frame."""
     directory = tmp_path / "conf"
     (directory / "source").mkdir(parents=True)
     sources = {
@@ -75,7 +75,7 @@ def digests(found: list[tuple[int, str]]) -> list[str]:
 
 
 def source_line(*overrides: str) -> str:
-    """The source of the one camera, as it stands in every pipeline, without the element that paces it."""
+    """The source of the one camera, as in every pipeline, but without the element that paces it."""
     (plan,) = compile_plans(configuration([*ONE, *overrides]).vehicle())
     return launch(element for element in plan.source if element.name != "pace")
 
@@ -85,7 +85,7 @@ def index(directory: Path) -> dict[str, Any]:
     return document
 
 
-# --- what is in the files ---------------------------------------------------------------------------------------------
+# --- contents of the files --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("clip", [path for path in CLIPS if "720p25" in path.name or "fisheye" in path.name], ids=str)
@@ -148,15 +148,15 @@ def test_a_signal_ends_with_complete_files(tmp_path, number, status):
         until(lambda: part.exists() and part.stat().st_size > 100_000)
         assert not (tmp_path / "rear.mkv").exists()
         child.send_signal(number)
-        said, _ = child.communicate(timeout=30)
-        assert child.returncode == status, said
+        output, _ = child.communicate(timeout=30)
+        assert child.returncode == status, output
     assert not part.exists()
     found = recorded(tmp_path / "rear.mkv")
     assert len(found) == index(tmp_path)["cameras"]["rear"]["frames"] > 5
-    assert f"rear: {tmp_path / 'rear.mkv'}: 848x480 at 30 Hz, {len(found)} frames" in said
+    assert f"rear: {tmp_path / 'rear.mkv'}: 848x480 at 30 Hz, {len(found)} frames" in output
 
 
-def test_the_others_go_on_where_a_source_fails(tmp_path, conf):
+def test_the_others_continue_if_a_source_fails(tmp_path, conf):
     output = tmp_path / "rec"
     words = ("vehicle=delivery_robot", "source=test", f"conf={conf}", f"output={output}", "duration_s=2")
     mounted = (
@@ -177,24 +177,24 @@ def test_the_others_go_on_where_a_source_fails(tmp_path, conf):
     assert "file" not in about["mast"]
 
 
-def test_a_source_that_ends_early_is_told(tmp_path, conf):
+def test_a_source_that_ends_early_is_reported(tmp_path, conf):
     done = run("record", *ONE, "source=short", f"conf={conf}", f"output={tmp_path / 'rec'}", "duration_s=5")
     assert done.returncode == 1
     assert "rear: its source ended after 0.7 of 5 s" in done.stderr
     assert len(recorded(tmp_path / "rec" / "rear.mkv")) == 20
 
 
-def test_lost_frames_are_counted_and_told(tmp_path, conf):
+def test_lost_frames_are_counted_and_reported(tmp_path, conf):
     words = ("source=test", "recording=slow", f"conf={conf}", f"output={tmp_path / 'rec'}")
-    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=30")  # the queue takes ten
+    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=30")  # the queue holds ten
     done = run("record", *ONE, *words, *huge, "duration_s=2")
     assert done.returncode == 0, done.stderr
     about = index(tmp_path / "rec")["cameras"]["rear"]
     assert about["missing_frames"] > 0
     assert about["frames"] == len(recorded(tmp_path / "rec" / "rear.mkv"))
     of = about["frames"] + about["missing_frames"]
-    told = f"rear: WARNING: {about['missing_frames']} of {of} frames are missing"
-    assert told in done.stderr
+    expected = f"rear: WARNING: {about['missing_frames']} of {of} frames are missing"
+    assert expected in done.stderr
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------
@@ -219,17 +219,17 @@ def test_a_disk_that_fills_up_ends_the_recording_with_complete_files(small_disk)
         until(lambda: part.exists() and part.stat().st_size)
         with (small_disk / "other").open("wb") as other:
             os.posix_fallocate(other.fileno(), 0, shutil.disk_usage(small_disk).free - 60_000_000)
-        said, _ = child.communicate(timeout=30)
-    assert child.returncode == 1, said
-    assert "0.06 GB left, 0.07 GB are kept free: the recording ends early" in said
+        output, _ = child.communicate(timeout=30)
+    assert child.returncode == 1, output
+    assert "0.06 GB left, 0.07 GB are kept free: the recording ends early" in output
     assert len(recorded(small_disk / "rear.mkv")) == index(small_disk)["cameras"]["rear"]["frames"] > 0
 
 
 def test_a_disk_without_room_is_refused_before_the_start(small_disk):
     done = run("record", *ONE, "source=test", f"output={small_disk}")  # 60 s at 30 Hz
     assert (done.returncode, list(small_disk.iterdir())) == (1, [])
-    told = "free, a recording needs 0.87 GB: 0.7 of 1.10 GB raw in 60 s, and 0.10 GB kept free"
-    assert told in done.stderr
+    expected = "free, a recording needs 0.87 GB: 0.7 of 1.10 GB raw in 60 s, and 0.10 GB kept free"
+    assert expected in done.stderr
 
 
 @pytest.mark.parametrize(("free", "fits"), [(86_000_000, False), (87_000_000, True)])
@@ -246,7 +246,7 @@ def test_the_room_that_is_needed(tmp_path, monkeypatch, free, fits):
             recordings.check_space(*check)
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
+# --- refused input ----------------------------------------------------------------------------------------------------
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -269,7 +269,7 @@ def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "told"),
+    ("words", "status", "expected"),
     [
         (["duration_s=1"], 2, "command line: output: missing: must be given: output=DIR, a directory for the files"),
         (["output=/tmp/x", "duration_s=0"], 2, "command line: duration_s: '0': must be above 0"),
@@ -284,10 +284,10 @@ def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
         ),
     ],
 )
-def test_bad_input_is_told(words, status, told):
+def test_bad_input_is_reported(words, status, expected):
     done = run("record", *ONE, *(["source=test"] if "source=appsrc" not in words else []), *words)
     assert (done.returncode, done.stdout) == (status, "")
-    assert done.stderr.startswith(told)
+    assert done.stderr.startswith(expected)
 
 
 def test_an_encoder_that_is_not_installed_names_its_package(tmp_path, monkeypatch, capsys):
@@ -297,8 +297,8 @@ def test_an_encoder_that_is_not_installed_names_its_package(tmp_path, monkeypatc
     monkeypatch.setitem(registry.PACKAGE_OF, "lostenc", "gstreamer1.0-lost")
     words = ["source=test", "recording.elements=[{name: encoder, element: lostenc}]", f"output={tmp_path}"]
     assert main(["record", *ONE, *words]) == 1
-    told = "the GStreamer element lostenc is not installed; on Debian: apt-get install gstreamer1.0-lost\n"
-    assert capsys.readouterr().err == told
+    expected = "the GStreamer element lostenc is not installed; on Debian: apt-get install gstreamer1.0-lost\n"
+    assert capsys.readouterr().err == expected
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""The report's page in a real browser, from its file: what is drawn, what is said when pointed at, nothing loaded."""
+"""The report's page in a real browser, from its file: charts, hover texts, no external requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytest.importorskip("plotly")
 sync_api = pytest.importorskip("playwright.sync_api")
 
 SINGLE = {
-    ("bitrate_on_track", 0): 6,  # way, points, arrows, start, end, where one points at
+    ("bitrate_on_track", 0): 6,  # way, points, arrows, start, end, place under the pointer
     ("totals", 0): 4,
     ("bitrates", 0): 5,  # mean, lowest and highest of two cameras, and two others
     ("bitrates", 1): 3,
@@ -62,14 +62,14 @@ def single(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @contextmanager
 def opened(chromium: Any, page_file: Path, width: int = 1280, scheme: str = "dark") -> Iterator[Any]:
-    """The page from its file, free of errors, asking for nothing but itself."""
+    """The page from its file, free of errors, requesting nothing but itself."""
     with chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme) as tab:
         page = tab.new_page()
         wrong: list[str] = []
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda said: wrong.append(said.text) if said.type in ("error", "warning") else None)
+        page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
         own = (page_file.as_uri(), "data:", "blob:")
-        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(asked.url))
+        page.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
         page.goto(page_file.as_uri())
         page.wait_for_function(DRAWN)
         yield page
@@ -77,7 +77,7 @@ def opened(chromium: Any, page_file: Path, width: int = 1280, scheme: str = "dar
 
 
 def hovered(page: Any, figure: str, part: int, curve: int, point: int) -> str:
-    """What plotly says when the pointer is at a point of a curve."""
+    """Plotly's hover text at a point of a curve."""
     chart = page.locator(f".chart.{figure}[data-drive='0'][data-part='{part}']")
     chart.scroll_into_view_if_needed()
     place = chart.evaluate(
@@ -116,18 +116,18 @@ def test_the_theme_follows_the_system_and_is_chosen_by_a_button(chromium: Any, s
         assert page.evaluate(theme) == "night"
 
 
-def test_factors_say_why(chromium: Any, single: Path) -> None:
+def test_factors_show_their_reason(chromium: Any, single: Path) -> None:
     with opened(chromium, single) as page:
         at = page.evaluate("document.querySelector('.scaling').data[0].x.findIndex(t => t > 12)")
-        told = hovered(page, "scaling", 0, 0, at)
-        assert "front_left, front_right from " in told
-        assert "of 6000 kbit/s, range [300, 950) -> 0.25" in told
+        text = hovered(page, "scaling", 0, 0, at)
+        assert "front_left, front_right from " in text
+        assert "of 6000 kbit/s, range [300, 950) -> 0.25" in text
 
 
-def test_freezes_say_when_and_how_long(chromium: Any, single: Path) -> None:
+def test_freezes_show_their_time_and_length(chromium: Any, single: Path) -> None:
     with opened(chromium, single) as page:
-        (told,) = page.evaluate("document.querySelector('.latency').data[2].hovertext")
-        assert told.startswith("top_rear froze at 6.0 s for 1.5")
+        (text,) = page.evaluate("document.querySelector('.latency').data[2].hovertext")
+        assert text.startswith("top_rear froze at 6.0 s for 1.5")
 
 
 def test_pointing_at_a_time_marks_the_place_on_the_map(chromium: Any, single: Path) -> None:

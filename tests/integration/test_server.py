@@ -1,4 +1,4 @@
-"""The RTSP server under clients of every kind: what one does, others do not notice."""
+"""The RTSP server under clients of every kind: none disturbs the others."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from runner.gst.viewers import user_agent
 
 CAMERA, OTHER = "front_left", "front_right"
 FRAME_S = 1 / 40
-SMALL = ("vehicle=delivery_robot", "fps_max=10")  # where time is measured, on a machine that may be busy
+SMALL = ("vehicle=delivery_robot", "fps_max=10")  # for measuring time on a machine that may be busy
 SMALL_CAMERA, UNTOUCHED, SMALL_FRAME_S = "rear", "front", 1 / 10
-OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only asked for the way there
+OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only used to find the route
 
 
 class Vehicle:
-    """Some cameras that stream, and what the tests ask of them."""
+    """Some streaming cameras, and what the tests do with them."""
 
     def __init__(self, side, vehicle, reported):
         self.side, self.reported = side, reported
@@ -55,7 +55,7 @@ def serving(*overrides, cameras=(CAMERA,)):
 
 @contextmanager
 def watched(vehicle, camera=CAMERA, *, udp=True):
-    """A camera that somebody watches, who must not lose a packet."""
+    """A camera with a viewer, who must not lose a packet."""
     with RtspClient(vehicle.url(camera)) as viewer:
         assert viewer.open(udp=udp) == [200, 200, 200]
         viewer.read()
@@ -68,7 +68,7 @@ def watched(vehicle, camera=CAMERA, *, udp=True):
 
 @contextmanager
 def asking_options(vehicle, camera):
-    """Ask for OPTIONS again and again, each on a connection of its own; yields how long the answers took, s."""
+    """Send OPTIONS repeatedly, each on its own connection; yields the response times, s."""
     took, done = [], threading.Event()
 
     def ask():
@@ -131,7 +131,7 @@ def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
             before.read()
             until(lambda: before.frames > 5)
             vehicle.turn(sending=False)
-            time.sleep(3 * FRAME_S)  # what is on its way
+            time.sleep(3 * FRAME_S)  # frames in flight
         frames = vehicle.frames()
         with asking_options(vehicle, OTHER) as took, RtspClient(vehicle.url()) as client:
             began = time.monotonic()
@@ -141,7 +141,7 @@ def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
         assert max(took) < 0.2
         if state != "sending":
             assert vehicle.frames() - frames <= 10
-        with RtspClient(vehicle.url()) as viewer:  # and the picture comes back
+        with RtspClient(vehicle.url()) as viewer:  # and the picture returns
             assert viewer.open(udp=udp) == [200, 200, 200]
             viewer.read()
             vehicle.turn(sending=True)
@@ -194,7 +194,7 @@ def test_nobody_seeks_what_others_watch(source, header):
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
-def test_a_player_that_opens_a_paused_camera_takes_nobodys_picture(transport):
+def test_a_player_that_opens_a_paused_camera_does_not_disturb_others(transport):
     with serving(cameras=(CAMERA, OTHER)) as vehicle, watched(vehicle, OTHER):
         vehicle.turn(sending=False)
         words = ["ffmpeg", "-v", "error", "-rtsp_transport", transport, "-i", vehicle.url(), "-f", "null", "-"]
@@ -289,7 +289,7 @@ def test_a_second_viewer_over_the_uplink_is_refused(outside):
             until(lambda: third.session or third.open() == [200, 200, 200])
 
 
-def test_more_viewers_are_let_in_where_the_configuration_says_so(outside):
+def test_more_viewers_are_let_in_if_the_configuration_allows_them(outside):
     with serving("media.max_viewers=2") as vehicle, ExitStack() as stack:
         viewers = [stack.enter_context(RtspClient(vehicle.url(), source=outside)) for _ in range(3)]
         assert [viewer.open() for viewer in viewers] == [[200, 200, 200], [200, 200, 200], [200, 453]]
@@ -311,7 +311,7 @@ def test_the_controller_is_let_in_and_the_other_viewer_closed(outside):
 
 
 def longest_allowed(untouched):
-    """Two frame intervals; one more than a camera lost that nobody disturbs, where the machine itself stood still."""
+    """Two frame intervals, or one more than the gap of an undisturbed camera, if the machine itself stalled."""
     return max(2 * SMALL_FRAME_S, untouched.longest_gap() + SMALL_FRAME_S)
 
 
@@ -321,7 +321,7 @@ def longest_allowed(untouched):
 @pytest.mark.alone
 @pytest.mark.parametrize("small", [True, False], ids=["small buffers", "large buffers"])
 @pytest.mark.parametrize("neighbour", ["udp", "tcp", "both"])
-def test_a_reader_that_stops_is_closed_and_holds_up_nobody(neighbour, small):
+def test_a_reader_that_stops_is_closed_and_does_not_delay_others(neighbour, small):
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving(*SMALL, cameras=(SMALL_CAMERA, UNTOUCHED)))
         vehicle.turn(SMALL_CAMERA, size=(640, 480), bitrate=6000)
@@ -393,7 +393,7 @@ def test_a_silent_viewer_over_udp_is_sent_nothing_after_its_session_ends():
         assert len(silent.packets) == seen
 
 
-def test_viewers_that_say_something_stay_on_a_paused_camera():
+def test_viewers_that_keep_their_session_alive_stay_on_a_paused_camera():
     """A player's RTCP and keep-alive requests, a raw client's GET_PARAMETER."""
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving("media.session_timeout_s=1"))

@@ -1,4 +1,4 @@
-"""The vehicle's SRT caller where nobody answers."""
+"""The vehicle's SRT caller when nobody answers."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from rig import Heard, free_port, passes, until
+from rig import RecordingListener, free_port, passes, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.gst.receiver import Reception
@@ -40,11 +40,11 @@ TELEMETRY = {"t": 2, "predicted_kbps": 2000, "position": None, "refused": 0, "ca
 
 
 class Vehicle:
-    """A vehicle's end of the link that says what the test wants."""
+    """A vehicle's end of the link, scripted by the test."""
 
     def __init__(self, broker):
         self.requests = []
-        self.operator = ""  # who asked last
+        self.operator = ""  # sender of the last request
         listen = {topic("delivery_robot", "request", "+"): self._on_request}
         self.link = ControlLink(broker, (topic("delivery_robot", "state"), OFFLINE), listen, lambda here: None, print)
         self.link.connect()
@@ -59,11 +59,11 @@ class Vehicle:
         self.link.publish(topic("delivery_robot", *parts), message)
 
     def live_until(self, done):
-        """Publish telemetry again and again, as a vehicle does."""
+        """Publish telemetry repeatedly, as a vehicle does."""
         until(lambda: [self.publish("telemetry", TELEMETRY), done()][-1], every_s=0.1)
 
     def request(self, event):
-        return until(lambda: next((asked for asked in self.requests if asked["event"] == event), None))
+        return until(lambda: next((request for request in self.requests if request["event"] == event), None))
 
 
 @pytest.fixture
@@ -71,13 +71,13 @@ def both():
     broker = Endpoint("127.0.0.1", free_port())
     with private_broker(broker):
         station = Station(configuration(["vehicle=delivery_robot", f"control.port={broker.port}"]).vehicle(), {})
-        heard = Heard()
-        station.listeners.append(heard)
+        listener = RecordingListener()
+        station.listeners.append(listener)
         vehicle = Vehicle(broker)
         station.connect()
         vehicle.publish("state", STATE)
         vehicle.live_until(lambda: station.state)
-        yield station, vehicle, heard
+        yield station, vehicle, listener
         station.close()
         vehicle.link.close((topic("delivery_robot", "state"), OFFLINE))
 
@@ -90,30 +90,30 @@ def samples():
     return dict.fromkeys(("front", "rear", "mast"), Reception())
 
 
-def test_who_comes_says_hello_and_is_answered(both):
-    station, vehicle, heard = both
+def test_a_new_station_announces_itself_and_is_answered(both):
+    station, vehicle, listener = both
     assert "id" in vehicle.request("operator_connected")
     replies = []
     station.ask({"event": "total_set", "kbps": 1000}, replies.append)
-    asked = vehicle.request("total_set")
+    request = vehicle.request("total_set")
     vehicle.publish("reply", {"id": "another", "t": 1, "result": "applied", "reason": ""})
-    vehicle.publish("reply", {"id": asked["id"], "t": 1, "result": "refused", "reason": "no"})
+    vehicle.publish("reply", {"id": request["id"], "t": 1, "result": "refused", "reason": "no"})
     until(lambda: replies)
     assert results(replies) == [("refused", "no")]
-    assert heard.notes == ["the vehicle is online, mode automatic"]
+    assert listener.notes == ["the vehicle is online, mode automatic"]
 
 
 def test_retained_telemetry_is_no_sign_of_life(both):
     station, vehicle, _ = both
     late = Station(station._vehicle, {})
-    notes = Heard()
-    late.listeners.append(notes)
+    listener = RecordingListener()
+    late.listeners.append(listener)
     late.connect()
     try:
         until(lambda: late._published)  # retained, and so was the telemetry
         assert not passes(lambda: late.state, seconds=0.5)
         vehicle.live_until(lambda: late.state)
-        assert notes.notes == ["the vehicle is online, mode automatic"]
+        assert listener.notes == ["the vehicle is online, mode automatic"]
     finally:
         late.close()
 
@@ -126,8 +126,8 @@ def test_a_request_that_nobody_answers_has_timed_out(both):
     assert results(replies) == [("timed out", "no answer from the vehicle within 3 s")]
 
 
-def test_a_silent_vehicle_is_not_there_and_returns_by_a_word(both):
-    station, vehicle, heard = both
+def test_a_silent_vehicle_is_offline_until_its_next_message(both):
+    station, vehicle, listener = both
     until(lambda: station.take(samples()) is None and not station.state, seconds=10 * SILENT_S)
     replies = []
     station.ask({"event": "total_set", "kbps": 1000}, replies.append)
@@ -136,24 +136,24 @@ def test_a_silent_vehicle_is_not_there_and_returns_by_a_word(both):
     vehicle.publish("telemetry", TELEMETRY)
     until(lambda: station.state)
     vehicle.request("operator_connected")
-    assert heard.notes[1:] == ["the vehicle has been silent for 0.7 s", "the vehicle is online, mode automatic"]
+    assert listener.notes[1:] == ["the vehicle has been silent for 0.7 s", "the vehicle is online, mode automatic"]
     station.take(samples())
-    sample = heard.said[-1][1]
+    sample = listener.received[-1][1]
     assert (sample.predicted_kbps, sample.allocated_kbps) == (2000, 1500)
 
 
-def test_a_vehicle_whose_clock_is_ahead_is_warned_of_where_its_ages_stood(both):
-    station, _, heard = both
+def test_a_vehicle_whose_clock_is_ahead_is_warned_of_in_place_of_its_ages(both):
+    station, _, listener = both
     station.take({name: Reception(frames=9, latency_ms=-500.4) for name in samples()})
     warning = "delivery_robot, mode automatic, total 1500 kbit/s; its clock is ahead by at least 500 ms: "
     assert station.headline() == f"{warning}latencies are unknown"
     assert {row.received.latency_ms for row in station.rows()} == {None}
-    assert heard.said[-1][1].clock_ahead_ms == 500.4
-    assert heard.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: picture ages are unknown; ")
+    assert listener.received[-1][1].clock_ahead_ms == 500.4
+    assert listener.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: picture ages are unknown; ")
 
 
 def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
-    station, vehicle, heard = both
+    station, vehicle, listener = both
     cameras = {
         name: {**camera, "scaling": 0.25, "reason": f"{kbps} of 4000 kbit/s, range [0, 400) -> 0.25"}
         for kbps, (name, camera) in enumerate(STATE["cameras"].items(), 300)
@@ -163,12 +163,12 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
     vehicle.publish("state", {**state, "t": 3.0, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
     until(lambda: station.state.total_kbps == 880)
     text = "Prediction 900 kbit/s: front, rear, mast 0.5 -> 0.25 (3 of 3 cameras, total 900 kbit/s)"
-    assert heard.notes[1:] == [text]
+    assert listener.notes[1:] == [text]
 
 
 def test_a_vehicle_that_leaves_is_gone_at_once(both):
-    station, vehicle, heard = both
+    station, vehicle, listener = both
     vehicle.publish("state", OFFLINE)
     until(lambda: not station.state)
-    assert heard.notes[1:] == ["the vehicle is offline"]
-    assert heard.said[-1] == ("state", None)
+    assert listener.notes[1:] == ["the vehicle is offline"]
+    assert listener.received[-1] == ("state", None)

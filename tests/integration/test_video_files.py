@@ -24,15 +24,15 @@ CAMERAS = ("front", "rear")
 
 
 class Sides:
-    """Two cameras on the vehicle and at the operator, each with a file, and what was told of them."""
+    """Two cameras on the vehicle and at the operator, each with a file, and their reported first frames."""
 
     def __init__(self, directory, *words, cameras=CAMERAS, conf=None):
-        self.told, self.reported = [], []
+        self.first_frames, self.reported = [], []
         overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", f"media.port={free_port()}", *words]
         vehicle = configuration(overrides, conf, check=check_plan).vehicle()
         self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
         self.plans = compile_plans(self.vehicle)
-        self.files = VideoFiles(directory, lambda *first: self.told.append(first))
+        self.files = VideoFiles(directory, lambda *first: self.first_frames.append(first))
         self.sending = VehicleSide(self.plans, self.vehicle.media, self.report, self.files)
         self.resize(320, 180)
 
@@ -64,9 +64,9 @@ def sides(tmp_path, request):
 
 
 def decoded(path, whole=True):
-    """Sizes of the pictures that ffmpeg makes of a file, consecutive equal ones once, and how many pictures.
+    """Sizes of the pictures that ffmpeg decodes from a file, consecutive equal ones once, and how many pictures.
 
-    whole  nothing was lost on the way: ffmpeg must like it, and says nothing on standard error
+    whole  nothing was lost in transit: ffmpeg must accept the file and print nothing to standard error
     """
     raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000"]
     raw += ["-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
@@ -84,38 +84,38 @@ def decoded(path, whole=True):
 def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
     with sides.receiving() as operator:
         for size in ((160, 90), (640, 360), (320, 180)):
-            until(lambda: all(came.frames > 20 for came in operator.sample({}).values()))
+            until(lambda: all(received.frames > 20 for received in operator.sample({}).values()))
             sides.resize(*size)
             before = operator.sample({})
             until(lambda b=before: all(c.frames > b[n].frames + 20 for n, c in operator.sample({}).items()))
-        came, sent = operator.sample({}), sides.sending.sent()
+        received, sent = operator.sample({}), sides.sending.sent()
     until(lambda: "front: pipeline stopped" in sides.reported or sides.plans[0].server is None)
     sides.stop()
     for name in CAMERAS:
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
-        assert found[-4:] == sizes  # who dials out sends before anybody has turned a knob
-        assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames go on while both sides stop
-        # On a busy machine packets get lost on loopback, too; what came is kept as it came.
-        whole = came[name].decoded >= came[name].frames - 1 and came[name].lost == 0
+        assert found[-4:] == sizes  # a caller sends before any knob is turned
+        assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames continue while both sides stop
+        # On a busy machine packets get lost on loopback, too; what arrives is kept as it is.
+        whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
-        # Who comes into a stream that runs begins with the next parameter sets.
+        # A receiver that joins a running stream begins with the next parameter sets.
         assert found == sizes or (not whole and found == sizes[1:])
-        assert came[name].decoded - 2 <= count <= came[name].decoded + 40
+        assert received[name].decoded - 2 <= count <= received[name].decoded + 40
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
 
 
-def test_the_first_frame_of_a_file_is_told_with_its_capture_time(sides):
+def test_the_first_frame_of_a_file_is_reported_with_its_capture_time(sides):
     start = time.time()
     with sides.receiving():
-        until(lambda: len(sides.told) == 4)
+        until(lambda: len(sides.first_frames) == 4)
     end = time.time()
-    first = {(camera, file): captured for camera, file, captured in sides.told}
+    first = {(camera, file): captured for camera, file, captured in sides.first_frames}
     for name in CAMERAS:
         sent = first[name, f"video/{name}.vehicle.0.ts"]
-        came = first[name, f"video/{name}.operator.0.ts"]
+        received = first[name, f"video/{name}.operator.0.ts"]
         assert start < sent < end
-        assert abs(came - sent) < 0.001  # the same frame, and the packets carry when it was captured
+        assert abs(received - sent) < 0.001  # the same frame, and the packets carry its capture time
 
 
 def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path):
@@ -123,20 +123,20 @@ def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path
         with watching(sides.plans[0]) as client:
             until(lambda c=client: len(c.sizes) > 20)
         until(lambda n=number: sides.reported.count("front: pipeline stopped") == n + 1)
-    assert [file for _, file, _ in sides.told] == ["video/front.vehicle.0.ts", "video/front.vehicle.1.ts"]
+    assert [file for _, file, _ in sides.first_frames] == ["video/front.vehicle.0.ts", "video/front.vehicle.1.ts"]
     for number in range(2):
         assert decoded(tmp_path / f"video/front.vehicle.{number}.ts")[1] >= 20
-    first, second = (captured for _, _, captured in sides.told)
+    first, second = (captured for _, _, captured in sides.first_frames)
     assert first < second
 
 
-def test_a_file_that_is_there_is_never_written_over(sides, tmp_path):
+def test_an_existing_file_is_never_overwritten(sides, tmp_path):
     (tmp_path / "video").mkdir()
     old = tmp_path / "video/front.vehicle.0.ts"
     old.write_bytes(b"another drive")
     with watching(sides.plans[0]):
-        until(lambda: sides.told)
-    assert [file for _, file, _ in sides.told] == ["video/front.vehicle.1.ts"]
+        until(lambda: sides.first_frames)
+    assert [file for _, file, _ in sides.first_frames] == ["video/front.vehicle.1.ts"]
     assert old.read_bytes() == b"another drive"
 
 
@@ -145,12 +145,12 @@ def test_an_operator_without_a_vehicle_leaves_no_files(tmp_path):
     sides.stop()
     with sides.receiving() as operator:
         until(lambda: all(r._supervised._attempt > 2 for r in operator._receivers.values()))
-    assert sides.told == []
+    assert sides.first_frames == []
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_file_has_no_say_in_the_stream(sides):
-    """Form and latency of what is sent are the same with a file and without."""
+def test_the_file_does_not_affect_the_stream(sides):
+    """Format and latency of the stream are the same with and without a file."""
 
     def seen(plan):
         pipeline, end = Gst.parse_launch(plan.pipeline), Gst.ElementFactory.make("fakesink", None)
@@ -174,23 +174,23 @@ def test_the_file_has_no_say_in_the_stream(sides):
     assert seen(replace(plan, video=True)) == seen(plan)
 
 
-# --- what must not end the stream -------------------------------------------------------------------------------------
+# --- faults that do not end the stream --------------------------------------------------------------------------------
 
 
 def failed_files(sides):
-    """Files that were reported as failed; the operator names cameras together where they fail alike."""
+    """Files that were reported as failed; the operator names cameras together if they fail alike."""
     reports = [line.partition(": ") for line in sides.reported]
     return sum(len(cameras.split(", ")) for cameras, _, what in reports if what.startswith("no video is kept"))
 
 
-def goes_on(sides, camera="front"):
-    """The stream, on both sides, after the file has failed on both; in the same pipelines."""
+def stream_continues(sides, camera="front"):
+    """The stream continues on both sides, in the same pipelines, after the file has failed on both."""
     with sides.receiving() as operator:
         until(lambda: failed_files(sides) == 2 * len(CAMERAS))
         before = operator.sample({})[camera].frames
         until(lambda: operator.sample({})[camera].frames > before + 40)
-        came = operator.sample({})
-        assert {c.rebuilt for c in came.values()} == {0}
+        received = operator.sample({})
+        assert {c.rebuilt for c in received.values()} == {0}
         sides.resize(160, 90)
         until(lambda: operator.sample({})[camera].width == 160)
     others = [line for line in sides.reported if "no video is kept" not in line and "pipeline stopped" not in line]
@@ -204,7 +204,7 @@ def test_a_full_disk_ends_the_file_and_not_the_stream(sides, monkeypatch, tmp_pa
         return path
 
     monkeypatch.setattr(video_files, "_new_file", full)
-    goes_on(sides)
+    stream_continues(sides)
     assert any("space" in line.lower() for line in sides.reported), sides.reported
 
 
@@ -212,7 +212,7 @@ def test_a_disk_that_is_full_later_ends_the_file_and_not_the_stream(sides, tmp_p
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
     try:
-        goes_on(sides)
+        stream_continues(sides)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     for name in CAMERAS:
@@ -221,12 +221,12 @@ def test_a_disk_that_is_full_later_ends_the_file_and_not_the_stream(sides, tmp_p
 
 def test_a_directory_that_cannot_be_made_ends_the_file_and_not_the_stream(sides, tmp_path):
     (tmp_path / "video").write_text("a file")
-    goes_on(sides)
-    assert sides.told == []
+    stream_continues(sides)
+    assert sides.first_frames == []
 
 
-def test_a_disk_that_stalls_does_not_hold_up_the_stream(tmp_path, monkeypatch):
-    """A pipe that nobody empties takes 64 kB and then no more."""
+def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
+    """A pipe that nobody reads takes 64 kB and then blocks."""
     monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", 20_000)
     sides = Sides(tmp_path)
 

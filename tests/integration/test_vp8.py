@@ -1,4 +1,4 @@
-"""A graph with an encoder that does not say what may change while it plays: vp8enc."""
+"""A graph with an encoder that does not declare what may change while it plays: vp8enc."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def sending(conf: Path):
 
 
 def kbps(side, frames=20):
-    """What the encoder puts out at 15 Hz."""
+    """The encoder's output bitrate at 15 Hz."""
     first, before = side.sent()["rear"]
     until(lambda: side.sent()["rear"][0] >= first + frames, seconds=30)
     last, after = side.sent()["rear"]
     return 8 * (after - before) / 1000 / ((last - first) / 15)
 
 
-def test_a_property_that_may_change_though_the_element_does_not_say_so(conf):
+def test_a_property_that_may_change_though_the_element_does_not_declare_it(conf):
     conf.write("graph/vp8.yaml", GRAPH + MUTABLE)
     with sending(conf.path) as (side, plan):
         side.turn([Command("rear", knob, value) for knob, value in {"size": (424, 240), "bitrate": 1500}.items()])
@@ -100,7 +100,7 @@ def test_a_property_that_may_change_though_the_element_does_not_say_so(conf):
         (MUTABLE.replace("target-bitrate", "deadline"), "mutable[0]: 'encoder.deadline': no knob sets this property"),
     ],
 )
-def test_what_is_not_declared_is_refused(conf, declared, problem):
+def test_an_undeclared_property_is_refused(conf, declared, problem):
     from runner.apply import check_plan
 
     conf.write("graph/vp8.yaml", GRAPH + declared)

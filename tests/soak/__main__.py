@@ -1,4 +1,4 @@
-"""Long repeats of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
+"""Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
 new sizes, garbage.
 
     make soak                           everything, at most 45 minutes on two cores
@@ -6,7 +6,7 @@ new sizes, garbage.
     SOAK_SEED=7 make soak               the same random choices again; the seed is printed
     make soak PARTS="stalls hostile"    some parts only
 
-Every part prints what it did, with its figures; the exit status is 1 if anything failed.
+Every part prints its steps and figures; the exit status is 1 if anything failed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import signals
 import sizes
 import stalls
 
-Part = Callable[[int, float], list[str]]  # seed, scale -> what failed
+Part = Callable[[int, float], list[str]]  # seed, scale -> problems
 PARTS: dict[str, Part] = {
     "signals": lambda seed, scale: [str(run) for run in signals.soak(seed, max(8, round(80 * scale)))],
     "stalls": stalls.soak,

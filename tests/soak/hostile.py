@@ -1,7 +1,7 @@
-"""Garbage for RTSP, MQTT in both directions, WebSocket and HTTP of running sides.
+"""Garbage sent to running sides over RTSP, MQTT in both directions, WebSocket and HTTP.
 
 No process ends, no thread dies, nothing prints a traceback, watched cameras lose no frame; memory, threads and
-descriptors come back to where they were.
+descriptors return to their initial values.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SETTLE_S = 40.0  # sessions and half-finished requests expire
 
 
 class Size(NamedTuple):
-    """What a process holds."""
+    """Resources that a process holds."""
 
     memory_mb: float
     threads: int
@@ -43,7 +43,7 @@ def soak(seed: int, scale: float) -> list[str]:
         "MQTT to the operator": to_operator,
     }
     with running() as (system, operator):
-        for kind in kinds.values():  # what is loaded and cached at the first use counts as there before
+        for kind in kinds.values():  # the baseline includes all that is loaded and cached on first use
             kind(system, dice, 100)
         time.sleep(SETTLE_S / 2)
         before = _sizes(system)
@@ -60,7 +60,7 @@ def soak(seed: int, scale: float) -> list[str]:
             print(f"  {name}: before {was}, after {now}", flush=True)
             if now.memory_mb > was.memory_mb + GROWTH_MB:
                 problems.append(f"{name}: memory rose from {was.memory_mb:.0f} to {now.memory_mb:.0f} MB")
-            # A thread or two may have come from a pool that had not been used up; each client's or camera's is gone.
+            # A pool may have started another thread or two; those of clients and cameras have ended.
             if abs(now.threads - was.threads) > 4:
                 problems.append(f"{name}: {was.threads} threads before, {now.threads} after")
             if abs(now.descriptors - was.descriptors) > 8:
@@ -79,7 +79,7 @@ def _size(pid: int) -> Size:
     return Size(round(memory_kb / 1024, 1), int(status["Threads"]), len(list(Path(f"/proc/{pid}/fd").iterdir())))
 
 
-# --- what is sent -----------------------------------------------------------------------------------------------------
+# --- inputs -----------------------------------------------------------------------------------------------------------
 
 METHODS = (
     "OPTIONS",
@@ -121,7 +121,7 @@ def bytes_of(dice: random.Random, most: int = 200) -> bytes:
 
 
 def broken(dice: random.Random, data: bytes) -> bytes:
-    """A message with something cut out, put in or changed; sometimes as it is."""
+    """A message with something cut out, put in or changed; sometimes unchanged."""
     at, way = dice.randrange(len(data) + 1), dice.randrange(5)
     if way == 0:
         return data[:at]
@@ -133,7 +133,7 @@ def broken(dice: random.Random, data: bytes) -> bytes:
 
 
 def rtsp(system: System, dice: random.Random, count: int) -> None:
-    """Whole and broken requests, several on a connection; some connections are left without a word."""
+    """Whole and broken requests, several on a connection; some connections are closed without TEARDOWN."""
     sent = 0
     while sent < count:
         with suppress(OSError), socket.create_connection(("127.0.0.1", system.media), 1) as sock:
@@ -211,7 +211,7 @@ async def _websocket(system: System, dice: random.Random, count: int) -> None:
     sent = 0
     live = f"http://127.0.0.1:{system.page}/live?viewer="
     async with aiohttp.ClientSession() as session, session.ws_connect(f"{live}driver", max_msg_size=0) as driver:
-        # The driver's page holds control. What others ask is refused, so that watched cameras stay as they are.
+        # The driver's page holds control. Requests of others are refused, so that watched cameras stay unchanged.
         reading = asyncio.create_task(_read(driver))
         while sent < count:
             async with session.ws_connect(f"{live}hostile{dice.randrange(5)}", max_msg_size=0) as ws:
@@ -256,7 +256,7 @@ def to_vehicle(system: System, dice: random.Random, count: int) -> None:
 
 
 def to_operator(system: System, dice: random.Random, count: int) -> None:
-    """Not retained: what is broken is dropped; a true state would be the vehicle's."""
+    """Not retained: broken messages are dropped; a valid state would pass for the vehicle's."""
     _publish(system, dice, count, ("state", "telemetry", "configuration", "reply/x", f"reply/{_operator(system)}"))
 
 

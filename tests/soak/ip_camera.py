@@ -1,4 +1,4 @@
-"""An IP camera that stands still for 1 to 30 s: viewers keep their sessions, and the picture comes back."""
+"""An IP camera that freezes for 1 to 30 s: viewers keep their sessions, and the picture returns."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def soak(seed: int, scale: float) -> list[str]:
                     try:
                         until(lambda b=before: system.samples()["rear"]["frames"] > b + 15, seconds=30, every_s=0.1)
                     except AssertionError:
-                        problems.append(f"stood for {stopped_s:.1f} s: no picture within 30 s")
+                        problems.append(f"frozen for {stopped_s:.1f} s: no picture within 30 s")
                         continue
                     back_s = time.monotonic() - woken
-                    print(f"{number:3} stood {stopped_s:.1f} s, back in {back_s:.1f} s", flush=True)
+                    print(f"{number:3} frozen {stopped_s:.1f} s, back in {back_s:.1f} s", flush=True)
                     if back_s > BACK_S:
-                        problems.append(f"stood for {stopped_s:.1f} s: back after {back_s:.1f} s, limit {BACK_S:g} s")
+                        problems.append(f"frozen for {stopped_s:.1f} s: back after {back_s:.1f} s, limit {BACK_S:g} s")
                     if system.samples()["rear"]["rebuilt"] != rebuilt:
-                        problems.append(f"stood for {stopped_s:.1f} s: the operator's session was rebuilt")
+                        problems.append(f"frozen for {stopped_s:.1f} s: the operator's session was rebuilt")
                     if player.poll() is not None:
-                        problems.append(f"stood for {stopped_s:.1f} s: ffmpeg's session ended")
+                        problems.append(f"frozen for {stopped_s:.1f} s: ffmpeg's session ended")
                 player.kill()
             until(lambda: flowing(operator), seconds=15)
             problems += system.tracebacks()

@@ -1,4 +1,4 @@
-"""kill -9 of each process: whatever is started again is back within 5 s, and a demo leaves nothing behind."""
+"""kill -9 of each process: after a restart everything is back within 5 s, and a demo leaves no process behind."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from system import CAMERAS, System, flowing, running
 from rig import CHECKOUT, free_port, until
 
 BACK_S = 5.0
-END_S = 6.0  # of a demo that has lost a part: it ends the others, by force after a while
-START_S = 3.0  # of a process, before its connections count
+END_S = 6.0  # for a demo that has lost a part to end the others, by force after a while
+START_S = 3.0  # for a process to start, before its connections count
 
 
 def soak(seed: int, scale: float) -> list[str]:
@@ -36,15 +36,17 @@ def _restarted(dice: random.Random, count: int) -> list[str]:
             system.processes[name].kill()
             system.processes[name].wait()
             time.sleep(away_s)
-            frames, heard = _received(system), len(operator.telemetry)
+            frames, telemetry = _received(system), len(operator.telemetry)
             system.start(name)
             began = time.monotonic()
             limit = BACK_S + (START_S if name != "broker" else 0)
 
-            def back(before: dict[str, int] = frames, heard: int = heard, new: bool = name == "operator") -> bool:
+            def back(
+                before: dict[str, int] = frames, telemetry: int = telemetry, new: bool = name == "operator"
+            ) -> bool:
                 now = _received(system)
                 rising = set(now) == set(CAMERAS) and all(now[c] > (0 if new else before[c]) for c in CAMERAS)
-                return rising and len(operator.telemetry) > heard and flowing(operator)
+                return rising and len(operator.telemetry) > telemetry and flowing(operator)
 
             try:
                 until(back, seconds=30, every_s=0.05)
@@ -59,7 +61,7 @@ def _restarted(dice: random.Random, count: int) -> list[str]:
 
 
 def _received(system: System) -> dict[str, int]:
-    """Frames that the operator's side has received of each camera; nothing before its first sample."""
+    """Frames that the operator's side has received of each camera; empty before its first sample."""
     try:
         return {name: camera["frames"] for name, camera in system.samples().items()}
     except (OSError, StopIteration):
@@ -72,13 +74,13 @@ def _demos(dice: random.Random, count: int) -> list[str]:
         relay = dice.random() < 0.5
         victim = ("demo", "vehicle", "operator", "mosquitto", "relay" if relay else "vehicle")[number % 5]
         mark = uuid.uuid4().hex
-        with tempfile.TemporaryDirectory() as directory, tempfile.TemporaryFile("w+") as said:
+        with tempfile.TemporaryDirectory() as directory, tempfile.TemporaryFile("w+") as output:
             words = [f"media.port={free_port()}", f"control.port={free_port()}", "duration_s=60"]
             words += ["link=relay", f"log={Path(directory) / 'drive'}"] if relay else []
             demo = subprocess.Popen(
                 [sys.executable, "-m", "runner", "demo", *ROBOT, *words],
-                stdout=said,
-                stderr=said,
+                stdout=output,
+                stderr=output,
                 start_new_session=True,
                 cwd=CHECKOUT,
                 env={**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark},
@@ -93,7 +95,7 @@ def _demos(dice: random.Random, count: int) -> list[str]:
             while (left := _left(mark, demo)) and time.monotonic() - began < END_S:
                 time.sleep(0.05)
             ended_s = time.monotonic() - began
-            with suppress(subprocess.TimeoutExpired):  # its parts may be gone a moment before it
+            with suppress(subprocess.TimeoutExpired):  # its parts may end a moment before it
                 demo.wait(1)
             status = demo.poll()
             name = "demo over a relay" if relay else "demo"
@@ -102,8 +104,8 @@ def _demos(dice: random.Random, count: int) -> list[str]:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
             demo.wait()
-            said.seek(0)
-            text = said.read()
+            output.seek(0)
+            text = output.read()
         if left:
             problems.append(f"{victim} killed: left {'; '.join(left.values())}")
         elif pid and victim != "demo" and status in (0, None):
@@ -120,5 +122,5 @@ def _part(mark: str, demo: int, wanted: str) -> int | None:
 
 
 def _left(mark: str, demo: subprocess.Popen[bytes]) -> dict[int, str]:
-    demo.poll()  # else it would stay as a zombie
+    demo.poll()  # otherwise it would remain a zombie
     return marked(mark)

@@ -11,7 +11,7 @@ from system import Watched, newest, running
 from rig import free_port
 
 STATES = ("sending", "switched off", "paused")
-EVERY = 8  # openings between two looks at the watched camera
+EVERY = 8  # openings between two checks of the watched camera
 
 
 def soak(seed: int, scale: float) -> list[str]:

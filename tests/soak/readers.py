@@ -1,4 +1,4 @@
-"""A slow reader per camera, and one that stops: they are closed, and who watches in earnest loses no frame."""
+"""A slow reader per camera, and one that stops: both are disconnected, and regular viewers lose no frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from system import CAMERAS, Watched, running
 
 from rtsp_client import RtspClient
 
-ALONE_S = 300  # of a reader at half the rate
+ALONE_S = 300  # with readers at half the rate
 
 
 def soak(seed: int, scale: float) -> list[str]:
@@ -31,7 +31,7 @@ def soak(seed: int, scale: float) -> list[str]:
                         group.append(client)
                 for client in slow:
                     kbps = operator.telemetry[-1]["cameras"][client.url.rpartition("/")[2]]["applied"]["bitrate"]
-                    client.delay_s = 2 * 1200 * 8 / (1000 * kbps)  # a packet in twice the time in which one is sent
+                    client.delay_s = 2 * 1200 * 8 / (1000 * kbps)  # twice the interval at which packets are sent
                     client.read()
                 time.sleep(dice.uniform(10, 20))
                 for client in stopped:

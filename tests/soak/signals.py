@@ -1,4 +1,4 @@
-"""Signals to the verbs that run long, at random moments, single and double: each run ends in time, with all it started.
+"""Signals to long-running verbs, at random moments, once or twice: each run ends in time, with all it started.
 
     PYTHONPATH=tests/integration .venv/bin/python tests/soak/signals.py SEED COUNT [VERB ...]
 
@@ -27,18 +27,18 @@ from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
 LIMIT_S = 3.0  # from the first signal to the end of the last process
-MARK = "TOD_SOAK_RUN"  # environment variable that tells the processes of one run from all others
+MARK = "TOD_SOAK_RUN"  # environment variable that marks the processes of one run
 ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=5", "page.serve=false", "pqos=constant", "pqos.kbps=2000")
 STATUSES = {0, 130, 143}
-BY_VERB = {  # what else is right
+BY_VERB = {  # further valid statuses
     "record": {1},  # a camera had no frame yet
-    # By the system's own hand, when the work is done and Python ends: there are no half files.
+    # By the signal's default action, when the work is done and Python exits: no partial files remain.
     **{verb: {-signal.SIGINT, -signal.SIGTERM} for verb in ("report", "export", "replay")},
 }
 
 
 class Verb(NamedTuple):
-    """words: the command line, told a free directory; span_s: signals come from 0 to this after the start, s."""
+    """words: the command line, given a free directory; span_s: signals are sent 0 to this many s after the start."""
 
     words: Callable[[Path], Sequence[str]]
     span_s: float
@@ -46,7 +46,7 @@ class Verb(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """One run and what came of it. ended_s: None if it did not end in time; left: command lines of who was left."""
+    """One run and its outcome. ended_s: None if it did not end in time; left: command lines of leftover processes."""
 
     number: int
     verb: str
@@ -56,18 +56,18 @@ class Run:
     ended_s: float | None
     status: int | None
     left: tuple[str, ...]
-    said: str
+    output: str
 
     @property
     def problem(self) -> str:
         if self.ended_s is None:
             return f"not ended within {LIMIT_S:g} s: {'; '.join(self.left)}"
-        if "Traceback" in self.said:
-            return f"traceback: {self.said.strip()[-2000:]}"
-        # Before Python has started, a signal ends the process by the system's own hand.
+        if "Traceback" in self.output:
+            return f"traceback: {self.output.strip()[-2000:]}"
+        # Before Python has started, the default action of a signal ends the process.
         killed = self.status is not None and self.status < 0 and self.at_s < 0.5
         right = self.status in STATUSES | BY_VERB.get(self.verb, set())
-        return "" if right or killed else f"status {self.status}: {self.said.strip()[-200:]}"
+        return "" if right or killed else f"status {self.status}: {self.output.strip()[-200:]}"
 
     def __str__(self) -> str:
         ended = "-" if self.ended_s is None else f"{self.ended_s:.2f} s"
@@ -85,7 +85,7 @@ def _side(verb: str, broker: Endpoint, *more: str) -> Sequence[str]:
 
 @contextmanager
 def verbs() -> Iterator[dict[str, Verb]]:
-    """Every verb that runs long, with what it works on."""
+    """Every long-running verb, with its inputs."""
     with tempfile.TemporaryDirectory() as name:
         directory, broker = Path(name), Endpoint("127.0.0.1", free_port())
         drive = directory / "drive"
@@ -107,7 +107,7 @@ def _print(run: Run) -> None:
     print(run, flush=True)
 
 
-def soak(seed: int, count: int, chosen: Sequence[str] = (), tell: Callable[[Run], None] = _print) -> list[Run]:
+def soak(seed: int, count: int, chosen: Sequence[str] = (), report: Callable[[Run], None] = _print) -> list[Run]:
     """Run verbs in turn and interrupt each.
 
     returns  the runs that failed
@@ -117,7 +117,7 @@ def soak(seed: int, count: int, chosen: Sequence[str] = (), tell: Callable[[Run]
         names = list(chosen or known)
         for number in range(count):
             run = _run(number, names[number % len(names)], known[names[number % len(names)]], dice)
-            tell(run)
+            report(run)
             failed += [run] if run.problem else []
     return failed
 
@@ -126,12 +126,12 @@ def _run(number: int, name: str, verb: Verb, dice: random.Random) -> Run:
     kinds = [dice.choice((signal.SIGINT, signal.SIGTERM)) for _ in range(dice.choice((1, 2)))]
     at_s, gap_s = dice.uniform(0.05, verb.span_s), dice.choice((0.0, 0.001, 0.02, 0.2, 0.6))
     mark = uuid.uuid4().hex
-    with tempfile.TemporaryDirectory() as free, tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryDirectory() as free, tempfile.TemporaryFile("w+") as output:
         child = subprocess.Popen(
             _command(*verb.words(Path(free))),
             stdin=subprocess.PIPE,
-            stdout=said,
-            stderr=said,
+            stdout=output,
+            stderr=output,
             start_new_session=True,
             cwd=CHECKOUT,
             env={**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark},
@@ -150,15 +150,15 @@ def _run(number: int, name: str, verb: Verb, dice: random.Random) -> Run:
         assert child.stdin
         child.stdin.close()
         status = child.wait(10)
-        said.seek(0)
+        output.seek(0)
         sent = tuple(kind.name for kind in kinds)
-        return Run(number, name, sent, at_s, gap_s, ended_s, status, tuple(left.values()), said.read())
+        return Run(number, name, sent, at_s, gap_s, ended_s, status, tuple(left.values()), output.read())
 
 
 def _wait(child: subprocess.Popen[bytes], mark: str, until: float) -> dict[int, str]:
-    """Wait until every process of a run has ended; those that have not in time, by process id."""
+    """Wait until every process of a run has ended; returns those that have not in time, by process id."""
     while True:
-        child.poll()  # else it would stay as a zombie
+        child.poll()  # otherwise it would remain a zombie
         left = marked(mark)
         if not left or time.monotonic() > until:
             return left

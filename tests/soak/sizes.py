@@ -1,4 +1,4 @@
-"""New sizes of all cameras, twice a second, before the eyes of a browser: no decoder may break."""
+"""New sizes of all cameras, twice a second, watched by a browser: no decoder may fail."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def soak(seed: int, scale: float) -> list[str]:
 
 
 def frames(system: System) -> dict[str, int]:
-    """Frames that the operator's side has received, of whichever pipeline."""
+    """Frames that the operator's side has received, over all pipelines."""
     return {name: camera["frames"] for name, camera in system.samples().items()}
 
 

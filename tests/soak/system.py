@@ -25,7 +25,7 @@ class System:
     """Three processes: broker, vehicle, operator.
 
     words  overrides of both sides
-    url    where a camera is to be had: `url("front")`
+    url    address of a camera: `url("front")`
     page   port of the operator's page
     """
 
@@ -80,7 +80,7 @@ class System:
         return cameras
 
     def tracebacks(self) -> list[str]:
-        """Tracebacks in what the processes have printed, the first of each."""
+        """The first traceback in the output of each process."""
         found = []
         for name in self.processes:
             text = self.output(name).read_text(errors="replace")
@@ -92,7 +92,7 @@ class System:
 
 @contextmanager
 def running(*words: str) -> Iterator[tuple[System, Operator]]:
-    """A system that streams, and a program's end of the control link."""
+    """A streaming system, and a program at the other end of its control link."""
     with tempfile.TemporaryDirectory(prefix="tod-soak-") as directory:
         system = System(Path(directory), words)
         try:
@@ -115,7 +115,7 @@ def newest(operator: Operator) -> Any:
 
 
 def flowing(operator: Operator, cameras: Sequence[str] = CAMERAS) -> bool:
-    """Whether all cameras are decided to be sent and are watched."""
+    """Whether all cameras are to be sent and have viewers."""
     state = newest(operator)
     return state["online"] and all(
         state["cameras"][name]["sending"] and state["cameras"][name]["applied"] for name in cameras
@@ -123,14 +123,14 @@ def flowing(operator: Operator, cameras: Sequence[str] = CAMERAS) -> bool:
 
 
 class Watched:
-    """A camera that the operator watches: every frame that its encoder puts out must come."""
+    """A camera that the operator watches: every frame that its encoder outputs must arrive."""
 
     def __init__(self, system: System, operator: Operator, camera: str = "front") -> None:
         self._system, self._operator, self._camera = system, operator, camera
         self._before = self._settled()
 
     def problems(self) -> list[str]:
-        """What was lost since the last call."""
+        """Losses since the last call."""
         before, self._before = self._before, self._settled()
         sent, received, lost, rebuilt = (self._before[key] - before[key] for key in before)
         print(f"    watched {self._camera}: {sent} frames sent, {received} received, {lost} packets lost", flush=True)
@@ -144,7 +144,7 @@ class Watched:
         return [f"watched {self._camera}: {problem}" for problem in found]
 
     def _settled(self) -> Mapping[str, int]:
-        """Counters at rest: nothing is on its way while the camera is switched off."""
+        """Settled counters: nothing is in flight while the camera is switched off."""
         self._switch(False)
         seen: list[Mapping[str, int]] = []
         while len(seen) < 5 or seen[-1] != seen[-5]:
@@ -158,8 +158,8 @@ class Watched:
         return seen[-1]
 
     def _switch(self, on: bool) -> None:
-        said = self._operator.ask(str(time.monotonic()), event="camera_switched", camera=self._camera, on=on)
-        assert said["result"] == "applied", said
+        reply = self._operator.ask(str(time.monotonic()), event="camera_switched", camera=self._camera, on=on)
+        assert reply["result"] == "applied", reply
 
 
 def ended(child: subprocess.Popen[bytes], seconds: float) -> bool:
