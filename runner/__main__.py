@@ -12,7 +12,7 @@ from importlib import import_module
 from runner.errors import RunError, UserError
 from runner.system import signals
 
-# All else is imported once signals are taken: an exception in an import would be a traceback.
+# Everything else is imported once signals are handled: an interrupted import would print a traceback.
 
 USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
 
@@ -30,13 +30,13 @@ conf=DIR (or the environment variable TOD_CONF) names a directory of your own; i
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
-    argv     None: the process's own; a process that was ended by a signal then does not return from here
+    argv     None: the process's own; a process ended by a signal then does not return from here
     returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C, 143 SIGTERM
     """
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
         if argv is None and signals.received():
-            # The interpreter would wait for libraries whose threads may still be in Python.
+            # A normal exit would wait for library threads that may still be in Python.
             with suppress(OSError):
                 sys.stdout.flush()
             os._exit(status)
@@ -67,10 +67,10 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
     except KeyboardInterrupt:
         return 128 + (signals.received() or signal.SIGINT)
     except BrokenPipeError:
-        # Who read our output has gone; the interpreter would complain again when it flushes.
+        # The reader of our output is gone; the interpreter would complain again when it flushes.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:  # a disk that is full, a file that may not be read
+    except OSError as error:  # a full disk, a file without read permission
         where = f"{error.filename}: " if error.filename else ""
         print(f"{where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
         return 1

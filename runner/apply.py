@@ -1,4 +1,4 @@
-"""The one door to GStreamer: build what was planned, carry out commands, say what is applied.
+"""The only interface to GStreamer: builds plans, carries out commands, reports what is applied.
 
 Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere else.
 """
@@ -58,12 +58,12 @@ __all__ = [
     "write_clip",
 ]
 
-CALL_S = 10.0  # what GLib's thread is asked to do takes milliseconds; after so long it hangs
-STOP_S = 2.0  # how long the end waits for pipelines to stop
+CALL_S = 10.0  # a call into GLib's thread takes milliseconds; after this long it hangs
+STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
 def check_machine(plans: Sequence[Plan]) -> None:
-    """Whether every plugin is installed and every source opens: files, devices.
+    """Check that every plugin is installed and every source opens: files, devices.
 
     raises  RunError with the remedy, for all cameras at once
     """
@@ -76,7 +76,7 @@ def check_machine(plans: Sequence[Plan]) -> None:
 
 
 def check_recorders(plans: Sequence[Plan]) -> None:
-    """Whether every plugin that recording needs is installed.
+    """Check that every plugin that recording needs is installed.
 
     raises  RunError with the packages to install, for all cameras at once
     """
@@ -98,7 +98,7 @@ def _source_problem(plan: Plan) -> str | None:
 
 
 class _Glib:
-    """GLib's main loop in a thread of its own: the RTSP server and the buses live there."""
+    """GLib's main loop in its own thread, where the RTSP server and the buses run."""
 
     def __init__(self) -> None:
         self._loop = GLib.MainLoop()
@@ -106,10 +106,10 @@ class _Glib:
         self._thread.start()
 
     def call(self, what: str, function: Callable[[], None]) -> None:
-        """Run a function in the loop's thread and wait for it; what it raises is raised here.
+        """Run a function in the loop's thread and wait for it; its exceptions are raised here.
 
-        what    the function's work, for people
-        raises  RunError where it is not done within CALL_S
+        what    the function's work, for messages
+        raises  RunError if it is not done within CALL_S
         """
         done = threading.Event()
         raised: list[BaseException] = []
@@ -129,7 +129,7 @@ class _Glib:
             raise raised[0]
 
     def end(self, stop: Callable[[], None]) -> None:
-        """Run the last function, give state changes time to finish, end the loop. What hangs by then is left alone."""
+        """Run the last function, let state changes finish, end the loop. Whatever hangs by then is left alone."""
         try:
             self.call("stopping", stop)
             settle(STOP_S)
@@ -142,7 +142,7 @@ class _Glib:
 
 
 def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
-    """The plans as they are built: with a file each, where video is kept.
+    """The plans to build: each with a file, if video is kept.
 
     raises  RunError with the packages to install
     """
@@ -155,13 +155,13 @@ def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
 
 
 class VehicleSide:
-    """All cameras of the vehicle, streaming. Keeps where each knob is wanted, and writes it all again after a rebuild.
+    """All cameras of the vehicle, streaming. Keeps the wanted value of each knob, and sets them again after a rebuild.
 
     on_report  called, from another thread, when a camera's pipeline starts, stops or fails
-    video   where what is sent is kept; None: nowhere
-    raises  RunError where the port is in use, or what `video` needs is not installed
+    video      where to keep what is sent; None: nowhere
+    raises     RunError if the port is in use, or something that `video` needs is not installed
 
-    `on_turned` is called, from any thread, when knobs were set and read back: `applied` may have changed.
+    `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class VehicleSide:
         self._glib.call("starting the cameras", start)
 
     def turn(self, commands: Iterable[Command]) -> None:
-        """Carry out commands: those of one camera between the same two of its frames. Returns at once."""
+        """Carry out commands: those for one camera between the same two of its frames. Returns at once."""
         changed: dict[str, dict[str, KnobValue]] = {}
         for command in commands:
             changed.setdefault(command.camera, {})[command.knob] = command.value
@@ -198,27 +198,27 @@ class VehicleSide:
                 pipeline.turn(self._wanted_of(name), values)
 
     def give_control(self, operator: str) -> None:
-        """State which operator is in control, "" for none: its viewers are always let in, see `runner.gst.viewers`."""
+        """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
         if self._server:
             self._server.controller = operator
 
     def push(self, camera: str, frame: Any) -> bool:
-        """One frame, captured now, for a camera whose source is born in Python; see `runner.live.LiveVehicle`."""
+        """One frame, captured now, for a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
         if camera not in self._wanted:
             raise ValueError(f"camera {camera!r}: no such camera{suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 
     def applied(self) -> dict[str, Mapping[str, KnobValue]]:
-        """By camera and knob, what was read back from the elements; cameras without a pipeline have nothing."""
+        """By camera and knob, the values read back from the elements; empty for cameras without a pipeline."""
         return {name: dict(p.knobs.applied) if (p := self._pipeline(name)) else {} for name in self._wanted}
 
     def sent(self) -> dict[str, tuple[int, int]]:
-        """By camera, frames and bytes that its encoder has put out since its pipeline was built."""
+        """By camera, frames and bytes that its encoder has output since its pipeline was built."""
         return {name: p.counters() if (p := self._pipeline(name)) else (0, 0) for name in self._wanted}
 
     def faults(self) -> list[str]:
-        """What elements refused since the last call; each is a defect or a wrong graph."""
+        """Values that elements refused since the last call; each is a bug or a wrong graph."""
         faults = []
         for name in self._wanted:
             pipeline = self._pipeline(name)
@@ -228,7 +228,7 @@ class VehicleSide:
         return faults
 
     def sources(self) -> dict[str, str]:
-        """By camera, what is wrong with a source that has failed and is being replaced; the others are left out."""
+        """By camera, the fault of a source that has failed and is being replaced; the others are left out."""
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
 
@@ -242,7 +242,7 @@ class VehicleSide:
         self._glib.end(stop)
 
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
-        """A pipeline that was just built, with every knob where it is wanted."""
+        """Set up a newly built pipeline, with every knob at its wanted value."""
         name = plan.camera.name
         source = None
         if plan.frozen_s is not None:
@@ -253,7 +253,7 @@ class VehicleSide:
         return CameraPipeline(pipeline, plan, self._wanted_of(name), self._turned, source)
 
     def _turned(self) -> None:
-        self.on_turned()  # as it is then, not as it was when the pipeline was built
+        self.on_turned()  # looked up now: it may have been set after the pipeline was built
 
     def _wanted_of(self, name: str) -> Mapping[str, KnobValue]:
         with self._lock:
@@ -271,10 +271,10 @@ class OperatorSide:
     on_report   called, from another thread, with cameras and what happened to them
     on_unit     called, from the camera's streaming thread, with each access unit received
     on_picture  called, from the camera's streaming thread, with each decoded picture
-    arrivals    keep when each access unit came, for the samples
-    video       where what is received is kept; None: nowhere
-    operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
-    raises      RunError where what `video` needs is not installed
+    arrivals    record when each access unit arrived, for the samples
+    video       where to keep what is received; None: nowhere
+    operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
+    raises      RunError if something that `video` needs is not installed
     Without `on_unit`, `on_picture` and `arrivals` no Python runs per frame.
     """
 
@@ -302,11 +302,10 @@ class OperatorSide:
         self._glib.call("starting the receivers", start)
 
     def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
-        """What has come of each camera; to be called a few times a second.
+        """What was received of each camera; to be called a few times a second.
 
-        sending  which cameras should send; one that should and is silent is built anew. Those of which nobody knows are
-                 left out
-        raises   RunError where GStreamer hangs
+        sending  which cameras should send; one that should but is silent is rebuilt. Unknown ones are left out
+        raises   RunError if GStreamer hangs
         """
         samples: dict[str, Reception] = {}
 
@@ -354,7 +353,7 @@ class RecordingSide:
         self._for_each("ending the files", Recorder.finish)
 
     def stop(self) -> None:
-        """End at once; what is not finished stays incomplete."""
+        """End at once; unfinished files stay incomplete."""
 
         def stop() -> None:
             for recorder in self._recorders.values():
@@ -370,7 +369,7 @@ class RecordingSide:
         self._glib.call(what, each)
 
 
-# --- offline: what driving does not load ------------------------------------------------------------------------------
+# --- offline: not loaded while driving --------------------------------------------------------------------------------
 
 
 def discover(path: Path, where: str) -> Form:
@@ -388,7 +387,7 @@ def read_video(path: Path) -> Iterator[Unit]:
 
 
 def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps: Fraction) -> None:
-    """Frames made in Python as a clip, see `runner.gst.clip_writer.write_clip`."""
+    """Write frames generated in Python as a clip, see `runner.gst.clip_writer.write_clip`."""
     from runner.gst import clip_writer
 
     clip_writer.write_clip(path, frames, width, height, fps)
@@ -397,7 +396,7 @@ def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps
 def run_lanes(
     lanes: LaneSet, on_frame: OnFrame, on_picture: OnDecoded, on_progress: Callable[[int], None]
 ) -> list[Encoded]:
-    """A sequence through many encoders, see `runner.gst.lanes.run_lanes`."""
+    """Run a sequence through many encoders, see `runner.gst.lanes.run_lanes`."""
     from runner.gst import lanes as gst_lanes
 
     return gst_lanes.run_lanes(lanes, on_frame, on_picture, on_progress)

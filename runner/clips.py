@@ -1,4 +1,4 @@
-"""Clips that a source renders before a run: what each camera sees of the drive, and where its clip is kept."""
+"""Clips that a source renders before a run: the view of each camera, and where its clip is stored."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 
 from runner.core.model import Camera, ModelError, Pose
 
-RENDERER_VERSION = 2  # raise it with every change that changes pictures or files
+RENDERER_VERSION = 2  # increment with every change to pictures or files
 # A camera without a pose looks ahead from the height of a driver's eyes.
 DRIVER = Pose(0.0, 0.0, 1.5, 0.0, 5.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one camera sees of the drive.
+    """One camera's view of the drive.
 
     width, height  px, even
     fov_deg        horizontal field of view; below 180 for a pinhole
@@ -43,14 +43,14 @@ class View:
             raise ModelError("pose.z_m", f"z_m {self.pose.z_m:g}, fps {self.fps}", "must be above 0")
 
     def frames(self, seconds: float) -> int:
-        """Number of frames of a clip of that many seconds."""
+        """Number of frames in a clip of that length."""
         return round(seconds * self.fps)
 
 
 def view(camera: Camera) -> View:
-    """What a camera sees of the synthetic drive.
+    """A camera's view of the synthetic drive.
 
-    raises  ModelError where the drive cannot be rendered so
+    raises  ModelError if it cannot be rendered
     """
     width, height = camera.source_size
     return View(width, height, camera.fps, camera.pose or DRIVER, camera.fov_deg, camera.lens)
@@ -62,13 +62,13 @@ def cache_directory() -> Path:
 
 
 def clip_path(view: View, seconds: float, cache: Path) -> Path:
-    """Where the clip of a view lies: its name is a digest of everything that its pictures depend on."""
+    """Path of a view's clip: the name is a digest of everything that affects its pictures."""
     digest = hashlib.sha256(repr((RENDERER_VERSION, view, float(seconds))).encode()).hexdigest()
     return cache / f"drive-{digest[:20]}.mp4"
 
 
 def rendered(camera: Camera) -> str | None:
-    """The camera's clip, where its source renders one and the cache has it."""
+    """The camera's clip, if its source renders one and it is in the cache."""
     if not camera.source.render:
         return None
     path = clip_path(view(camera), camera.source.render_s, cache_directory())

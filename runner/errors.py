@@ -1,4 +1,4 @@
-"""What ends a run with one clear message instead of a traceback."""
+"""Errors that end a run with one clear message instead of a traceback."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from runner.redact import redacted
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One mistake of the user: where, what was found, which rule it breaks.
+    """One user mistake: location, value found, rule broken.
 
-    found  None where the path already shows it
+    found  None if the path already shows it
     """
 
     file: str
@@ -49,9 +49,9 @@ class RunError(Exception):
 
 
 class MissingBindings(ImportError):
-    """GStreamer's Python bindings, or parts of them, do not load.
+    """GStreamer's Python bindings, or parts of them, cannot be loaded.
 
-    missing  why each part does not load, and what brings it
+    missing  by part, why it does not load and what provides it
     """
 
     def __init__(self, missing: Mapping[str, str]) -> None:

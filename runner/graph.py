@@ -24,14 +24,14 @@ from runner.core.model import (
 )
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
-# Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and with what.
+# Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and how its value is computed.
 _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
     "key_interval_s": ("key_interval_frames", lambda seconds, fps: seconds * fps),
     "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
 }
 Assignment = tuple[str, str, Value]  # element, property, value
-# Before the encoder of a recording. What the queue cannot take is lost and counted, so that a slow encoder or disk
-# never holds up the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts what is kept.
+# Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
+# disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
 _QUEUE: dict[str, Value] = {
     "leaky": "upstream",
     "max-size-bytes": 128_000_000,
@@ -43,10 +43,10 @@ _RECORDED = (
     Element("recorded", "identity", {"single-segment": True}),
 )
 _WRITER = Element("writer", "filesink", {})
-# The video of a side, as it is sent or received, also into a file: what follows the tee. Its names have a hyphen, which
-# those of a graph cannot have. Here what waits longest is lost, so that a slow disk never holds up the stream: 8 MB are
-# 10 s at 6 Mbit/s. The gate is closed when nothing can be written any more, runner/gst/video_files.py. Each frame is
-# written as it comes, for a process that is killed.
+# The branch after the tee writes a side's video, as sent or received, into a file. Its names have a hyphen, which those
+# of a graph cannot have. Its queue drops the oldest data, so that a slow disk never blocks the stream: 8 MB are 10 s at
+# 6 Mbit/s. The gate is closed when nothing can be written any more, see runner/gst/video_files.py. Each frame is
+# written at once, in case the process is killed.
 _TEE = Element("video-tee", "tee", {})
 _FILE_GATE = Element("video-gate", "valve", {})
 _FILE_QUEUE = Element(
@@ -61,22 +61,22 @@ _FILE_SINK = Element(
     {"sync": False, "async": False, "enable-last-sample": False, "buffer-mode": "unbuffered"},
 )
 _COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
-CODECS = ("h264", "h265")  # of which access units are known: for files and for the operator's page
-_FROZEN_INTERVALS = 10  # a source that is slow by itself is not frozen
+CODECS = ("h264", "h265")  # whose access units are supported: for files and for the operator's page
+_FROZEN_INTERVALS = 10  # of frames: a source with a low frame rate is not frozen
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
     """One camera compiled: nothing left to look up, nothing started.
 
-    source     elements that make raw frames; a stand-in as long as their clip is not rendered
-    loops      whether the source is a clip that starts again at its end
-    printed    what `print` shows of the source: the stand-in for frames that are born in Python
+    source     elements that produce raw frames; a stand-in while their clip is not rendered
+    loops      whether the source is a clip that restarts at its end
+    printed    the source as `print` shows it: a stand-in for frames that come from Python
     stands_in  whether that is a stand-in
     vehicle    elements after the source
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
-    recorder   elements that follow the source where it is recorded, but for the file; nothing where nobody records
+    recorder   elements that follow the source when it is recorded, without the file; empty if it is not recorded
     video      whether each side also writes what it sends or receives into a file
     """
 
@@ -94,12 +94,12 @@ class Plan:
 
     @property
     def serves(self) -> bool:
-        """Whether an RTSP server carries the stream; else the line brings its own sink and source."""
+        """Whether an RTSP server carries the stream; otherwise the graph has its own network sink and source."""
         return self.camera.graph.transport == "rtsp"
 
     @property
     def frozen_s(self) -> float | None:
-        """Without a frame for so long, s, the source is frozen and has to be replaced; None: it is not watched."""
+        """Without a frame for this long, s, the source is frozen and has to be replaced; None: it is not watched."""
         frozen_s = self.camera.source.frozen_s
         return None if frozen_s is None else max(frozen_s, _FROZEN_INTERVALS / float(self.camera.fps))
 
@@ -110,7 +110,7 @@ class Plan:
 
     @property
     def server(self) -> str | None:
-        """The RTSP factory's own string."""
+        """The launch string of the RTSP factory."""
         return f"( {self.pipeline} )" if self.serves else None
 
     @property
@@ -129,11 +129,11 @@ class Plan:
 
     @property
     def video_elements(self) -> tuple[Element, ...]:
-        """Elements between the stream and its file; none where there is no file."""
+        """Elements between the stream and its file; none without a file."""
         if not self.video:
             return ()
         codec = video_codec(self.camera.graph)
-        # Whoever opens the file has to find the parameter sets at each keyframe.
+        # A reader of the file needs the parameter sets at each keyframe.
         parser = Element("video-parser", f"{codec}parse", {"config-interval": -1})
         return (_FILE_GATE, _FILE_QUEUE, parser, _FILE_MUXER, _FILE_SINK)
 
@@ -142,7 +142,7 @@ class Plan:
         return f" {_TEE.name}. ! {launch(self.video_elements)}" if self.video else ""
 
     def _teed(self, side: str, elements: tuple[Element, ...]) -> tuple[Element, ...]:
-        """With a tee after the element that counts, where there is a file."""
+        """With a tee after the element that counts, if there is a file."""
         if not self.video:
             return elements
         after = [element.name for element in elements].index(_COUNTERS[side]) + 1
@@ -159,7 +159,7 @@ class Plan:
 
     def operator_line(self) -> str:
         """Arguments for gst-launch-1.0, quoted for a shell, beginning with the source that `vehicle_line` sends to."""
-        # Where print has a wire, it takes the place of the RTSP client, the first element.
+        # If there are wire elements, they replace the RTSP client, the first element.
         return shell((*self.wire_operator, *self.operator[1:]) if self.wire_operator else self.operator)
 
 
@@ -170,13 +170,13 @@ def compile_graph(
     clip: str | None = None,
     recording: Recording | None = None,
 ) -> Plan:
-    """Fill a camera's source and graph with what belongs to the camera.
+    """Fill the placeholders of a camera's source and graph.
 
     media      the vehicle's RTSP server
     index      number of the camera in its vehicle, for ports
-    clip       path of the rendered clip, where the source renders one and it is there
-    recording  how `record` keeps what the source delivers
-    raises     ModelError for a placeholder that nothing fills, or a name that the source shares with what follows it
+    clip       path of the rendered clip, if the source renders one and it exists
+    recording  how `record` stores the source's frames
+    raises     ModelError for a placeholder without a value, or a name that the source shares with a later element
     """
     graph, source = camera.graph, camera.source
     recorder = recording.elements if recording else ()
@@ -205,7 +205,7 @@ def compile_graph(
 
 
 def check_video(graph: Graph) -> None:
-    """Whether both sides can write their video into a file.
+    """Check that both sides can write their video into a file.
 
     raises  ModelError
     """
@@ -218,9 +218,9 @@ def check_video(graph: Graph) -> None:
 
 
 def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
-    """What turning a knob to a value sets on which elements, in the order of the graph.
+    """The element properties that turning a knob to a value sets, in the order of the graph.
 
-    raises  ModelError where a knob's value kind does not fit the knob
+    raises  ModelError if the kind of value does not fit the knob
     """
     quantities = _quantities(camera, value)
     turned: list[Assignment] = []
@@ -236,7 +236,7 @@ def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]
 
 
 def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:
-    """Elements of a camera as they are built with these knobs turned; what a knob sets elsewhere is left out."""
+    """Elements of a camera as they are built with these knobs turned; settings of other elements are left out."""
     by_element: dict[str, dict[str, Value]] = {}
     for knob, value in knobs.items():
         for name, key, filled in assignments(camera, knob, value):
@@ -259,19 +259,19 @@ def rtsp_url(media: Endpoint, camera: str) -> str:
 
 
 def video_codec(graph: Graph) -> str:
-    """Codec of a graph as its elements name it (x264enc and rtph264pay, ...), or "" for others than `CODECS`."""
+    """Codec of a graph from the names of its elements (x264enc, rtph264pay, ...); "" if it is not in `CODECS`."""
     factories = [element.factory for element in (*graph.vehicle, *graph.operator)]
     return next((codec for codec in CODECS if any(codec in factory for factory in factories)), "")
 
 
 def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
-    """What a knob's value offers to its turns, by the word that the YAML uses."""
+    """The quantities that a knob's value offers to its turns, by their names in the YAML."""
     if isinstance(value, bool):
         return {"on": value, "off": not value}
     if isinstance(value, int):
         return {"kbps": value, "bps": value * 1000}
     if isinstance(value, Roi):
-        # The crop element sees the native picture; an ROI counts from the full image inside it.
+        # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size
         full = camera.crop or camera.full_roi
         left, top = full.x + value.x, full.y + value.y
@@ -298,7 +298,7 @@ def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> N
 
 
 def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> dict[str, Value]:
-    """What the placeholders of a camera's source and graph stand for."""
+    """The values of the placeholders of a camera's source and graph."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
     square = "pixel-aspect-ratio=1/1"

@@ -1,7 +1,7 @@
 """Compile a sequence and a camera's graph into one GStreamer line with many encoders. Pure text.
 
-Each lane is the live line of both sides with the wire cut out: what the vehicle does to a frame from the crop to the
-payloader, followed at once by what the operator does to a packet up to the decoder.
+Each lane is the live line of both sides with the wire cut out: the vehicle's elements from the crop to the
+payloader, followed directly by the operator's elements up to the decoder.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from runner.core.model import Element, ModelError, Roi
 from runner.core.scaling import output_size
 from runner.graph import Plan, launch, turn_elements
 
-FRAMES = "frames"  # the tee that has every frame of the sequence
+FRAMES = "frames"  # the tee that passes every frame of the sequence
 QUEUE = "queue max-size-buffers=3 max-size-bytes=0 max-size-time=0"
 SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=true sync=false async=false max-buffers=2"
 
@@ -30,7 +30,7 @@ class Lane:
 
 @dataclass(frozen=True, slots=True)
 class LaneNames:
-    """Elements of one lane as the line names them."""
+    """Names of a lane's elements in the line."""
 
     encoder: str
     counter: str
@@ -39,7 +39,7 @@ class LaneNames:
 
 @dataclass(frozen=True, slots=True)
 class LaneSet:
-    """A line to run and what to watch in it."""
+    """A line to run and the elements to watch in it."""
 
     line: str
     fps: Fraction
@@ -50,9 +50,9 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane]) -> L
     """One line for some lanes of a camera.
 
     plan    the camera at the size and rate of the sequence
-    decode  the line that makes I420 frames of the sequence
+    decode  the line that decodes the sequence to I420 frames
     roi     part of the full image that is encoded
-    raises  ModelError where the graph's bitrate knob names no element that frames pass
+    raises  ModelError if the graph's bitrate knob names no element that frames pass through
     """
     before, behind = cut(plan)
     factors = sorted({lane.scaling for lane in lanes})
@@ -69,14 +69,14 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane]) -> L
 
 
 def fragment(plan: Plan, roi: Roi, lane: Lane) -> str:
-    """What makes one lane's pictures, as text that any change of graph or settings changes."""
+    """The elements that produce a lane's pictures, as text: any change of graph or settings changes it."""
     before, behind = cut(plan)
     knobs: dict[str, KnobValue] = {"roi": roi, "size": output_size(roi, lane.scaling), "bitrate": lane.kbps}
     return launch(turn_elements(plan.camera, (*before, *behind), knobs))
 
 
 def cut(plan: Plan) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
-    """The live line without its wire, up to the encoder and from it on."""
+    """The live line without its wire: the part before the encoder, and the part from it on."""
     vehicle = plan.vehicle if plan.serves else plan.vehicle[:-1]
     at = next(i for i, element in enumerate(vehicle) if element.name == encoder(plan))
     operator = plan.operator[1:-1]
@@ -95,7 +95,7 @@ def encoder(plan: Plan) -> str:
 
 
 def _counter(plan: Plan) -> str:
-    """The identity that counts coded bytes: the one behind the encoder, else the operator's."""
+    """The identity that counts encoded bytes: the one after the encoder, otherwise the operator's."""
     return "sent" if any(element.name == "sent" for element in plan.vehicle) else "received"
 
 

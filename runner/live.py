@@ -1,4 +1,4 @@
-"""Public: a vehicle that streams, for programs, see docs/sources.md."""
+"""Public: a streaming vehicle, for programs, see docs/sources.md."""
 
 from runner.vehicle.live import LiveVehicle, live_vehicle
 

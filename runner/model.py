@@ -1,4 +1,4 @@
-"""Public: types of what a rule is given, see docs/rules.md."""
+"""Public: types that are passed to a rule, see docs/rules.md."""
 
 from runner.core.model import Camera, Kbps, Mode, RateQualityModel, Roi, Vehicle
 

@@ -9,7 +9,7 @@ from runner.graph import Plan, compile_graph
 
 
 def compile_plans(vehicle: Vehicle) -> list[Plan]:
-    """A plan for each camera, with its rendered clip where there is one."""
+    """A plan for each camera, with its rendered clip if there is one."""
     return [
         compile_graph(camera, vehicle.media, index, clip=rendered(camera), recording=vehicle.recording)
         for index, camera in enumerate(vehicle.cameras.values())

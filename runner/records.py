@@ -1,9 +1,9 @@
-"""What both sides publish and log: state, telemetry, replies, samples, lines of a drive. Pure.
+"""Records that both sides publish and log: state, telemetry, replies, samples, lines of a drive. Pure.
 
-Each record is a frozen dataclass whose fields are the keys of its JSON, which is made and read here and nowhere else;
+Each record is a frozen dataclass whose fields are the keys of its JSON; only this module writes and reads that JSON;
 schemas/control.schema.json and schemas/drive.schema.json describe the same records. Bitrates are kbit/s, sizes px,
-times s. `t` counts from the beginning of the run or of the log that holds the record; at an operator's station, which
-has no such beginning, from 1970.
+times s. `t` counts from the start of the run or of the log that holds the record; at an operator's station, which
+has no such start, from 1970.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from runner.core.model import Mode, Roi, plain
 
 Number = int | float
 Json = dict[str, Any]
-Applied = Mapping[str, Any]  # by knob, the value that was read back; a camera without a pipeline has none
+Applied = Mapping[str, Any]  # by knob, the value read back; empty for a camera without a pipeline
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the vehicle is: degrees (WGS-84), and where it is known the speed in m/s and the course in degrees."""
+    """Position of the vehicle: degrees (WGS-84), and if known the speed in m/s and the course in degrees."""
 
     lat: float
     lon: float
@@ -41,12 +41,12 @@ class Position:
         return cls(event.lat, event.lon, **{key: value for key, value in known.items() if value is not None})
 
 
-# --- what is decided --------------------------------------------------------------------------------------------------
+# --- decisions --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class CameraDecision:
-    """What is decided for one camera, see `runner.core.decision.Setting`."""
+    """The decision for one camera, see `runner.core.decision.Setting`."""
 
     on: bool
     sending: bool
@@ -65,7 +65,7 @@ class CameraDecision:
 
 @dataclass(frozen=True, slots=True)
 class DecisionMade:
-    """Line of a log: a decision, what caused it, and the commands that followed from it."""
+    """Log line: a decision, its cause, and the resulting commands."""
 
     t: float
     cause: str
@@ -86,7 +86,7 @@ class DecisionMade:
 
 @dataclass(frozen=True, slots=True)
 class CameraState(CameraDecision):
-    """What is decided for one camera, what of it was read back as applied, and what is wrong with its source."""
+    """The decision for one camera, the values read back as applied, and the fault of its source, if any."""
 
     weight: Number
     applied: Applied
@@ -101,7 +101,7 @@ class CameraState(CameraDecision):
 class VehicleState:
     """State of a vehicle that is online.
 
-    cause  the event that the decision came from
+    cause  the event that triggered the decision
     fault  why the rules could not decide, so that an earlier decision stays in force
     """
 
@@ -116,7 +116,7 @@ class VehicleState:
 
 @dataclass(frozen=True, slots=True)
 class Offline:
-    """Line of an operator's log: the vehicle is offline."""
+    """Operator log line: the vehicle is offline."""
 
     t: float
     online: bool = False
@@ -124,7 +124,7 @@ class Offline:
 
 @dataclass(frozen=True, slots=True)
 class CameraTelemetry:
-    """What was read back as applied, and what the encoder has put out since its pipeline was built."""
+    """Values read back as applied, and the encoder's output since its pipeline was built."""
 
     applied: Applied
     frames: int
@@ -133,9 +133,9 @@ class CameraTelemetry:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Measured on the vehicle, a few times a second: also its sign of life.
+    """Measured on the vehicle, a few times a second: also its heartbeat.
 
-    refused  requests since the start
+    refused  requests refused since the start
     errors   exceptions that the control loop survived since the start
     """
 
@@ -149,7 +149,7 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a request: applied, refused, expired or timed out, and why."""
+    """Outcome of a request: applied, refused, expired or timed out, and why."""
 
     t: float
     result: str
@@ -165,7 +165,7 @@ class Reply(Outcome):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the configurations of both sides must agree on, by path; `run` distinguishes vehicles of one name."""
+    """Settings on which both sides' configurations must agree, by path; `run` distinguishes vehicles of one name."""
 
     run: str
     settings: Mapping[str, Any]
@@ -176,13 +176,13 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class CameraSample:
-    """What comes of one camera. Rates are those of the last second, counters run since the start.
+    """Reception of one camera. Rates cover the last second, counters run since the start.
 
-    lost        RTP packets that never came
-    foreign     packets that came from elsewhere than the vehicle and were dropped
-    rebuilt     how often the receiver's pipeline was built anew
-    latency_ms  capture to decode of the last frame looked at; None: unknown
-    arrivals    of each access unit since the sample before, in a log: time, and ms since its capture if known
+    lost        RTP packets that never arrived
+    foreign     packets from senders other than the vehicle, dropped
+    rebuilt     how often the receiver's pipeline was rebuilt
+    latency_ms  capture to decode of the last sampled frame; None: unknown
+    arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
     """
 
     fps: float
@@ -205,8 +205,8 @@ class CameraSample:
 class Sample:
     """What the operator's side measures a few times a second.
 
-    dropped         messages of the control link that were none
-    clock_ahead_ms  by how much the vehicle's clock is ahead at least; None: not detected
+    dropped         invalid messages on the control link
+    clock_ahead_ms  how far the vehicle's clock is ahead, at least; None: not detected
     """
 
     t: float
@@ -220,12 +220,12 @@ class Sample:
     clock_ahead_ms: float | None = None
 
 
-# --- other lines of a log ---------------------------------------------------------------------------------------------
+# --- other log lines --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """First line of a log: what was driven with what. `time`: its beginning, s since 1970."""
+    """First line of a log: side, versions and configuration. `time`: its start, s since 1970."""
 
     t: float
     side: str
@@ -237,7 +237,7 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What a person should know."""
+    """A note for the user."""
 
     t: float
     text: str
@@ -245,7 +245,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class VideoBegan:
-    """A video file has its first frame, captured then, s since 1970."""
+    """A video file has started; `captured`: capture time of its first frame, s since 1970."""
 
     t: float
     camera: str
@@ -255,7 +255,7 @@ class VideoBegan:
 
 @dataclass(frozen=True, slots=True)
 class LinkSample:
-    """A limited link: its rate, the wait of a packet, and what it has passed on and dropped so far."""
+    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded and dropped so far."""
 
     t: float
     kbps: float
@@ -267,7 +267,7 @@ class LinkSample:
 
 @dataclass(frozen=True, slots=True)
 class LinesDropped:
-    """So many lines were not written, since the disk was too slow."""
+    """Number of lines that were not written because the disk was too slow."""
 
     t: float
     lines: int
@@ -318,7 +318,7 @@ def to_json(record: Any) -> Json:
 
 
 def from_json(kind: type[T], document: Mapping[str, Any]) -> T:
-    """The record that a JSON object describes which satisfies its schema.
+    """The record described by a JSON object that satisfies its schema.
 
     raises  msgspec.ValidationError, a ValueError
     """
@@ -331,13 +331,13 @@ def state_to_json(state: VehicleState | None) -> Json:
 
 
 def line_to_json(record: Record) -> Json:
-    """A record as a line of a log."""
+    """A record as a log line."""
     document = to_json(record)
     return {"t": document.pop("t"), "log": KINDS[type(record)], **document}
 
 
 def line_from_json(document: Mapping[str, Any]) -> Record:
-    """The record that a line of a log describes which satisfies its schema."""
+    """The record described by a log line that satisfies its schema."""
     kind = _BY_KIND[document["log"]]
     record: Record = from_json(Offline if kind is VehicleState and not document["online"] else kind, document)
     return record
@@ -347,13 +347,13 @@ _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if 
 
 
 def decision_to_json(decision: Decision) -> Json:
-    """The JSON object of a decision; no record in between, since a replay writes thousands in a second."""
+    """The JSON object of a decision; no intermediate record, since a replay writes thousands per second."""
     cameras = {name: _decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
     return {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
 
 
 def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
-    """Where a camera's knobs are, by name."""
+    """Current values of a camera's knobs, by name."""
     return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
 
 

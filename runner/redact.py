@@ -1,4 +1,4 @@
-"""Addresses without their passwords, for everything that is shown, logged or kept."""
+"""Remove passwords from addresses in everything that is shown, logged or stored."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 _USER = re.compile(r"(?<=://)[^/?#\s]*@")  # userinfo of RFC 3986, section 3.2.1
-_NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']+")  # in a query; of rtspsrc
+_NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']+")  # in a query; property of rtspsrc
 
 
 def redacted(value: T) -> T:
-    """A text, or a document with texts in it, in which `user:password@` of addresses is left out."""
+    """A text, or a document containing texts, with `user:password@` removed from addresses."""
     found: Any = value
     if isinstance(value, str):
         found = _NAMED.sub(r"\1=***", _USER.sub("", value))

@@ -1,4 +1,4 @@
-"""Public: what a rule of your own imports, see docs/rules.md."""
+"""Public: what your own rules import, see docs/rules.md."""
 
 from runner.core.decision import Draft
 from runner.core.rules import Memory, Step, rule

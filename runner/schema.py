@@ -1,7 +1,7 @@
-"""Check documents against the JSON Schemas in schemas/ and say what is wrong as a person would.
+"""Check documents against the JSON Schemas in schemas/ and report problems in plain words.
 
-Two libraries share the work: jsonschema-rs decides whether a document is valid, a hundred times faster than jsonschema,
-which lists the errors of one that is not.
+Two libraries share the work: jsonschema-rs checks whether a document is valid, a hundred times faster than jsonschema,
+which lists the errors of an invalid one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Path = tuple[str | int, ...]
 DEEPEST_JSON = 32  # levels; a composed configuration has ten
 LONGEST_SHOWN = 80  # characters of a value in a message
 _BASE = "json-schema:///"
-LONGEST_WHOLE = 300  # digits; what is written out again as a float must fit into one
+LONGEST_WHOLE = 300  # digits; a number that is written out again as a float must fit into one
 
 _TYPES = {
     "integer": "a whole number",
@@ -39,13 +39,13 @@ _TYPES = {
 _PATTERNS = {
     "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
     "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
-    r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation, in the place of one
+    r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation in its place
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What breaks a rule, and where in the document; `found` is None where the path already shows it."""
+    """A violated rule and its place in the document; `found` is None if the path already shows it."""
 
     path: Path
     found: str | None
@@ -53,15 +53,15 @@ class Finding:
 
     @property
     def meant(self) -> Path:
-        """The path that was probably meant where a key is misspelt; else its own."""
+        """The path that was probably meant if a key is misspelt; otherwise its own."""
         _, misspelt, key = self.rule.rpartition("did you mean ")
         return (*self.path[:-1], key.rstrip("?")) if misspelt and self.found is None else self.path
 
 
 def findings(document: Any, schema: str) -> list[Finding]:
-    """All that is wrong with a document, in the order of the document; empty: it is valid.
+    """All problems of a document, in document order; empty: it is valid.
 
-    schema  name of a file in schemas/ without its ending
+    schema  name of a file in schemas/ without its extension
     """
     odd = list(_unrepresentable(document, ()))
     seen = {f.path for f in odd}
@@ -71,13 +71,13 @@ def findings(document: Any, schema: str) -> list[Finding]:
 
 
 def dotted(path: Path) -> str:
-    """A path as people write it: cameras.front_left.rate_quality.scaling[2]."""
+    """A path in the usual notation: cameras.front_left.rate_quality.scaling[2]."""
     text = "".join(f".{part}" if not isinstance(part, int) or isinstance(part, bool) else f"[{part}]" for part in path)
     return text.removeprefix(".")
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in YAML, cut where it is long."""
+    """A value as written in YAML, shortened if it is long."""
     return shortened(repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str))
 
 
@@ -87,7 +87,7 @@ def shortened(text: str) -> str:
 
 @cache
 def _compiled(reference: str) -> Any:
-    """Validator of what a reference names, by jsonschema-rs; relative references need a base there."""
+    """The jsonschema-rs validator for a reference; relative references need a base there."""
     from jsonschema_rs import Draft202012Validator
 
     return Draft202012Validator({"$ref": f"{_BASE}{reference}"}, registry=_compiled_registry())
@@ -103,7 +103,7 @@ def _compiled_registry() -> Any:
 def _is_valid(reference: str, document: Any) -> bool:
     try:
         return bool(_compiled(reference).is_valid(document))
-    except ValueError:  # no JSON: a key that is not text, or nested too deeply
+    except ValueError:  # not JSON: a key that is not text, or nested too deeply
         return False
 
 
@@ -119,7 +119,7 @@ def _validator(reference: str) -> Draft202012Validator:
 
 @cache
 def _draft() -> type[Draft202012Validator]:
-    """JSON Schema 2020-12, whose patterns are those of ECMA-262: $ is the end, and not also before a last newline."""
+    """JSON Schema 2020-12 with the patterns of ECMA-262: $ matches only the end, not before a trailing newline."""
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
     from jsonschema.validators import extend
@@ -133,7 +133,7 @@ def _draft() -> type[Draft202012Validator]:
 
 
 def referred(reference: str, schema: str) -> tuple[Any, str]:
-    """What a reference in a schema refers to, and the name of the schema that holds it."""
+    """The target of a reference in a schema, and the name of the schema that holds it."""
     file, _, pointer = reference.partition("#")
     home = file.removesuffix(".schema.json") or schema
     found: Any = schema_document(home)
@@ -143,9 +143,9 @@ def referred(reference: str, schema: str) -> tuple[Any, str]:
 
 
 def read_json(text: str | bytes) -> Any:
-    """A JSON document that comes from outside, its numbers finite: NaN, Infinity and 1e999 are none.
+    """A JSON document from outside; its numbers must be finite: NaN, Infinity and 1e999 are rejected.
 
-    raises  ValueError, also for what is nested deeper than any message of ours
+    raises  ValueError, also if it is nested deeper than any of our messages
     """
     try:
         document = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
@@ -204,7 +204,7 @@ def log_problem(document: Mapping[str, Any]) -> str | None:
 
 
 def message_problem(kind: str, document: Any) -> str | None:
-    """The problems of a message of the vehicle, in one line; None if it is valid."""
+    """The problems of a message from the vehicle, in one line; None if it is valid."""
     return _in_one_line(f"control.schema.json#/$defs/{kind}", document)
 
 
@@ -235,7 +235,7 @@ def _registry() -> Any:
     from referencing.jsonschema import DRAFT202012
 
     def resource(name: str) -> Any:
-        # A $schema of its own would make jsonschema go on with its own class in place of `_draft`.
+        # With its own $schema, jsonschema would continue with its own class instead of `_draft`.
         content = {key: value for key, value in schema_document(name).items() if key != "$schema"}
         return DRAFT202012.create_resource(content)
 
@@ -243,7 +243,7 @@ def _registry() -> Any:
 
 
 def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
-    """What YAML can say and JSON Schema cannot speak of: keys that are no text, numbers that are none."""
+    """What YAML can express and JSON Schema cannot check: keys that are not text, numbers that are not finite."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if isinstance(key, str):
@@ -286,7 +286,7 @@ def _explain(error: Any) -> Iterator[Finding]:
                 if key not in value:
                     yield Finding((*path, key), "missing", "must be given")
         case "anyOf":
-            # Of several forms the one that was meant is the one of the right type.
+            # Of several forms, the one of the right type was meant.
             meant = [inner for inner in error.context if inner.validator != "type"]
             yield from _explain((meant or error.context)[0])
         case "propertyNames" | "not" | "if":

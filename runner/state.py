@@ -1,4 +1,4 @@
-"""Public: the state that a rule is given, see docs/rules.md."""
+"""Public: the state that is passed to a rule, see docs/rules.md."""
 
 from runner.core.state import State
 

@@ -1,4 +1,4 @@
-"""What the configurations of both sides must agree on, and where they do not. Pure."""
+"""Settings on which both sides' configurations must agree, and their differences. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from runner.schema import Path, dotted, shown
 
 SECTIONS = ("name", "fps_max", "cameras", "graph")
-# Of a camera, what belongs to one side alone: where its frames come from, where its tile stands.
+# Camera keys that concern one side only: the source of its frames, the place of its tile.
 OWN = ("source", "device", "address", "clip", "place", "pose", "fov_deg", "lens")
 NAMED = 3  # differences that a message names
 
@@ -21,7 +21,7 @@ def settings(document: Mapping[str, Any]) -> SettingsByPath:
 
 
 def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str | None:
-    """The differences of the operator's configuration and the vehicle's, in one line; None if they agree."""
+    """The differences between the operator's configuration and the vehicle's, in one line; None if they agree."""
     paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
     parts = [
         f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]

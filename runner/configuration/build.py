@@ -1,4 +1,4 @@
-"""From plain data to a `Vehicle`: what the schemas accept is built, and every problem is gathered."""
+"""From plain data to a `Vehicle`: parts that the schemas accept are built, and all problems are collected."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from runner.system.files import file_problem
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
-CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # what the schema asks of a camera, given by its kind
+CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
 GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "wire", "knobs", "mutable")
 
 T = TypeVar("T")
@@ -53,18 +53,18 @@ PlanCheck = Callable[[Plan], Iterable[ModelError]]
 
 @dataclass
 class Builder:
-    """Builds model objects from plain data and gathers what is wrong with it; None stands for what could not be built.
+    """Builds model objects from plain data and collects its problems; None stands for an object that was not built.
 
-    Parts that the schema refuses are not built, so that one mistake is reported once.
+    Parts that the schema rejects are not built, so that one mistake is reported once.
     """
 
     composed: Composed
     runnable: bool
     check: PlanCheck | None
-    fits: Collection[str] = ()  # sections that the schemas accept, as is known already
+    fits: Collection[str] = ()  # sections already known to satisfy the schemas
     problems: list[Problem] = field(default_factory=list)
     bad: set[schema.Path] = field(default_factory=set)
-    broken: dict[schema.Path, Problem] = field(default_factory=dict)  # rules of the model, by path
+    broken: dict[schema.Path, Problem] = field(default_factory=dict)  # broken rules of the model, by path
     built: set[str] = field(default_factory=set)  # names of the cameras
     vehicle: Vehicle | None = None
     others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
@@ -122,7 +122,7 @@ class Builder:
         )
 
     def finished(self, built: T | None) -> T:
-        """What was built, if nothing was wrong."""
+        """The built object, if there were no problems."""
         if built is None or self.problems:
             raise ConfigError(self.problems)
         return built
@@ -130,11 +130,11 @@ class Builder:
     # --- problems -----------------------------------------------------------------------------------------------------
 
     def fine(self, *path: str | int) -> bool:
-        """Whether the schema found nothing wrong at or below a path, nor with what it is a part of."""
+        """Whether the schema found no problem at, below or above a path."""
         return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
 
     def _without_repeats(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
-        """A name below cameras that no kind is mounted under is one mistake, not many missing keys."""
+        """A name below cameras without a mounted kind is one mistake, not many missing keys."""
         missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
         unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
         for path in sorted(unmounted, key=str):
@@ -159,10 +159,10 @@ class Builder:
         self.problems.append(self.broken[where])
 
     def _attribute_problems(self) -> None:
-        """Tell a rule that joins several values of the file or override whose word broke it.
+        """Attribute a broken rule that joins several values to the file or override that broke it.
 
-        The value that the rule names may stand in a file that is right by itself: leave out one by one the parts stated
-        after it, and see without which the rule holds.
+        The value that the rule names may be in a file that is correct by itself: leave out the later parts one by one
+        and see without which one the rule holds.
         """
         for where, problem in list(self.broken.items()):
             for part in self.composed.later_parts(where):
@@ -205,7 +205,7 @@ class Builder:
     def _camera(self, name: str) -> Camera | None:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
-        # Parts that the schema accepts are looked at further, whatever is wrong beside them.
+        # Parts that the schema accepts are checked further, whatever is wrong elsewhere.
         graph = self.part(self._of(name, "graph"), _graph)
         source = self.part(self._of(name, "source"), _source)
         model = self.part((*path, "rate_quality"), _rate_quality)
@@ -235,7 +235,7 @@ class Builder:
         )
 
     def part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
-        """What a part of the document describes, if the schema accepts it."""
+        """The object that a part of the document describes, if the schema accepts it."""
         if not self.fine(*path):
             return None
         data: Any = self.composed.document
@@ -244,7 +244,7 @@ class Builder:
         return self.attempt(path, lambda: make(data))
 
     def check_link(self, kind: str) -> None:
-        """Whether all cameras go through a limited link of a kind."""
+        """Check that all cameras can use a limited link of a kind."""
         cameras = self.vehicle.cameras.values() if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling:
@@ -252,7 +252,7 @@ class Builder:
             self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
 
     def _check_inputs(self, camera: Camera) -> None:
-        """Whether the clip, device or address that a camera's source asks for is named, and a clip is there."""
+        """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""
         source = camera.source
         for key in () if source.render else sorted(source.needs.intersection(MOUNT_KEYS)):
             where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
@@ -263,10 +263,10 @@ class Builder:
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
     def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
-        """Whether everything that source, graph and recording refer to is there."""
+        """Check that everything that source, graph and recording refer to exists."""
         anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
         try:
-            # One name for all: what differs in nothing else need not be checked against the registry again.
+            # One name for all: plans that differ in nothing else need not be checked against the registry again.
             plan = compile_graph(replace(camera, name="camera", mount=anything), media, index, recording=recording)
             for knob, value in SAMPLE_KNOBS.items():
                 assignments(camera, knob, value)
@@ -280,12 +280,12 @@ class Builder:
             self._report(self._of(camera.name, section), ModelError(key, error.found, error.rule))
 
     def _of(self, camera: str, section: str) -> schema.Path:
-        """Where a camera's graph or source stands: its own one, else the one of all."""
+        """Path of a camera's graph or source: its own one, otherwise the common one."""
         data = self.composed.document["cameras"][camera]
         return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
-        """No two listeners on one port. Cameras count on from the first port of their graph."""
+        """No two listeners on one port. Cameras count up from the first port of their graph."""
         taken: dict[int, str] = {}
         for path, port in servers.items():
             if port in taken:
@@ -301,7 +301,7 @@ class Builder:
 
 
 def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """Those of some keys that the configuration states; the model has a default for each of the others."""
+    """Those keys that the configuration states; the model has a default for each of the others."""
     return {key: data[key] for key in keys if key in data}
 
 
@@ -362,7 +362,7 @@ def _recording(data: Mapping[str, Any]) -> Recording:
 
 
 def _split(key: str) -> schema.Path:
-    """The path that a dotted key means: a.b[1].c."""
+    """The path of a dotted key: a.b[1].c."""
     parts: list[str | int] = []
     for piece in filter(None, key.replace("]", "").replace("[", ".#").split(".")):
         parts.append(int(piece[1:]) if piece[0] == "#" else piece)

@@ -1,8 +1,8 @@
-"""Configurations that differ in the files they choose, with each file composed once where that is enough.
+"""Configurations that differ in the files they choose, with each file composed only once if possible.
 
-Hydra merges key by key: a file that keeps to the section of its group composes to the same section whatever is chosen
-beside it. All such files are composed in one go, each in a package of its own, and a configuration that chooses some of
-them is made of their sections. What reaches further, by a package, a choice or an interpolation, is composed each time.
+Hydra merges key by key: a file limited to the section of its group composes to the same section whatever else is
+chosen. All such files are composed in one go, each in its own package; a configuration that chooses some of them is
+made of their sections. Files that reach further, by a package, a choice or an interpolation, are composed each time.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ Choices = Mapping[str, str]  # file by group
 
 
 def words_of(choices: Choices) -> tuple[str, ...]:
-    """The overrides that make some choices."""
+    """The overrides for some choices."""
     places = {"cameras": f"+cameras@cameras.{MOUNT}"}
     return tuple(f"{places.get(group, group)}={option}" for group, option in choices.items())
 
 
 def reaches(path: Path) -> set[str]:
-    """Groups other than its own whose choice may matter to a file: it refers to them, chooses of them or fills them.
+    """Groups other than its own whose choice may affect a file: it refers to them, chooses from them or fills them.
 
-    raises  ConfigError where it cannot be read
+    raises  ConfigError if it cannot be read
     """
     content, package = read(path)
     own = path.parent.name
@@ -52,7 +52,7 @@ def reaches(path: Path) -> set[str]:
 
 
 class Combinations:
-    """Some overrides together with files of a user and packaged ones.
+    """Overrides combined with user and packaged files.
 
     choices  groups and files that will be chosen
     """
@@ -60,15 +60,15 @@ class Combinations:
     def __init__(self, overrides: Sequence[str], user: Path | None, choices: Iterable[tuple[str, str]]) -> None:
         self.overrides, self._user = tuple(overrides), user
         self._root = find_file(conf_directories(user), "", "config")
-        named = any(word.lstrip("+~").startswith("name") for word in overrides)  # which the vehicle's file does, too
+        named = any(word.lstrip("+~").startswith("name") for word in overrides)  # as the vehicle's file does, too
         groups = (*SECTIONS, "cameras", *(() if named else ("vehicle",)))
         self._picks = [choice for choice in choices if choice[0] in groups]
         self._sections: dict[tuple[str, str], Any] = {}
 
     def assembled(self, choices: Choices) -> Composed | None:
-        """The same document made of sections that are composed already; None where it has to be composed.
+        """The same document, assembled from sections already composed; None if it has to be composed.
 
-        It does not know where its values come from: compose what is wrong.
+        It does not record where its values come from: compose an invalid one to find out.
         """
         base = self._base
         own = {group: self._sections.get((group, option)) for group, option in choices.items()}
@@ -82,22 +82,22 @@ class Combinations:
 
     @cached_property
     def _base(self) -> dict[str, Any] | None:
-        """What the overrides alone compose to, and with it the sections of all files."""
+        """The configuration of the overrides alone; also composes the sections of all files."""
         try:
             return self._picked(self._picks)
-        except ConfigError:  # of one of them; the others are composed by themselves
+        except ConfigError:  # in one of them; the others are composed one by one
             pass
         try:
             base = self._picked([])
         except ConfigError:
             return None
         for pick in self._picks if base else ():
-            with suppress(ConfigError):  # composed with its own choices it is reported
+            with suppress(ConfigError):  # reported when it is composed with its own choices
                 self._picked([pick])
         return base
 
     def _picked(self, picks: Sequence[tuple[str, str]]) -> dict[str, Any] | None:
-        """Keep the sections of some files; returns what is composed beside them, None where that reaches further."""
+        """Store the sections of some files; returns the rest of the configuration, None if that reaches further."""
         packages = {pick: f"{PICKED}{index}" for index, pick in enumerate(picks)}
         words = [f"+{group}@{package}={option}" for (group, option), package in packages.items()]
         composed = compose([*self.overrides, *words], self._user)
@@ -110,7 +110,7 @@ class Combinations:
         return document
 
     def _is_self_contained(self, part: Part) -> bool:
-        """Whether a file fills the section of its group only, and whatever else is chosen does not matter to it."""
+        """Whether a file fills the section of its group only, and does not depend on other choices."""
         if not stays_inside(part.content):
             return False
         if part.path is None:  # an override, which is part of everything

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 OF_THE_PLACE = ("place", "pose", "weight", "device", "address", "clip", "graph", "source")  # keys of a mount
-WHOLE = ("vehicle", "experiment")  # groups whose files speak of the whole document
-# Groups that Hydra composes for an application that it starts itself: a tenth of the time.
+WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
+# Groups that Hydra composes only for applications that it starts itself: a tenth of the time.
 HYDRAS_OWN = ("output", "launcher", "sweeper", "help", "hydra_help", "hydra_logging", "job_logging", "env")
-PACKAGE_HEADER = "# @package _global_"  # a vehicle's file speaks of the whole document
+PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
 
 
 def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
@@ -51,7 +51,7 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
 
 
 def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
-    """Whether files that speak of the whole document say so; Hydra would put them elsewhere without a word."""
+    """Check that files for the whole document say so; Hydra would silently put them elsewhere."""
     for file in (find_file(directories, group, choices[group]) for group in WHOLE if group in choices):
         if file.exists() and read(file).package != "_global_":
             rule = f"must begin with the line {PACKAGE_HEADER}"
@@ -59,12 +59,12 @@ def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> N
 
 
 def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: Path | None = None) -> Composed:
-    """A configuration that was composed before, with the user's overrides on top; a group's file replaces that part.
+    """A configuration composed before, with the user's overrides on top; a group's file replaces that part.
 
-    base    the document, as a drive keeps it; name: where it stands, for messages
+    base    the document, as stored with a drive; name: its location, for messages
     raises  ConfigError
 
-    What an earlier version did not state is as the packaged config.yaml states it.
+    Keys that an earlier version did not state are taken from the packaged config.yaml.
     """
     base = _completed(base)
     if not overrides:
@@ -101,7 +101,7 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str, Any]:
-    """Another kind of camera in the place of one that is mounted: what belongs to the place stays."""
+    """Another kind of camera in place of a mounted one: keys that belong to the place stay."""
     from omegaconf import OmegaConf
 
     before = OmegaConf.select(config, package) or {}
@@ -109,7 +109,7 @@ def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str
 
 
 def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iterator[tuple[str, Any]]:
-    """Keys that an override of a composed document sets, and to what."""
+    """Keys that an override of a composed document sets, and their values."""
     if override.deletes or override.is_none:
         return
     if not override.choice:
@@ -134,7 +134,7 @@ def _part(override: Override) -> Part:
 
 
 def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[DictConfig, dict[str, str]]:
-    """What Hydra composes, and by group the file that was chosen."""
+    """Hydra's composition, and by group the chosen file."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -144,7 +144,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
 
     from runner.configuration.hydra_files import search
 
-    # OmegaConf's own resolver for environment variables is not part of this language: a file alone defines its values.
+    # OmegaConf's resolver for environment variables is not supported: a file alone defines its values.
     OmegaConf.clear_resolver("oc.env")
     search(directories)
     root = find_file(directories, "", "config")
@@ -201,7 +201,7 @@ def _place(name: str) -> tuple[str, str]:
 
 
 def _chooser(key: str, directories: Sequence[Path]) -> str:
-    """The file whose defaults list speaks of a group and package most often, the user's files first."""
+    """The file whose defaults list mentions a group and package most often, the user's files first."""
 
     def times(of: tuple[Path, list[tuple[str, str]]]) -> int:
         return sum(chosen.removeprefix("/") == key for chosen, _ in of[1])
@@ -210,7 +210,7 @@ def _chooser(key: str, directories: Sequence[Path]) -> str:
 
 
 def _overriding(group: str, name: str, directories: Sequence[Path]) -> str:
-    """The file whose defaults list chooses a file of a group in place of another, or ""; Hydra names its reader."""
+    """The file whose defaults list overrides the choice of a group's file, or ""; Hydra names its reader."""
     for path, entries in defaults(directories):
         if any(key.replace(" /", " ") == f"override {group}" and value == name for key, value in entries):
             return label(path)

@@ -1,4 +1,4 @@
-"""One configuration: composed once, its parts checked and built when they are asked for."""
+"""One configuration: composed once, its parts checked and built on demand."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from runner.pqos.track import Track
     from runner.rate_quality.study import Study
 
-Base = tuple[dict[str, Any], str]  # a configuration composed before, and where it stands
+Base = tuple[dict[str, Any], str]  # a configuration composed before, and its location
 
 
 class Configuration:
-    """What files and overrides compose to.
+    """The configuration composed from files and overrides.
 
     composed  with the origin of each value
-    user      directory whose files shadow the packaged ones and may add any
-    runnable  check also what only a run needs: that clips, devices and addresses are named and files exist
-    check     what else may be wrong with a compiled plan: the GStreamer registry's view
-    fits      sections that the schemas accept, as is known already
+    user      directory whose files shadow the packaged ones and may add others
+    runnable  also check what only a run needs: clips, devices and addresses are named, and files exist
+    check     further check of a compiled plan, against the GStreamer registry
+    fits      sections already known to satisfy the schemas
 
     `vehicle()`, `pqos()`, `study()` and `experiment()` raise ConfigError with all problems of the vehicle and of the
-    parts asked for so far.
+    parts requested so far.
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class Configuration:
         return self._builder.finished(self._builder.vehicle)
 
     def pqos(self) -> tuple[Pqos, Track | None]:
-        """The source of predictions, and the drive that gives positions where no GPS does."""
+        """The source of predictions, and the drive that gives positions if no GPS does."""
         from runner.pqos import build_pqos
         from runner.pqos.track import build_track
 
         part = self._builder.part
         pqos = part(("pqos",), lambda settings: build_pqos(settings, self._bases))
-        # A map that cannot be read is reported once, though the drive goes through its points.
+        # A map that cannot be read is reported once, although the drive also uses its points.
         track = part(("pqos",), lambda settings: build_track(settings, self._bases)) if pqos else None
         return self._builder.finished(pqos), track
 
@@ -106,8 +106,8 @@ def configuration(
     """Compose files and overrides.
 
     overrides  Hydra overrides, as on the command line
-    base       what the overrides change; None: the packaged and the user's files
-    raises     ConfigError where they cannot be composed
+    base       configuration that the overrides change; None: the packaged and the user's files
+    raises     ConfigError if they cannot be composed
     """
     composed = recompose(*base, overrides, user) if base else compose(overrides, user)
     return Configuration(composed, user, runnable=runnable, check=check)

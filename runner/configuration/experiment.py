@@ -1,4 +1,4 @@
-"""A drive that anyone can repeat: how long, how often, over which link; the `experiment` and `link` sections."""
+"""A drive that anyone can repeat: its length, runs and link; the `experiment` and `link` sections."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
-STEP_S = 0.1  # at which the rate of a link follows a map
+STEP_S = 0.1  # interval at which the rate of a link follows a map
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Experiment:
 
     about       what it shows, in a sentence, or ""
     duration_s  length of each drive, s
-    claims      name of what a publication reports of such a drive, or ""
+    claims      name of the claims that a publication makes about such a drive, or ""
     runs        by name, the overrides that each of several drives adds; empty: one drive
     """
 
@@ -36,7 +36,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """A link of limited rate between the two sides: its kind, netns or relay, and what it does to packets."""
+    """A link of limited rate between the two sides: its kind, netns or relay, and how it limits packets."""
 
     kind: str
     limit: Limit
@@ -50,9 +50,9 @@ def read_experiment(data: Mapping[str, Any]) -> Experiment:
 def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> LinkSettings:
     """The link that the `link` section describes.
 
-    predicted  the rates that it follows where it names no file, see `truth`
+    predicted  the rates that it follows if it names no file, see `truth`
     bases      directories in which a relative file is looked up
-    raises     ModelError with the key, what was found and what is right
+    raises     ModelError with the key, the value found and the rule
     """
     rates = trace(find_file(data, "file", bases), data["loop"], exact(0)) if data["file"] else predicted
     share = float(data["share"])
@@ -64,15 +64,15 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
 
 
 def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
-    """What the source of predictions in the `pqos` section states for each moment and place, not looking ahead.
+    """The rate that the prediction source of the `pqos` section states for each time and place, without look-ahead.
 
-    raises  ModelError with the key, what was found and what is right
+    raises  ModelError with the key, the value found and the rule
     """
     return _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
 
 
 def _known(source: Pqos, track: Track | None) -> RateAtTime:
-    """What a source of predictions states for each moment of a drive; 0 where it states nothing."""
+    """The rate that a prediction source states for each time of a drive; 0 if it states none."""
     rates: list[Kbps] = []
 
     def kbps_at(t: float) -> Kbps:

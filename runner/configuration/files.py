@@ -1,4 +1,4 @@
-"""Where configuration files are, and which there are: the user's directory before the packaged one."""
+"""Locations and names of configuration files: the user's directory before the packaged one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording",
 
 
 def conf_directories(user: Path | None) -> list[Path]:
-    """Where configuration files are looked up, the user's directory first."""
+    """Directories in which configuration files are looked up, the user's first."""
     packaged = directory("conf")
     return [user, packaged] if user else [packaged]
 
@@ -30,20 +30,20 @@ def files(directories: Sequence[Path]) -> Iterator[Path]:
 
 
 def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
-    """The first file of that name; where there is none, the place where it would be."""
+    """The first file of that name; if there is none, the path where it would be."""
     candidates = [d / group / f"{name}.yaml" for d in directories]
     return next((path for path in candidates if path.exists()), candidates[0])
 
 
 def defaults(directories: Sequence[Path]) -> Iterator[tuple[Path, list[tuple[str, str]]]]:
-    """What the defaults list of each readable file chooses, as pairs of key and name; the user's files first."""
+    """The choices in the defaults list of each readable file, as pairs of key and name; the user's files first."""
     for path in files(directories):
         with suppress(ConfigError):
             yield path, chosen_by(path)
 
 
 def built_on(path: Path, directories: Sequence[Path]) -> set[Path]:
-    """A file, and those that its defaults list names, and theirs; one that cannot be read names none."""
+    """A file and, recursively, those that its defaults list names; one that cannot be read names none."""
     found, open_ends = set[Path](), [path]
     while open_ends:
         path = open_ends.pop()
@@ -58,16 +58,16 @@ def built_on(path: Path, directories: Sequence[Path]) -> set[Path]:
 
 
 def bases_of(path: Path) -> list[str]:
-    """Files of its own group that a file builds on; raises ConfigError where it cannot be read."""
+    """Files of its own group that a file builds on; raises ConfigError if it cannot be read."""
     content = load_file(path)
     entries = content.get("defaults") if isinstance(content, dict) else None
     return [entry for entry in entries or () if isinstance(entry, str) and entry != "_self_"]
 
 
 def chosen_by(path: Path) -> list[tuple[str, str]]:
-    """What the defaults list of a file chooses, as pairs of key and name.
+    """The choices in the defaults list of a file, as pairs of key and name.
 
-    raises  ConfigError where it cannot be read
+    raises  ConfigError if it cannot be read
     """
     content = load_file(path)
     entries = content.get("defaults") if isinstance(content, dict) else None

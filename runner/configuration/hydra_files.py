@@ -25,7 +25,7 @@ class CheckedFiles(FileConfigSource):
         return SCHEME
 
     def is_config(self, config_path: str) -> bool:
-        """Whether there is anything of that name; `load_config` reports why it cannot be read."""
+        """Whether anything of that name exists; `load_config` reports why it cannot be read."""
         return (Path(self.path) / self._normalize_file_name(config_path)).exists()
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -46,7 +46,7 @@ class Directories(SearchPathPlugin):
 
 
 def search(directories: Sequence[Path]) -> None:
-    """Let Hydra look in these directories, the first one first."""
+    """Let Hydra search these directories, the first one first."""
     Directories.directories = directories
     for plugin in (CheckedFiles, Directories):
         Plugins.instance().register(plugin)

@@ -1,4 +1,4 @@
-"""What interpolations, ${a.b}, refer to, and how large a configuration gets when they are written out."""
+"""The targets of interpolations, ${a.b}, and the size of a configuration when they are expanded."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from runner.schema import Path
 
 _REFERENCE = re.compile(r"\$\{(\.*)([^${}:]+)\}")  # leading dots, key; the innermost of nested ones
 _STEP = re.compile(r"[^.\[\]]+")
-CHARACTERS = 100  # of text that count as a value
+CHARACTERS = 100  # of text that count as one value
 
 
 def references(text: str, path: Path) -> Iterator[Path]:
-    """The paths that the interpolations in a text refer to; path: where the text stands, for relative ones."""
+    """The paths that the interpolations in a text refer to; path: location of the text, for relative ones."""
     for dots, key in _REFERENCE.findall(text):
         above = path[: -len(dots)] if dots else ()
         yield (*above, *(int(step) if step.isdigit() else step for step in _STEP.findall(key)))
@@ -32,7 +32,7 @@ def stays_inside(content: Any, path: Path = ()) -> bool:
 
 
 def value_at(document: Any, path: Path, otherwise: Any = None) -> Any:
-    """The value at a path of a document, or else what is given for none."""
+    """The value at a path of a document; `otherwise` if there is none."""
     for key in path:
         if isinstance(document, dict):
             known = next((each for each in (key, str(key)) if each in document), None)  # overrides name an entry a.0
@@ -45,16 +45,16 @@ def value_at(document: Any, path: Path, otherwise: Any = None) -> Any:
 
 
 def spliced(written: Any, resolved: Any) -> tuple[Any, dict[Path, Path]]:
-    """A resolved document in which the entries of a list take the place of an interpolation that stands for the list.
+    """A resolved document in which an interpolation that refers to a list is replaced by the entries of the list.
 
     written   the document before its interpolations were resolved
     resolved  the same afterwards
-    returns   the document, and by path in it where the entries of such lists are written
+    returns   the document, and by path in it, where the entries of such lists are written
     """
     moved: dict[Path, Path] = {}
 
     def followed(path: Path, kind: type) -> Path:
-        """Where a value of a kind is written that a path leads to."""
+        """Where the value of a kind to which a path leads is written."""
         text = value_at(written, path)
         target = next(references(text, path), path) if isinstance(text, str) else path
         return followed(target, kind) if target != path and isinstance(value_at(resolved, target), kind) else path
@@ -85,10 +85,10 @@ def spliced(written: Any, resolved: Any) -> tuple[Any, dict[Path, Path]]:
 
 
 def written_out(document: Any, most: int) -> bool:
-    """Whether a document holds at most so many values with its interpolations written out.
+    """Whether a document holds at most `most` values with its interpolations expanded.
 
-    Each value counts once for every place that it is referred to from, directly or through others: a dozen short lines
-    that double each other make millions.
+    Each value counts once for every place that refers to it, directly or indirectly: a dozen short lines that double
+    each other make millions.
     """
     try:
         return _Sizes(document).of(()) <= most
@@ -97,7 +97,7 @@ def written_out(document: Any, most: int) -> bool:
 
 
 class _Sizes:
-    """Values below each path, counted once. A cycle counts as nothing: OmegaConf reports it."""
+    """Number of values below each path, counted once. A cycle counts as 0: OmegaConf reports it."""
 
     def __init__(self, document: Any) -> None:
         self._document = document

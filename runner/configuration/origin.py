@@ -1,4 +1,4 @@
-"""Which file or override each value of a composed configuration came from. Pure."""
+"""Which file or override each value of a composed configuration comes from. Pure."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from runner import schema
 from runner.configuration.interpolation import value_at
 from runner.errors import Problem
 
-PICKED = "picked"  # package, or how its name begins, in which a group's file is composed alone
-GRAPH_PARTS = {"encoder": "vehicle", "sender": "vehicle", "receiver": "operator"}  # and the list that takes each in
+PICKED = "picked"  # package, or prefix of its name, in which a group's file is composed alone
+GRAPH_PARTS = {"encoder": "vehicle", "sender": "vehicle", "receiver": "operator"}  # and the list that includes each
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One file or override that took part, with its content and the place in the whole where it landed."""
+    """One contributing file or override, with its content and its place in the whole configuration."""
 
     file: str
     package: schema.Path
@@ -27,9 +27,9 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """The whole configuration as plain data, and its parts, the one with the last word first.
+    """The whole configuration as plain data, and its parts, the one with the highest precedence first.
 
-    moved  by path in the document, where entries are written that a list takes in from another one
+    moved  by path in the document, where the entries that a list includes from another one are written
     """
 
     document: dict[str, Any]
@@ -37,13 +37,13 @@ class Composed:
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
 
     def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
-        """A problem of the whole, attributed to its file or override, by the path in there."""
+        """A problem of the whole, attributed to its file or override, with the path inside it."""
         path = self.written(path)
         part = self._origin(path)
         return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
 
     def later_parts(self, path: schema.Path) -> list[Part]:
-        """The parts that have a word to say after the one that the value comes from, the last one first."""
+        """The parts that take precedence over the one that the value comes from, the last one first."""
         return self.parts[: self._age(self.written(path))]
 
     def written(self, path: schema.Path) -> schema.Path:
@@ -53,9 +53,9 @@ class Composed:
         return (*self.moved[path[:length]], *path[length:]) if length else path
 
     def without_graph_parts(self) -> Composed:
-        """Without the parts of graphs that a list took in, or that a later list does without.
+        """Without the parts of graphs that a list includes, or that a later list omits.
 
-        One that is left is a mistake: the file that has the last word on it meant it to be used.
+        One that remains is a mistake: the file that sets it last meant it to be used.
         """
         used = {(path[:-2], origin[-2]) for path, origin in self.moved.items()}
         mounts = self.document.get("cameras")
@@ -70,11 +70,11 @@ class Composed:
         return self
 
     def _age(self, path: schema.Path) -> int:
-        """How many parts have a word to say after the one that a value comes from."""
+        """How many parts take precedence over the one that a value comes from."""
         return self.parts.index(self._origin(path))
 
     def _origin(self, path: schema.Path) -> Part:
-        """The part that has the value; for what is missing, the one that states most of its surroundings."""
+        """The part that has the value; for a missing one, the part that states most of its surroundings."""
         inside = [part for part in self._visible(path) if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
             makers = [part for part in inside if len(part.package) == length]
@@ -90,7 +90,7 @@ class Composed:
         return next(vehicle, self.parts[-1]) if path[:1] in (("name",), ("cameras",)) else self.parts[-1]
 
     def _visible(self, path: schema.Path) -> list[Part]:
-        """The parts down to the one whose list the path leads through: a list replaces those of all files before."""
+        """The parts down to the one whose list the path leads through: a list replaces those of all earlier files."""
         lists = [path[:depth] for depth, key in enumerate(path) if isinstance(key, int)]
         for index, part in enumerate(self.parts):
             if any(isinstance(_held(part, place), list) for place in lists):

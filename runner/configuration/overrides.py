@@ -1,4 +1,4 @@
-"""Overrides: words of the command line as Hydra parses them, which choose a group's file or set a value."""
+"""Overrides: words of the command line as Hydra parses them; each chooses a group's file or sets a value."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from runner.core.model import suggest
 from runner.errors import ConfigError, Problem
 
 COMMAND_LINE = "command line"
-OPTIONAL = ("link", "experiment")  # groups of which no file need be chosen
-LONGEST_WORD = 4096  # characters of an override, as of a path
-DEEPEST = 32  # brackets of a kind in an override
+OPTIONAL = ("link", "experiment")  # groups that need no chosen file
+LONGEST_WORD = 4096  # characters of an override, as for a path
+DEEPEST = 32  # brackets of one kind in an override
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +34,13 @@ class Override:
 
     @property
     def is_none(self) -> bool:
-        """Whether it takes away a choice that need not be made."""
+        """Whether it removes an optional choice."""
         return self.choice and self.key in OPTIONAL and self.value == "null"
 
     def hydra(self, chosen: Collection[str]) -> str:
-        """As Hydra is to read it: a plus is never needed and never wrong. The schema knows which keys there are.
+        """Its form for Hydra: a plus is never needed and never wrong. The schema defines the valid keys.
 
-        chosen  groups of which conf/config.yaml chooses a file
+        chosen  groups for which conf/config.yaml chooses a file
         """
         if self.is_none:
             return f"~{self.key}"
@@ -95,7 +95,7 @@ def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator
 
 
 def choosable(name: str) -> bool:
-    """Whether Hydra takes a word for the name of a file: not a,b, which is a sweep, nor 1e3, null or true."""
+    """Whether Hydra accepts a word as the name of a file: not a,b, which is a sweep, nor 1e3, null or true."""
     try:
         (override,) = parse_overrides([f"vehicle={name}"])
     except ConfigError:

@@ -1,4 +1,4 @@
-"""Write out the interpolations of a composed tree."""
+"""Resolve the interpolations of a composed tree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runner.errors import ConfigError, Problem
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-MOST_RESOLVED = 50_000  # values of a configuration, with its interpolations written out
+MOST_RESOLVED = 50_000  # values of a configuration, with its interpolations expanded
 
 
 def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
@@ -40,13 +40,13 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
 
 
 def is_determined(composed: Composed) -> bool:
-    """Whether its parts, merged one after the other, are the configuration."""
+    """Whether its parts, merged one after the other, give the configuration."""
     whole = _merged(composed.parts)
     return whole is not None and whole.document == composed.document
 
 
 def without(composed: Composed, part: Part) -> Composed | None:
-    """A configuration that its parts determine, without one of them; None where the others alone are not valid."""
+    """A configuration determined by its parts, without one of them; None if the others alone are not valid."""
     return _merged([other for other in composed.parts if other is not part])
 
 

@@ -15,7 +15,7 @@ from runner.core.rules import Rule, RuleCall
 
 
 def find_rule(name: str) -> Rule:
-    """The rule of that name, from here or from an entry point.
+    """The rule of that name, from this package or from an entry point.
 
     raises  ModelError with a suggestion
     """
@@ -36,7 +36,7 @@ def find_rule(name: str) -> Rule:
 def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     """A rule with its parameters checked against the rule's own signature.
 
-    Parameters are numbers >= 0, made exact, in the unit that their name ends in; `halve_every_s` and its like are > 0.
+    Parameters are numbers >= 0, made exact, in the unit at the end of their name; those like `halve_every_s` are > 0.
     raises  ModelError
     """
     found = find_rule(name)

@@ -1,4 +1,4 @@
-"""Configuration files: YAML as OmegaConf reads it, checked for what a parser would choke on."""
+"""Configuration files: YAML as OmegaConf reads it, checked against limits that protect the parser."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from runner.system.files import read_file
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-MOST_BYTES = 100_000  # some twenty times the longest packaged file
-MOST_VALUES = 10_000  # with every alias (*NAME) written out
+MOST_BYTES = 100_000  # about twenty times the longest packaged file
+MOST_VALUES = 10_000  # with every alias (*NAME) expanded
 DEEPEST = 32  # levels of lists and mappings
 _NAME = re.compile(r"[\w /@:.,${}?-]+")  # of a file or a group, in a defaults list
 _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
@@ -37,7 +37,7 @@ class YamlFile(NamedTuple):
 def load_file(path: Path) -> Any:
     """Content of a YAML file: YAML 1.1, duplicate keys refused.
 
-    raises  ConfigError for what is no file, no YAML or beyond the limits above
+    raises  ConfigError if it is not a file, not YAML or beyond the limits above
     """
     return read(path).content
 
@@ -52,7 +52,7 @@ def read(path: Path) -> YamlFile:
 
 
 def label(path: Path) -> str:
-    """A file as messages name it: conf/... for a packaged one, the path as the user gave it for his own."""
+    """A file's name in messages: conf/... for a packaged one, the path as given for a user's own."""
     packaged = directory("conf")
     return f"conf/{path.relative_to(packaged)}" if path.is_relative_to(packaged) else str(path)
 
@@ -60,7 +60,7 @@ def label(path: Path) -> str:
 def load_node(path: Path) -> DictConfig:
     """Content of a configuration file as Hydra merges it; not to be changed.
 
-    raises  ConfigError as `load_file`, and where it is no configuration at all
+    raises  ConfigError as `load_file`, and if it is not a configuration
     """
     file = read(path)
     if path not in _nodes or _nodes[path][0] is not file:
@@ -68,7 +68,7 @@ def load_node(path: Path) -> DictConfig:
     return _nodes[path][1]
 
 
-_nodes: dict[Path, tuple[YamlFile, DictConfig]] = {}  # by path, what was read and made of it
+_nodes: dict[Path, tuple[YamlFile, DictConfig]] = {}  # by path, the content read and its node
 
 
 def _node(path: Path, content: Any) -> DictConfig:
@@ -86,7 +86,7 @@ def _node(path: Path, content: Any) -> DictConfig:
 
 
 def _shape_problems(path: Path, content: Any) -> Iterator[Problem]:
-    """What is wrong with YAML that Hydra cannot compose."""
+    """Problems of YAML that Hydra cannot compose."""
     file = label(path)
     if content is None:
         yield Problem(file, "", None, "is empty, must be a mapping")
@@ -107,7 +107,7 @@ def _shape_problems(path: Path, content: Any) -> Iterator[Problem]:
 
 
 def _is_choice(entry: Any) -> bool:
-    """Whether Hydra can look for what an entry of a defaults list names."""
+    """Whether Hydra can look up the names in an entry of a defaults list."""
     words = [entry]
     if isinstance(entry, dict):
         ((key, value),) = entry.items() if len(entry) == 1 else ((None, None),)
@@ -117,7 +117,7 @@ def _is_choice(entry: Any) -> bool:
 
 @lru_cache(maxsize=1024)
 def _read(path: Path, _modified_ns: int, _bytes: int) -> YamlFile:
-    """Read once as long as time and size stay: a run composes the same files more than once."""
+    """Read once while time and size stay the same: a run composes the same files more than once."""
     try:
         text = read_file(path, MOST_BYTES).decode()
         return YamlFile(_content(text), _package(text))
@@ -130,13 +130,13 @@ def _read(path: Path, _modified_ns: int, _bytes: int) -> YamlFile:
 
 def _content(text: str) -> Any:
     in_python, in_c = _loaders()
-    with suppress(yaml.YAMLError):  # the messages of the parser in Python say more
+    with suppress(yaml.YAMLError):  # the messages of the parser in Python are more detailed
         return yaml.load(text, Loader=in_c)
     return yaml.load(text, Loader=in_python)
 
 
 def _package(text: str) -> str | None:
-    """The package in the comments at the top. Hydra itself wants it in the first line."""
+    """The package in the comments at the top. Hydra itself expects it in the first line."""
     comments = takewhile(lambda line: not line or line.startswith("#"), map(str.strip, text.splitlines()))
     return next((found[1] for line in comments if (found := _PACKAGE.fullmatch(line))), None)
 
@@ -153,7 +153,7 @@ def _loaders() -> tuple[Any, Any]:
     from omegaconf._utils import get_yaml_loader
 
     class Limited(get_yaml_loader()):  # type: ignore[misc]
-        """Counts while the tree of nodes grows, so that nothing is built that is too large."""
+        """Counts while the tree of nodes grows, so that nothing too large is built."""
 
         def __init__(self, stream: Any) -> None:
             super().__init__(stream)

@@ -19,7 +19,7 @@ def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
     b_full   kbit/s for the full image
     roi      px, what the operator has set
     full     px, the full image
-    returns  kbit/s; a camera that is off has p_set = 0, for which the caller does not call this
+    returns  kbit/s; not called for a camera that is off, whose p_set is 0
     """
     return Fraction(roi.pixels * b_full, full.pixels) if roi is not full and roi != full else b_full
 
@@ -35,10 +35,10 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
 
     demands  kbit/s per camera, 0 for a camera that is off
     total    kbit/s, predicted by pQoS or set by the operator
-    weights  >= 0 per camera; all 1 is the paper; 0 gives nothing
+    weights  >= 0 per camera; all 1: as in the paper; 0: no bitrate
     returns  kbit/s per camera, in the order of `demands`
 
-    The paper leaves two cases open. All cameras off: everyone gets 0. More than demanded: the surplus stays unused.
+    The paper leaves two cases open. All cameras off: each gets 0. More than demanded: the surplus stays unused.
     """
     waiting = {name: own for name, own in demands.items() if own and weights[name]}
     wanted = _sum(waiting.values())
@@ -49,7 +49,7 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
         share = total / wanted
         return allocated | {name: own * share for name, own in waiting.items()}
     left = total
-    # Heaviest first: once lambda does not fill a camera, it fills no lighter one, and the rest share what is left.
+    # Heaviest first: once lambda does not fill a camera, it fills no lighter one, and the rest share the remainder.
     for name in sorted(waiting, key=weights.__getitem__, reverse=True):
         share = left / sum(weights[other] * own for other, own in waiting.items())
         if share * weights[name] < 1:

@@ -1,4 +1,4 @@
-"""The difference between what is decided and what has been commanded, as commands to `apply`."""
+"""The difference between the decision and the values commanded so far, as commands to `apply`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KNOBS = ("sending", "roi", "size", "bitrate")
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Turn one knob of one camera. All commands of a camera that come together act between the same two frames.
+    """Turn one knob of one camera. Commands of a camera that arrive together take effect between the same two frames.
 
     value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1
     """
@@ -39,27 +39,27 @@ KnobValues = Mapping[str, KnobValue]  # value by knob, of one camera
 
 
 def wanted(setting: Setting) -> KnobValues:
-    """Where a setting wants a camera's knobs. While nothing is sent the other knobs stay where they are."""
+    """Knob values of a camera for a setting. While nothing is sent, the other knobs keep their values."""
     if not setting.sending:
         return {"sending": False}
     return {"sending": True, "roi": setting.roi, "size": (setting.width, setting.height), "bitrate": setting.kbps}
 
 
 def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[Command]:
-    """Commands that take every camera from where its knobs were commanded to, to where the decision wants them."""
+    """Commands that take every camera's knobs from the values last commanded to those of the decision."""
     commands = []
     for name, setting in decision.settings.items():
         now = commanded.get(name, {})
         for knob, value in wanted(setting).items():
             held = now.get(knob)
-            # Most values are the very object that was commanded; comparing regions one by one is slow.
+            # Most values are the same object that was commanded; comparing regions one by one is slow.
             if held is not value and held != value:
                 commands.append(Command(name, knob, value))
     return commands
 
 
 def after(commanded: Mapping[str, KnobValues], commands: list[Command]) -> Mapping[str, KnobValues]:
-    """Where the knobs are commanded to once these commands are given."""
+    """The commanded knob values after these commands."""
     if not commands:
         return commanded
     turned: dict[str, dict[str, KnobValue]] = {}

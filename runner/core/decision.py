@@ -16,15 +16,15 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How one camera is to be sent.
+    """How to send one camera.
 
     sending        False: nothing is encoded (off, or allocated below 1 kbit/s), the stream stays connectable
     demand         kbit/s, Eq. (1), 0 when off
     kbps           whole kbit/s, rounded down; 0 while nothing is sent
-    given          the same, also while a rule stops all sending: what the camera resumes with
+    given          the same, also while a rule stops all sending: the value with which the camera resumes
     scaling        selected factor; None when off
     width, height  px of the encoded picture, 0 when off
-    reason         why, for the operator; takes no part in comparison
+    reason         why, for the operator; ignored in comparisons
     """
 
     on: bool
@@ -53,7 +53,7 @@ class Decision:
 
 
 class Draft(NamedTuple):
-    """A decision in the making. A rule reads what earlier ones gave and returns a draft with its own part replaced.
+    """A decision in progress. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
     total    kbit/s of all cameras
     demand   kbit/s by camera, 0 when off
@@ -82,5 +82,5 @@ class Draft(NamedTuple):
         return self.replaced(**changes)
 
     def noted(self, note: str, **changes: Any) -> Draft:
-        """The draft with these parts replaced and the reason for it."""
+        """The draft with these parts replaced and the reason added."""
         return self._replace(notes=(*self.notes, note), **changes)

@@ -1,4 +1,4 @@
-"""What can happen. One vocabulary for the control link, the drive log and `replay` (schemas/event.schema.json).
+"""Events: one vocabulary for the control link, the drive log and `replay` (schemas/event.schema.json).
 
 `Event` objects are valid once built; `parse` turns JSON that the schema accepts into one.
 """
@@ -15,7 +15,7 @@ from runner.core.model import Kbps, Mode, Roi, exact, plain
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that happened `t` seconds after the start of the run; `t` never falls."""
+    """Something that happened `t` seconds after the start of the run; `t` never decreases."""
 
     t: float
 
@@ -30,8 +30,8 @@ class BitratePredicted(Event):
     """Prediction of the bitrate available for all cameras together, from pQoS.
 
     kbps        the prediction
-    lower_kbps  what it will hardly fall below, where the source knows
-    valid_s     how long it may be used, where the source knows
+    lower_kbps  likely lower bound, if the source knows it
+    valid_s     how long it may be used, if the source knows it
     """
 
     kbps: Kbps
@@ -84,7 +84,7 @@ class WeightsSet(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkMeasured(Event):
-    """What arrived at the operator: kbit/s, share of packets lost, round trip and jitter."""
+    """Reception at the operator: kbit/s, share of packets lost, round trip and jitter."""
 
     camera: str
     kbps: Kbps
@@ -105,7 +105,7 @@ class OperatorDisconnected(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockAdvanced(Event):
-    """Nothing but time has passed; emitted every 100 ms while live, so that rules may wait without a clock."""
+    """Only time has passed; emitted every 100 ms while live, so that rules can wait without a clock."""
 
 
 EVENTS: dict[str, type[Event]] = {
@@ -129,7 +129,7 @@ _ROI = ("x", "y", "width", "height")
 
 
 def parse(document: Mapping[str, Any]) -> Event:
-    """The event that a JSON object which satisfies the schema describes."""
+    """The event described by a JSON object that satisfies the schema."""
     values = dict(document)
     kind = EVENTS[values.pop("event")]
     for key in _EXACT:
@@ -145,7 +145,7 @@ def parse(document: Mapping[str, Any]) -> Event:
 
 
 def to_json(event: Event) -> dict[str, Any]:
-    """The JSON object that `parse` reads back as the same event; keys that are not known are left out."""
+    """The JSON object that `parse` reads back as the same event; unknown values are left out."""
     document: dict[str, Any] = {"t": event.t, "event": NAMES[type(event)]}
     for name in (f.name for f in fields(event) if f.name != "t"):
         value = getattr(event, name)

@@ -1,4 +1,4 @@
-"""What exists: cameras, their rate-quality models, pipeline graphs, the vehicle. Frozen, valid once built.
+"""The model: cameras, their rate-quality models, pipeline graphs, the vehicle. Frozen, valid once built.
 
 Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), sizes are px, times are seconds.
 """
@@ -16,14 +16,14 @@ from itertools import pairwise
 from typing import Any, Protocol
 
 Kbps = Fraction
-Value = bool | int | float | str  # what an element's property may hold in YAML
+Value = bool | int | float | str  # type of an element's property in YAML
 
 PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
 
 
 class ModelError(ValueError):
-    """What was found at `key` (a path below the thing being built) and the rule that it breaks."""
+    """The value found at `key` (a path below the object being built) and the rule that it breaks."""
 
     def __init__(self, key: str, found: object, rule: str) -> None:
         super().__init__(f"{key}: {found}: {rule}")
@@ -31,7 +31,7 @@ class ModelError(ValueError):
 
 
 def exact(number: float | str | Fraction) -> Fraction:
-    """The number a person wrote, without binary rounding: 0.1 is 1/10.
+    """The number as the user wrote it, without binary rounding: 0.1 is 1/10.
 
     A float prints as the shortest decimal text that reads back as itself, which for up to 15 digits is what was typed.
     """
@@ -41,12 +41,12 @@ def exact(number: float | str | Fraction) -> Fraction:
 
 
 def plain(number: Fraction) -> int | float:
-    """The same number for JSON and for people: whole numbers without a decimal point."""
+    """The same number for JSON and for display: whole numbers without a decimal point."""
     return number.numerator if number.denominator == 1 else float(number)
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """The end of a sentence on an unknown word, with its separator: the nearest known word, else all known words."""
+    """End of a message about an unknown word, with its separator: the closest known word, otherwise all known words."""
     known = list(known)
     near = get_close_matches(word, known, 1)
     shown = [*known[:13], "..."] if len(known) > 13 else known
@@ -58,7 +58,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
 class ModeRule(Protocol):
     """A rule with its parameters, as a mode lists it, see `runner.core.rules`.
 
-    reads  fields of the state whose change makes the mode decide again
+    reads  fields of the state whose change triggers a new decision
     """
 
     @property
@@ -97,13 +97,13 @@ class Roi:
 class RateQualityModel:
     """Scaling factor that looks best in each bitrate range (paper, Eq. 3 and Table I).
 
-    scaling  R factors in ]0, 1], rising
-    b_min    R lower bounds in kbit/s, rising from 0
+    scaling  R factors in ]0, 1], increasing
+    b_min    R lower bounds in kbit/s, increasing from 0
     b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
     raises   ModelError
 
-    Made from them: `whole_b_min`, the bounds as integers where all are, else empty; `ranges`, each range B_r and its
-    factor as a person reads them: "range [300, 950) -> 0.25", "range [950, ...) -> 0.5".
+    Derived: `whole_b_min`, the bounds as integers if all are whole, otherwise empty; `ranges`, each range B_r and its
+    factor as text: "range [300, 950) -> 0.25", "range [950, ...) -> 0.5".
     """
 
     scaling: tuple[Fraction, ...]
@@ -145,7 +145,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class KnobTarget:
-    """One property that a knob sets, and with what: kbps, bps, left, right, top, bottom, on, off or a caps template."""
+    """One property that a knob sets, and its value: kbps, bps, left, right, top, bottom, on, off or a caps template."""
 
     element: str
     property: str
@@ -154,13 +154,13 @@ class KnobTarget:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """A camera's pipeline on both sides as the YAML states it.
+    """A camera's pipeline on both sides as defined in YAML.
 
     transport  rtsp: a server on the vehicle, the operator's first element is its client;
                pipeline: the vehicle's last element sends, the operator's first one receives
-    wire       what `print` puts in place of server and client, since gst-launch has neither (rtsp only)
+    wire       what `print` shows in place of server and client, since gst-launch has neither (rtsp only)
     settings   named numbers of the graph (mtu_bytes, jitter_buffer_ms, ...) that properties refer to as {name}
-    mutable    (element, property) that knobs set though GStreamer does not say that it may change while playing
+    mutable    (element, property) that knobs set although GStreamer does not declare it mutable while playing
     verified   False: checked against its schema only, never run by this project's tests
     """
 
@@ -202,13 +202,13 @@ def _check_unique(key: str, names: list[str]) -> None:
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
-    settings  what the file itself gives for placeholders: clip, device, address
-    loop      start again at the end without a gap (a clip)
-    frozen_s  without a frame for so long, and for 10 frame intervals, the source is replaced while the camera plays;
-              None: it is not watched
+    settings  values for placeholders from the file itself: clip, device, address
+    loop      restart at the end without a gap (a clip)
+    frozen_s  without a frame for this long, and for 10 frame intervals, the source is replaced while the camera plays;
+              None: it is not monitored
     render    name of the procedural drive that makes the clip, or ""
     render_s  length of that drive, s
-    stand_in  elements that `print` shows where gst-launch cannot make the frames (born in Python, not rendered yet)
+    stand_in  elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
     """
 
     elements: tuple[Element, ...]
@@ -228,10 +228,10 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """How frames are kept without loss, as the YAML states it.
+    """How frames are recorded without loss, as defined in YAML.
 
-    codec     its name, for people and for recording.json
-    of_raw    largest share of the raw frames' size that a file is planned to take
+    codec     its name, for display and for recording.json
+    of_raw    expected size of a file, at most, as a share of the raw frames' size
     elements  from raw frames to a Matroska stream, may hold {placeholders}
     """
 
@@ -245,10 +245,10 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a camera sits on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
+    """Where a camera is mounted on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
 
     The origin is on the ground below the rear axle. Metres and degrees; yaw turns left,
-    pitch tips the view down, roll tips it clockwise.
+    pitch tilts the view down, roll tilts it clockwise.
     """
 
     x_m: float
@@ -272,9 +272,9 @@ class Camera:
     """A camera mounted in a vehicle.
 
     width, height   px of the full image, after the crop of the native one
-    native          px size of what the source delivers, with the part that is kept; None: it is the full image
+    native          px size of the source's image, of which `crop` is kept; None: it is the full image
     weight          explicit weight in the allocation, >= 0
-    mount           device, address, clip: what a placeholder of that name is filled with
+    mount           device, address, clip: values of the placeholders of these names
     """
 
     name: str
@@ -309,7 +309,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a server listens and where its clients find it."""
+    """Where a server listens and where its clients reach it."""
 
     host: str
     port: int
@@ -323,8 +323,8 @@ class Media(Endpoint):
     """The vehicle's RTSP server.
 
     rtp_ports          first and last UDP port for RTP and RTCP; a camera takes two
-    session_timeout_s  a viewer that sends neither requests nor RTCP for so long is dropped
-    max_viewers        viewers of one camera outside the vehicle, at once
+    session_timeout_s  a viewer that sends neither requests nor RTCP for this long is dropped
+    max_viewers        simultaneous viewers of one camera outside the vehicle
     """
 
     rtp_ports: tuple[int, int]
@@ -341,7 +341,7 @@ class Media(Endpoint):
 class PageSettings:
     """The operator's page, on 127.0.0.1.
 
-    late_ms  age of a picture when it is drawn, above which it is marked as late
+    late_ms  age of a picture when drawn, above which it is marked as late
     """
 
     serve: bool
@@ -358,9 +358,9 @@ class Vehicle:
     """Everything the runner needs to know, valid once built.
 
     modes      the rule list of each mode
-    pqos       the prediction source as the YAML states it, read by `pqos.py`
-    recording  how `record` keeps the frames of every camera
-    expires_s  age from which the vehicle drops a request, beyond the round trip
+    pqos       the prediction source as defined in YAML, read by `runner.pqos`
+    recording  how `record` stores the frames of every camera
+    expires_s  age from which the vehicle drops a request, in addition to the round trip
     log_video  whether the log of a drive holds the video of every camera
     """
 
@@ -377,4 +377,4 @@ class Vehicle:
     log_video: bool = False
 
 
-Progress = Callable[[str, float], None]  # what is being done, share done in [0, 1]
+Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

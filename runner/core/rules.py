@@ -1,8 +1,8 @@
 """A mode is an ordered list of named rules; each takes the draft of a decision one step further.
 
-A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, made known by the
-decorator `rule`, which states what it needs from earlier rules, what it gives, and which fields of the state it reads.
-Memory is frozen and keyed by rule; only rules that need a past touch it.
+A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, registered by the
+decorator `rule`, which declares what it needs from earlier rules, what it gives, and which state fields it reads.
+Memory is frozen and keyed by rule; only rules that need history use it.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ Step = tuple[Draft, Memory]
 
 BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
 FACTOR_RULE = "must be a Fraction in ]0, 1]"
-GIVEN = ("total", "demand", "bitrate", "scaling")  # what the rules of a mode must have given at its end
+GIVEN = ("total", "demand", "bitrate", "scaling")  # parts that a mode's rules must have given at the end
 
 
 class RuleFailed(RunError):
-    """A rule raised an exception or gave a value that no camera can be sent with; the text names rule and value."""
+    """A rule raised an exception or gave a value that cannot be used; the text names rule and value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A rule and what it states about itself.
+    """A rule and what it declares about itself.
 
     needs  parts of the draft that earlier rules must have given
-    gives  parts of the draft that are there after it
-    reads  fields of the state whose change makes the mode decide again
+    gives  parts of the draft that exist after it
+    reads  fields of the state whose change triggers a new decision
     """
 
     name: str
@@ -55,7 +55,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class RuleCall:
-    """A rule with the parameters that a modes file gives it."""
+    """A rule with its parameters from a modes file."""
 
     rule: Rule
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -81,10 +81,10 @@ EVERYTHING = frozenset(part.name for part in fields(State))
 def rule(
     *, needs: Iterable[str] = (), gives: Iterable[str] = (), reads: Iterable[str] = EVERYTHING
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
-    """Make a function known as a rule under its own name.
+    """Register a function as a rule under its own name.
 
-    reads   saves decisions that would come out the same: without it any change of the state makes the mode decide again
-    raises  ValueError where `reads` names no field of the state: the rule would miss its changes
+    reads   avoids decisions whose result would be the same: without it any change of the state triggers a new decision
+    raises  ValueError if `reads` names something other than a field of the state: the rule would miss its changes
     """
     read = frozenset(reads)
     if unknown := sorted(read - EVERYTHING):
@@ -105,13 +105,13 @@ def rule(
 
 @rule(gives=["total"], reads=["prediction"])
 def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
-    """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one comes."""
+    """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one arrives."""
     return draft.replaced(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
 
 
 @rule(gives=["total"], reads=["collective_total"])
 def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
-    """Mode C: the total is the operator's; `start_kbps` where a run starts in C and none was set yet."""
+    """Mode C: the total is the operator's; `start_kbps` if a run starts in C and none was set yet."""
     return draft.replaced(total=start_kbps if state.collective_total is None else state.collective_total), memory
 
 
@@ -135,16 +135,16 @@ def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Eq. (2): the total is shared in proportion to demand times weight, nobody gets more than the demand."""
+    """Eq. (2): the total is shared in proportion to demand times weight, no camera gets more than its demand."""
     assert draft.total is not None
     return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Each camera that is on gets the same, times its weight, and nobody more than the demand: for comparison."""
+    """Each camera that is on gets the same, times its weight, but no more than its demand: for comparison."""
     assert draft.total is not None
-    # Eq. (2) shares in proportion to weight times demand; this takes the demand out of it.
+    # Eq. (2) shares in proportion to weight times demand; this cancels the demand.
     wanted = {name: demand for name, demand in draft.demand.items() if demand}
     weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
     return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
@@ -152,14 +152,14 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Eq. (4): the factor whose bitrate range the allocation, seen as for the full image, falls into."""
+    """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = {}, {}
     for name, camera in vehicle.cameras.items():
         if not state.on[name]:
             continue
         allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
         kbps, bitrate = _whole(allocated), scaling.as_full_image(allocated, roi, full)
-        # What cannot be sent is not a picture to look at: however few its pixels, the smallest factor.
+        # A camera that cannot be sent shows no picture: however few its pixels, it gets the smallest factor.
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = "" if not kbps or roi is full or roi == full else f", as {_whole(bitrate)} for the full image"
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
@@ -168,7 +168,7 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
 
 @rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
 def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Mode S: each camera is sent as the operator has set it; the total is what that comes to."""
+    """Mode S: each camera is sent as the operator has set it; the total is the resulting sum."""
     on = [name for name in vehicle.cameras if state.on[name]]
     bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
     factors = {name: state.manual[name].scaling for name in on}
@@ -177,12 +177,12 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
     return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
-# --- answers to inputs that are stale or lost: modes=safe -------------------------------------------------------------
+# --- responses to stale or lost inputs: modes=safe --------------------------------------------------------------------
 
 
 @rule(needs=["total"], gives=["total"], reads=["prediction"])
 def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """The total is at most the lower bound of the prediction, where it states one."""
+    """The total is at most the lower bound of the prediction, if it states one."""
     lower = None if state.prediction is None else state.prediction.lower_kbps
     assert draft.total is not None
     if lower is None or lower >= draft.total:
@@ -202,10 +202,10 @@ def fade_when_stale(
     halve_every_s: Fraction,
     floor_kbps: Kbps,
 ) -> Step:
-    """A prediction that is too old is trusted less and less.
+    """A stale prediction is trusted less and less.
 
-    Older than its own `valid_s`, else than `after_s`, the total is halved, and again every `halve_every_s`, down to
-    `floor_kbps`; never above the prediction. Where none has come yet, the age counts from the start of the run.
+    Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
+    down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run.
     """
     made = state.prediction
     limit = after_s if made is None or made.valid_s is None else exact(made.valid_s)
@@ -223,7 +223,7 @@ def fade_when_stale(
 
 @rule(reads=["operator_lost", "t"])
 def pause_without_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, after_s: Fraction) -> Step:
-    """Nothing is sent while the operator's side has been gone for longer than `after_s`; it resumes with its return."""
+    """Nothing is sent while the operator's side has been gone for over `after_s`; sending resumes on its return."""
     lost = state.operator_lost
     if lost is None or state.t - lost <= after_s:
         return draft, memory
@@ -235,9 +235,9 @@ def pause_without_operator(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
 def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
-    """A greater factor is taken only after it has been called for without a break for `for_s`; a smaller one at once.
+    """A larger factor is taken only after it has been requested without a break for `for_s`; a smaller one at once.
 
-    Memory: by camera, the factor in force and since when a greater one is called for (None: it is not).
+    Memory: by camera, the factor in force and since when a larger one has been requested (None: it is not).
     """
     past: Mapping[str, tuple[Fraction, float | None]] = memory.get("hold_upscaling", {})
     now: dict[str, tuple[Fraction, float | None]] = {}
@@ -261,7 +261,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
 
 
 def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Memory]:
-    """Pure heart of the runner: run the rules of the mode in force, in order.
+    """Pure core of the runner: run the rules of the mode in force, in order.
 
     raises  RuleFailed, since rules may be the user's own
     """
@@ -279,7 +279,7 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
 
 
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
-    """Why the cameras cannot be sent with the parts of the draft that a rule has changed; None if they can."""
+    """Why the parts of the draft that a rule has changed cannot be used; None if they can."""
     if not isinstance(draft, Draft):
         return "it must return a Draft and the memory"
     if draft.total is not before.total and not _is_bitrate(draft.total):
@@ -299,7 +299,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
 
 
 def _is_bitrate(value: Any) -> bool:
-    """A float is refused even where it is whole: a bitrate on a bound must never be decided by rounding noise."""
+    """A float is refused even if it is whole: rounding noise must never decide a bitrate on a bound."""
     return type(value) in (Fraction, int) and value.numerator >= 0  # comparing fractions is slow
 
 
@@ -307,7 +307,7 @@ def _is_factor(value: Any) -> bool:
     return type(value) is Fraction and 0 < value.numerator <= value.denominator
 
 
-# Parts of a draft by camera, what their values must be, and that in words.
+# Parts of a draft by camera, the check of their values, and the same in words.
 PARTS = (
     ("demand", _is_bitrate, BITRATE_RULE),
     ("bitrate", _is_bitrate, BITRATE_RULE),
@@ -317,7 +317,7 @@ PARTS = (
 
 @cache
 def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
-    """Fields of the state whose change makes the mode decide again."""
+    """Fields of the state whose change triggers a new decision."""
     return frozenset({"mode", "on", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
 
 

@@ -1,4 +1,4 @@
-"""Resolution scaling selection (paper, section II-B) and the picture size that follows from it."""
+"""Resolution scaling selection (paper, section II-B) and the resulting picture size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def as_full_image(allocated: Kbps, roi: Roi, full: Roi) -> Kbps:
 
     b_alloc * p_full / p_set                                             (paper, left side of Eq. 4)
 
-    A region of interest smaller than the full image so wins a greater scaling factor.
+    A region of interest smaller than the full image thus gets a larger scaling factor.
     """
     return Fraction(allocated * full.pixels, roi.pixels) if roi is not full and roi != full else allocated
 
@@ -22,11 +22,11 @@ def select_scaling(model: RateQualityModel, bitrate: Kbps) -> tuple[Fraction, st
     """Factor s_r of the range that a bitrate falls into:  b_min,r <= bitrate < b_min,r+1   (paper, Eq. 4)
 
     bitrate  kbit/s of the full image, see `as_full_image`
-    returns  s_r in ]0, 1], and range and factor as a person reads them; a bound belongs to the upper range, the last
+    returns  s_r in ]0, 1], and range and factor as text; a bound belongs to the upper range, the last
              range has no upper end
     """
     if model.whole_b_min:
-        # A whole bound is reached when the whole part reaches it: the same answer without comparing fractions.
+        # An integer bound is reached when the integer part reaches it: the same result without comparing fractions.
         r = bisect_right(model.whole_b_min, bitrate.numerator // bitrate.denominator) - 1
     else:
         r = bisect_right(model.b_min, bitrate) - 1
@@ -34,9 +34,9 @@ def select_scaling(model: RateQualityModel, bitrate: Kbps) -> tuple[Fraction, st
 
 
 def output_size(roi: Roi, scaling: Fraction) -> tuple[int, int]:
-    """Width and height in px of what is encoded: the ROI times the factor, pixels stay square.
+    """Width and height in px of the encoded picture: the ROI times the factor, pixels stay square.
 
-    Each side goes to the nearest even number, ties up, since 4:2:0 encoders refuse odd ones. Where a side would fall
+    Each side is rounded to the nearest even number, ties up, since 4:2:0 encoders refuse odd ones. If a side would fall
     below 16 px, both use the factor that makes the shorter one 16.
     """
     size = _scaled(roi, scaling)

@@ -1,4 +1,4 @@
-"""What we know, and how an event changes it."""
+"""The state, and how an event changes it."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class State:
     """Inputs of the rules. A value that no event has set yet is None.
 
     t                 seconds, time of the last event
-    manual            by camera: what mode single sends, or what a camera that is off sent last
-    prediction        the last one, in whatever mode it came
+    manual            by camera: settings of mode single, or the last ones of a camera that is off
+    prediction        the last one, in whichever mode it arrived
     total_set         kbit/s, the operator's last total
-    collective_total  kbit/s, total that mode collective runs at
-    operator_lost     t at which the operator's side went away
+    collective_total  kbit/s, total of mode collective
+    operator_lost     t at which the operator's side disconnected
     """
 
     mode: Mode
@@ -64,14 +64,14 @@ class State:
 def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
     """The state after an event.
 
-    in_force  the decision that is applied when the event comes: entering S or C starts from it
+    in_force  the decision that is applied when the event arrives: entering S or C starts from it
     raises    Refused
     """
     return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
 
 
 def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> dict[str, Any]:  # noqa: PLR0911, PLR0912
-    """What an event changes in the state, by field."""
+    """Changes of the state by an event, by field."""
     match event:
         case ev.BitratePredicted():
             return {"prediction": event}
@@ -111,7 +111,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
-    """What the cameras that are on send now, or would if an operator watched, as settings of mode single."""
+    """What the cameras that are on send, or would send if an operator were connected, as settings of mode single."""
     settings = ((name, in_force.settings[name]) for name in names or in_force.settings)
     return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 

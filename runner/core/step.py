@@ -1,4 +1,4 @@
-"""One event further: the pure step that live runs, dry runs, replay and simulation share."""
+"""Process one event: the pure step that live runs, dry runs, replay and simulation share."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ NOTHING: Mapping[str, KnobValues] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Where a run stands after an event.
+    """State of a run after an event.
 
-    commanded  by camera and knob, what has been commanded so far
-    commands   what this event made of it: the difference
+    commanded  by camera and knob, the value last commanded
+    commands   what follows from this event: the difference
     refused    why the event was not accepted; None if it was
     fault      why the rules could not decide, so that an earlier decision stays in force; None if they could
     """
@@ -39,7 +39,7 @@ class Run:
 def start(vehicle: Vehicle) -> Run:
     """A run before its first event: decided, nothing commanded yet.
 
-    A run that starts in mode S takes what A would decide.
+    A run that starts in mode S uses what mode A would decide.
 
     raises  RuleFailed
     """
@@ -52,9 +52,9 @@ def start(vehicle: Vehicle) -> Run:
 
 
 def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
-    """Take one event: advance the state, decide if an input of the rules changed, command the difference.
+    """Process one event: advance the state, decide if an input of the rules changed, command the difference.
 
-    Where a rule fails, the last decision stays in force and `fault` gives the reason. A mode whose rules fail is not
+    If a rule fails, the last decision stays in force and `fault` gives the reason. A mode whose rules fail is not
     entered.
     """
     refused: str | None = None
@@ -81,4 +81,4 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
 
 
 def _differ(now: object, before: object) -> bool:
-    return now is not before and now != before  # most fields are the very same object
+    return now is not before and now != before  # most fields are the same object

@@ -1,7 +1,7 @@
-"""A bandwidth map from drives: what came through where the link was really the limit. Pure.
+"""A bandwidth map from drives: the received rate wherever the link was the bottleneck. Pure.
 
-What arrives says how much a link carries only while more is sent than it carries; at all other times it says how much
-was sent. A sample counts where, over its second, packets were lost or frames waited: what came is then what it gave.
+The received rate shows the capacity of a link only while more than that is sent; at all other times it shows how much
+was sent. A sample counts if packets were lost or frames waited during its second: its rate is then the capacity.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from runner.drive.series import FloatSeries, Positions, Series
 from runner.pqos.bandwidth_map import offset
 
-WINDOW_S = 1.0  # that the rates of the samples are taken over
-WAITED_MS = 50.0  # more than the least latency of the drive: the queue before the link was filling
-GAP_S = 2.0  # positions further apart say nothing of the time between
+WINDOW_S = 1.0  # over which the rates of the samples are measured
+WAITED_MS = 50.0  # above the lowest latency of the drive: the queue in front of the link was filling
+GAP_S = 2.0  # positions further apart say nothing about the time between
 
 
 class CapacitySample(NamedTuple):
-    """What the link gave at a place: degrees, kbit/s of encoded video."""
+    """Capacity of the link at a place: degrees, kbit/s of encoded video."""
 
     lat: float
     lon: float
@@ -28,7 +28,7 @@ class CapacitySample(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """One square of the ground: mean place of its samples, a percentile of their rates (kbit/s), and their number."""
+    """A square of the ground: mean position of its samples, a percentile of their rates (kbit/s), and their number."""
 
     lat: float
     lon: float
@@ -44,7 +44,7 @@ def capacity_problem(drive: Series) -> str | None:
 
 
 def limited_samples(drive: Series) -> list[CapacitySample]:
-    """The samples of a drive in which the link was the limit; none where they cannot be determined."""
+    """The samples of a drive in which the link was the limit; none if they cannot be determined."""
     if capacity_problem(drive) or drive.positions is None:
         return []
     received = [camera.received for camera in drive.cameras.values() if camera.received]
@@ -58,9 +58,9 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
 
 
 def cells(samples: Iterable[CapacitySample], percentile: float, cell_m: float) -> list[Cell]:
-    """Squares of the ground, in the order in which they were first met.
+    """Squares of the ground, in the order of their first samples.
 
-    percentile  of the rates in a cell, 0 to 100: 10 is what the link gave in nine of ten samples
+    percentile  of the rates in a cell, 0 to 100: 10 is the rate that nine of ten samples reached
     cell_m      side of a square, m
     """
     found: dict[tuple[int, int], list[CapacitySample]] = {}
@@ -93,7 +93,7 @@ def _lost(at: FloatSeries, t: FloatSeries, lost: FloatSeries) -> np.ndarray[tupl
 def _waited(
     at: FloatSeries, t: FloatSeries, latency_ms: FloatSeries
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Whether half of the frames that came in the second before each time had waited."""
+    """Whether half of the frames that arrived in the second before each time had waited."""
     waited = np.zeros(at.shape, dtype=bool)
     if not np.isfinite(latency_ms).any():
         return waited
@@ -106,7 +106,7 @@ def _waited(
 
 
 def _at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:
-    """Degrees in the middle of the second before each time; nan where no position is near."""
+    """Degrees in the middle of the second before each time; nan if no position is near."""
     middle = t - WINDOW_S / 2
     after = np.searchsorted(positions.t, middle).clip(1, max(1, len(positions.t) - 1))
     neighbours = positions.t[[after - 1, np.minimum(after, len(positions.t) - 1)]]

@@ -1,4 +1,4 @@
-"""What a source claims of a drive, held against what came out."""
+"""A publication's claim about a drive, checked against the result."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class ClaimCheck(NamedTuple):
-    """One claim. holds: None where the drive does not show it."""
+    """One claim. holds: None if the drive does not show it."""
 
     claim: str
     outcome: str

@@ -1,4 +1,4 @@
-"""What publications report of a drive, held against what came out of one. Pure."""
+"""Claims of publications about a drive, checked against a logged one. Pure."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from runner.drive.checks import ClaimCheck
 from runner.drive.series import FloatSeries, Series, TimeSeries, held, spans
 
-SHORTEST_S = 5.0  # in which there is something to look at
-STEP_S = 0.1  # at which quantities that hold are looked at
+SHORTEST_S = 5.0  # length from which a drive is checked
+STEP_S = 0.1  # at which quantities that hold are sampled
 DIPS_S = (15.0, 55.0)  # "around 15 and 55 s"
 NEAR_S = 5.0
 SEVERAL_S = 3.0
@@ -53,7 +53,7 @@ CLAIMS: Mapping[str, Callable[[Series], list[ClaimCheck]]] = {"driving_test": dr
 
 
 def claims(drive: Series) -> list[ClaimCheck]:
-    """Those that the drive's experiment names; none where it names none."""
+    """The claims named by the drive's experiment; none if it names none."""
     named = str((drive.config.get("experiment") or {}).get("claims"))
     return CLAIMS[named](drive) if named in CLAIMS else []
 
@@ -132,7 +132,7 @@ def _times(span: Span) -> FloatSeries:
 
 
 def _kbps(drive: Series, name: str) -> FloatSeries:
-    """What a camera was allocated, over the drive but for its first second, in which the first prediction comes."""
+    """Allocation of a camera over the drive except its first second, in which the first prediction arrives."""
     decided = drive.cameras[name].decided
     return held(TimeSeries(decided.t, decided.kbps), _times(Span(1, drive.end)))
 

@@ -42,7 +42,7 @@ def when(drive: Series) -> str:
 
 
 def number(value: float | None, digits: int = 4) -> float | None:
-    """Rounded; None for what is not known."""
+    """Rounded; None if unknown."""
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 

@@ -1,6 +1,6 @@
-"""The figures of the paper's driving test (section V-B), each defined once: what print and page draw of it. Pure.
+"""The figures of the paper's driving test (section V-B), each defined once for print and page. Pure.
 
-A figure is rows of charts: a row for each drive, on the same axes, so that drives are compared by eye.
+A figure is rows of charts: a row for each drive, on the same axes, so that drives can be compared by eye.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Ser
 from runner.drive.statistics import DriveStatistics, latencies, per_second, to_arrival
 
 MINUTES_FROM_S = 900.0
-STEP_OFFSET = 0.014  # of the largest factor, between steps that would lie on one another
-WIDE = 8.0  # latencies that spread over more than this ratio have a logarithmic axis
-DECADES = 50.0  # over more than this ratio fewer of them are numbered
+STEP_OFFSET = 0.014  # of the largest factor, between steps that would overlap
+WIDE = 8.0  # latencies that spread over more than this ratio get a logarithmic axis
+DECADES = 50.0  # above this ratio fewer values are labelled
 QUANTILES = np.concatenate([np.linspace(0, 0.95, 96), np.linspace(0.951, 1, 50)])
 ARROWS = 7  # that show the direction of the drive
 FLATTEST = 0.4  # shorter side of a map over the longer
-SMALLEST_TRACK_M = 20.0  # around a vehicle that stands
+SMALLEST_TRACK_M = 20.0  # around a stationary vehicle
 METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 
 Drives = Sequence[DriveStatistics]
 
 
 class Axis(NamedTuple):
-    """marks: the values that are numbered; none leaves the choice to the renderer."""
+    """marks: the labelled values; none leaves the choice to the renderer."""
 
     title: str
     low: float
@@ -43,12 +43,12 @@ class Axis(NamedTuple):
 class Curve:
     """A quantity, in the units of the axes.
 
-    colour     place of a camera in the palette, or the name of a colour of the style sheet
+    colour     index of a camera in the palette, or the name of a colour of the style sheet
     dash       index of the dash pattern, which distinguishes curves without colour
-    around     lowest and highest of the cameras that the curve is the mean of
+    around     lowest and highest of the cameras whose mean is the curve
     steps      each value holds until the next
     filled     down to 0, without a line
-    reasons    of each value, shown when it is hovered over
+    reasons    of each value, shown on hover
     """
 
     label: str
@@ -64,7 +64,7 @@ class Curve:
 
 
 class Bars(NamedTuple):
-    """Spans of time of one camera: (from, how long), s."""
+    """Spans of time of one camera: (start, duration), s."""
 
     label: str
     colour: int
@@ -72,14 +72,14 @@ class Bars(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Rows of bars below a chart, on its axis of time; and the text shown where there are none."""
+    """Rows of bars below a chart, on its axis of time; and the text shown if there are none."""
 
     bars: tuple[Bars, ...]
     none: str
 
 
 class MapTrack(NamedTuple):
-    """Positions, m, the bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) on the way."""
+    """Positions, m, bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) along the way."""
 
     way: tuple[FloatSeries, FloatSeries]
     t: FloatSeries
@@ -96,9 +96,9 @@ class MapTrack(NamedTuple):
 class Chart:
     """One pair of axes.
 
-    drive   its place among the drives, None for a chart of all of them
-    unit_s  s of the unit of an axis of time
-    hover   a value, as plotly formats it
+    drive   its index among the drives, None for a chart of all of them
+    unit_s  unit of a time axis, s
+    hover   plotly's format of a value
     """
 
     title: str
@@ -114,7 +114,7 @@ class Chart:
 
 
 class Figure(NamedTuple):
-    """rows: charts that stand beside each other."""
+    """rows: charts side by side."""
 
     name: str
     heading: str
@@ -159,7 +159,7 @@ def bitrate_on_track(drives: Drives) -> Rows | str:
 
 
 def totals(drives: Drives) -> Rows:
-    """What was predicted, allocated, and came of it."""
+    """Predicted, allocated and actual total."""
 
     def curves(series: Series) -> Iterable[Curve]:
         if series.link:
@@ -215,7 +215,7 @@ def scaling(drives: Drives) -> Rows:
 
 
 def latency(drives: Drives) -> Rows | str:
-    """Latency over time with freezes, and how it is distributed."""
+    """Latency over time with freezes, and its distribution."""
     seconds = {at: per_second(drive.series) for at, drive in enumerate(drives) if latencies(drive.series)[1].size}
     if not seconds:
         return "no latency was logged: that takes an operator's log"
@@ -305,7 +305,7 @@ def _mean(label: str, lines: Sequence[TimeSeries], colour: int, dash: int) -> Cu
 
 
 def _factors(drive: DriveStatistics, panel: Panel) -> set[float]:
-    """Those that the cameras of a panel may use, and those that were in force."""
+    """Factors that the cameras of a panel may use, and those that were in force."""
     described = drive.series.config.get("cameras") or {}
     ladders = [(described.get(name) or {}).get("rate_quality", {}).get("scaling", ()) for name in panel.cameras]
     used = [drive.cameras[name].factors for name in panel.cameras if name in drive.cameras]
@@ -313,7 +313,7 @@ def _factors(drive: DriveStatistics, panel: Panel) -> set[float]:
 
 
 def _step_reasons(names: Sequence[str], camera: CameraSeries, end: float) -> Iterable[str]:
-    """Of each step of a factor, the time, the factor and the reason."""
+    """For each step of a factor, the time, the factor and the reason."""
     decided = camera.decided
     reasons = [
         f"{', '.join(names)} from {t:.1f} s: {'off' if np.isnan(factor) else f'{factor:g}'}\n{reason}"
@@ -330,7 +330,7 @@ def _by_panel(
     *,
     shared: bool = False,
 ) -> Rows:
-    """A row for each drive, a chart for each panel of cameras; those below one another share an axis, or all do."""
+    """A row for each drive, a chart for each panel of cameras; charts below one another share an axis, or all do."""
     found = {
         (at, part): tuple(curves(drive, panel))
         for at, drive in enumerate(drives)
@@ -353,7 +353,7 @@ def _label(drives: Drives, at: int) -> str:
 
 
 def _unit(drives: Drives) -> tuple[float, str]:
-    """s of the unit of the time axis, and how it is labelled."""
+    """Unit of the time axis in s, and its label."""
     long = max(drive.series.end for drive in drives) > MINUTES_FROM_S
     return (60.0, "time in min") if long else (1.0, "time in s")
 
@@ -390,7 +390,7 @@ def _top(found: Iterable[Iterable[Curve]]) -> float:
 
 
 def _spread(title: str, shown: FloatSeries) -> Axis:
-    """An axis that holds some latencies: logarithmic where they spread and none is below 0."""
+    """An axis for some latencies: logarithmic if they spread widely and all are above 0."""
     low, high = float(shown.min()), float(shown.max())
     if low <= 0 or high / low <= WIDE:
         return Axis(title, min(0.0, low), high * 1.05)
@@ -408,7 +408,7 @@ def _freezes(drive: DriveStatistics) -> Strip:
 
 
 def _distribution(drives: Drives, known: Sequence[int]) -> Chart:
-    """Share of frames that are at most so late: of each camera, or of each drive where there are several."""
+    """Cumulative share of frames over latency: of each camera, or of each drive if there are several."""
     title, curves = "distribution", []
     if len(drives) == 1:
         series = drives[0].series
@@ -436,7 +436,7 @@ def _shares(label: str, values: FloatSeries, colour: int | str, **more: Any) -> 
 
 
 def on_track(drive: Series) -> tuple[FloatSeries, FloatSeries, FloatSeries, FloatSeries]:
-    """Time, m east, m north and total bitrate, kbit/s: as measured, or as allocated where nothing was."""
+    """Time, m east, m north and total bitrate, kbit/s: as measured, or as allocated if nothing was."""
     places = drive.positions
     assert places is not None
     t = drive.actual.t if drive.measured else places.t
@@ -447,7 +447,7 @@ def on_track(drive: Series) -> tuple[FloatSeries, FloatSeries, FloatSeries, Floa
 
 
 def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Of the map, m east and north: room around the track, and no side too short for the colour bar."""
+    """Limits of the map, m east and north: room around the track, and no side too short for the colour bar."""
     spans = [float(np.ptp(each)) for each in (places.east, places.north)]
     least = max(FLATTEST * max(spans), SMALLEST_TRACK_M)
     room = 0.06 * max(*spans, SMALLEST_TRACK_M)
@@ -459,7 +459,7 @@ def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]
 
 
 def _arrows(x: FloatSeries, y: FloatSeries) -> Iterable[tuple[float, float, float]]:
-    """Along the way, at even distances."""
+    """Arrows along the way, at even distances."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     for share in np.arange(1, ARROWS + 1) / (ARROWS + 1) if way[-1] > SMALLEST_TRACK_M else ():
         at = int(np.searchsorted(way, share * way[-1]))

@@ -1,4 +1,4 @@
-"""The report's page: one file with data, script and style in it, which asks no other host for anything."""
+"""The report's page: one file that includes data, script and style, and loads nothing from other hosts."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def page(
     """The whole page.
 
     checks   by label of a drive
-    figures  those that lie beside the page as .png and .pdf
-    raises   RunError where plotly is not installed
+    figures  those stored beside the page as .png and .pdf
+    raises   RunError if plotly is not installed
     """
     title = " and ".join(drive.series.label for drive in drives)
     parts = {
@@ -52,17 +52,17 @@ def page(
     }
     text = (STATIC / "report.html").read_text(encoding="utf-8")
     head, *rest = text.split("{{")
-    # One pass: nothing that was filled in is looked at again.
+    # One pass: inserted text is not scanned again.
     return head + "".join(parts[key] + tail for key, tail in (each.split("}}", 1) for each in rest))
 
 
 def _in_script(code: str) -> str:
-    """JavaScript that cannot end the element it stands in."""
+    """JavaScript that cannot end the element that contains it."""
     return code.replace("</script", "<\\/script").replace("<!--", "<\\!--")
 
 
 def _json(document: Any) -> str:
-    """JSON that may stand inside a script element, whatever text it holds."""
+    """JSON that may stand inside a script element, whatever text it contains."""
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
@@ -149,7 +149,7 @@ def _table(caption: str, table: HtmlTable, more: str = "") -> str:
 
 
 def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
-    """What was driven, when, with what, and how it ended."""
+    """Facts about a drive: vehicle, time, rates, modes, rules, and how it ended."""
     series = drive.series
     ends = ", ".join(f"{side}: {'ended cleanly' if clean else 'cut off'}" for side, clean in series.ended.items())
     facts = [
@@ -170,14 +170,14 @@ def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
 
 
 def _rules(series: Series) -> str:
-    """Those of the modes that were in force."""
+    """Rules of the modes that were in force."""
     known = rules(series)
     used = dict.fromkeys(mode for _, mode in series.modes)
     return "; ".join(f"{mode}: {', '.join(known[mode])}" for mode in used if mode in known) or "-"
 
 
 def _versions(drive: DriveStatistics) -> Iterable[tuple[str, str]]:
-    """By side, what it ran."""
+    """Software versions by side."""
     for side, versions in drive.series.versions.items():
         yield side, ", ".join(f"{name} {version}" for name, version in versions.items()) or "-"
 
@@ -194,7 +194,7 @@ def _figure(figure: Figure) -> str:
 
 
 def _reasons(drive: DriveStatistics, of: str) -> str:
-    """The last changes and why; and what was noted."""
+    """The last changes with their reasons, and the notes."""
     last = drive.series.reasons[-LAST_REASONS:]
     rows = [(f"{each.t:.1f}", each.camera, each.reason, each.cause) for each in reversed(last)]
     caption = f"the last {len(rows)} of {len(drive.series.reasons)} changes of factor or sending, newest first"
@@ -227,7 +227,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
 
 
 def _curve(curve: Curve) -> dict[str, Any]:
-    """Thinned; steps where they change, and at their end."""
+    """A thinned curve; steps are kept where they change, and at their end."""
     keys = ("label", "colour", "dash", "width", "steps", "filled")
     x, y = curve.x, curve.y
     kept = np.zeros(x.shape, dtype=bool)

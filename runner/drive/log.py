@@ -1,4 +1,4 @@
-"""The log of one side of a drive, written as lines of JSON while it drives. schemas/drive.schema.json has the lines."""
+"""The log of one side of a drive, written as lines of JSON during the drive. schemas/drive.schema.json defines them."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
-# Records of numbers and of the rules' own words; looking through a decision takes twenty times as long as making it.
+# Records of numbers and of the rules' own texts; redacting a decision takes twenty times as long as making it.
 WITHOUT_ADDRESSES = (DecisionMade, LinkSample, Telemetry)
-RETRY_S = 1.0  # time between attempts to write to a disk that is full
-CLOSE_S = 5.0  # a disk that takes nothing for so long keeps no process from ending
+RETRY_S = 1.0  # time between attempts to write to a full disk
+CLOSE_S = 5.0  # a disk that is stuck for longer does not keep the process from ending
 
 
 class Log:
-    """One side's file in the directory of a drive. May be used from any thread; a slow disk holds up none of them.
+    """One side's file in the directory of a drive. May be used from any thread; a slow disk blocks none of them.
 
-    directory  None: nothing is kept
-    config     the composed configuration; passwords in addresses are not kept
-    versions   of what the drive is made with, by name
-    on_report  called, from a thread of the log, when the file cannot be written, and when it can again
-    raises     UserError where the directory holds a drive already, or cannot be written
+    directory  None: nothing is written
+    config     the composed configuration; passwords in addresses are removed
+    versions   of the software used, by name
+    on_report  called, from a log thread, when the file cannot be written, and when it can again
+    raises     UserError if the directory already holds a drive, or cannot be written
 
     Lines wait in a bounded queue for a thread that writes each with one system call, so that a killed process loses at
-    most what was queued. Lines that find the queue full are dropped, and a line of kind "dropped" counts them.
+    most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them.
     Lines written before `begin` are kept until then.
     """
 
@@ -68,15 +68,15 @@ class Log:
         self._side, self._config, self._versions, self._on_report = side, config, versions, on_report
         self._lock = threading.Lock()
         self._began: float | None = None
-        self._past: float | None = None  # of a drive of the past, the time of its last line
-        self.time = 0.0  # of the beginning, s since 1970
+        self._past: float | None = None  # for a past drive, the time of its last line
+        self.time = 0.0  # of the start, s since 1970
         self._early: list[Json] = []
         self._writer: _Writer | None = None
 
     def begin(self, at: float | None = None) -> None:
-        """Time 0 of the drive.
+        """Set time 0 of the drive.
 
-        at  s since 1970, of a drive of the past whose lines bring their times; None: now
+        at  s since 1970, for a past drive whose lines carry their own times; None: now
         """
         self.time = time.time() if at is None else at
         versions = {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions}
@@ -89,25 +89,25 @@ class Log:
                 self._put(line)
 
     def now(self) -> float:
-        """Time since the beginning, s."""
+        """Time since the start, s."""
         if self._past is not None or self._began is None:
             return self._past or 0.0
         return round(time.monotonic() - self._began, 6)
 
     def event(self, event: Event) -> None:
-        """One line: an event.
+        """Write an event.
 
-        raises  RunError where a drive of the past cannot be written
+        raises  RunError if a past drive cannot be written
         """
         self._write(to_json(event))
 
     def record(self, record: Record) -> None:
-        """One line: a record; raises as `event`."""
+        """Write a record; raises as `event`."""
         line = line_to_json(record)
         self._write(line if isinstance(record, WITHOUT_ADDRESSES) else redacted(line))
 
     def note(self, text: str) -> None:
-        """One line: what a person should know, now."""
+        """Write a note for the user, at the current time."""
         self.record(Note(self.now(), text))
 
     def _write(self, line: Json) -> None:
@@ -120,11 +120,11 @@ class Log:
             self._put(line)
 
     def video(self, camera: str, file: str, captured: float) -> None:
-        """A video file has its first frame, captured then (s since 1970)."""
+        """A video file has started; `captured`: capture time of its first frame, s since 1970."""
         self.record(VideoBegan(self.now(), camera, file, captured))
 
     def close(self) -> None:
-        """The clean end; a drive that never began leaves nothing."""
+        """Close the log cleanly; a drive that never began leaves no file."""
         ended = line_to_json(Ended(self.now()))
         with self._lock:
             if self._past is not None:
@@ -137,7 +137,7 @@ class Log:
             file.close(keep=self._began is not None)
 
     def discard(self) -> None:
-        """Give up the log of a drive of the past that did not come to its end."""
+        """Discard the log of a past drive that was not completed."""
         with self._lock:
             if self._file:
                 self._file.close(keep=False)
@@ -154,12 +154,12 @@ class Log:
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:
-    # Half of a surrogate pair, as a request or a file's name may hold, is written as JSON has it.
+    # Half of a surrogate pair, as a request or a file's name may contain, is written as a JSON escape.
     return (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
 
 
 class _File:
-    """A file that holds whole lines only: a line that did not fit is taken back."""
+    """A file of complete lines only: a partly written line is removed."""
 
     def __init__(self, path: Path, fd: int) -> None:
         self.path, self._fd = path, fd
@@ -185,9 +185,9 @@ class _File:
 
 
 class _Writer:
-    """Writes lines in a thread of its own, so that no disk holds up the thread that has something to log.
+    """Writes lines in its own thread, so that a slow disk does not block the thread that logs.
 
-    dropped    makes the line that counts lines which found the queue full
+    dropped    makes the line that counts the lines dropped while the queue was full
     on_report  called when the file cannot be written, and when it can again
     """
 
@@ -210,7 +210,7 @@ class _Writer:
             self._lost += 1
 
     def close(self, last: bytes) -> None:
-        """Write what is queued and a last line, within a limit."""
+        """Write the queued lines and a last line, within a time limit."""
         until = time.monotonic() + CLOSE_S
         self._closing.set()
         with suppress(queue.Full):
@@ -227,7 +227,7 @@ class _Writer:
         self._file.close(keep=True)
 
     def _written(self, data: bytes) -> bool:
-        """Write a line, however often that takes; False where the log is closed before it is written."""
+        """Write a line, with retries; False if the log is closed before it is written."""
         why = self._file.append(data)
         if why is None:
             return True
@@ -240,7 +240,7 @@ class _Writer:
 
 
 def check_free(directory: Path, side: str) -> None:
-    """raises UserError where this side of a drive is there already; a file without a line is none"""
+    """raises UserError if this side of a drive already exists; an empty file does not count"""
     path = directory / FILES[side]
     try:
         if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
@@ -266,7 +266,7 @@ def _refused(directory: Path, rule: str) -> UserError:
 
 
 def log_run(log: Log, event: Event, before: Run, after: Run) -> None:
-    """Log an event, and what was decided where that changed."""
+    """Log an event, and the decision if it changed."""
     log.event(event)
     if after.commands or after.decision != before.decision:
         log.record(DecisionMade.of(after.state.t, describe(event), after.decision, after.commands))

@@ -1,4 +1,4 @@
-"""A drive as MCAP (https://mcap.dev) for Foxglove: what was logged and what was seen on one clock."""
+"""A drive as MCAP (https://mcap.dev) for Foxglove: logs and video on one clock."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from runner.apply import Unit
 
 SECOND_NS = 1_000_000_000
-# A frame of the file and one of the log that are further apart are not the same; less than most cameras' gap.
+# A frame of the file and one of the log further apart than this differ; less than most cameras' frame interval.
 SAME_NS = 20_000_000
-TELL_EVERY = 500  # messages between two tellings of progress
-# By kind of line, its topic. Notes become foxglove.Log, positions also foxglove.LocationFix, videos their pictures.
+TELL_EVERY = 500  # messages between two reports of progress
+# Topic by kind of line. Notes become foxglove.Log, positions also foxglove.LocationFix, videos CompressedVideo.
 TOPICS = {
     "decision": "/decision",
     "telemetry": "/telemetry",
@@ -40,7 +40,7 @@ ReadVideo = Callable[[Path], Iterator["Unit"]]
 
 
 class McapMessage(NamedTuple):
-    """What is to be written, and for when.
+    """A message to write, and its time.
 
     ns  since 1970
     """
@@ -56,14 +56,14 @@ def write_mcap(
     on_warning: Callable[[str], None],
     progress: Callable[[float], None] = lambda done: None,
 ) -> int:
-    """All of a drive in the order of time, in compressed chunks with checksums.
+    """Write all of a drive in time order, in compressed chunks with checksums.
 
-    file        takes the bytes
-    read_video  gives the pictures of a file
-    on_warning  called with a line on what is left out
-    progress    called now and then with the share that is done
+    file        receives the bytes
+    read_video  yields the pictures of a file
+    on_warning  called with a line about each omission
+    progress    called now and then with the share done
     returns     number of messages
-    raises      RunError where the file cannot be written
+    raises      RunError if the file cannot be written
     """
     import foxglove
     from foxglove.mcap import MCAPCompression, MCAPWriteOptions
@@ -88,7 +88,7 @@ def write_mcap(
 
 
 class _Out:
-    """The file as the writer sees it: always in good health. What failed is raised where somebody hears it."""
+    """The file as the writer sees it, which never fails: `check` raises the error where it can be handled."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -118,14 +118,14 @@ class _Out:
 
 
 class _Channels:
-    """The topics, each made when its first message comes."""
+    """The topics, each created with its first message."""
 
     def __init__(self, context: Any, cameras: Iterable[str]) -> None:
         self._context, self._cameras = context, list(cameras)
         self._made: dict[str, Any] = {}
 
     def tell(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
-        """A line of JSON, with the definition that it keeps to."""
+        """Write a line of JSON, with the schema definition that it satisfies."""
         if topic not in self._made:
             self._made[topic] = self._json_channel(topic, schema, definition)
         self._made[topic].log(json.dumps(line, ensure_ascii=False).encode(), log_time=ns)
@@ -177,7 +177,7 @@ class _Channels:
 
 
 def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
-    """A schema without references, and with the cameras by name: Foxglove then offers each number for plots.
+    """A schema without references, and with the cameras by name, so that Foxglove offers each number for plots.
 
     home  name of the schema that it is a part of
     """
@@ -198,9 +198,9 @@ def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
 def _streams(
     drive: Drive, channels: _Channels, read_video: ReadVideo, on_warning: Callable[[str], None]
 ) -> Iterator[Iterator[McapMessage]]:
-    """Messages by where they come from, each in the order of time."""
+    """Messages by source, each in time order."""
     for name, side in drive.sides.items():
-        # Where the vehicle did not log, the operator knows where it was.
+        # If the vehicle did not log, the operator's log has its positions.
         yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
         for camera, files in _files(side).items():
             known = _captures(side, camera)
@@ -218,7 +218,7 @@ def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Itera
 def _writers(
     name: str, line: Event | Record, channels: _Channels, positions: bool, ns: int
 ) -> Iterator[Callable[[], None]]:
-    """What becomes of one line."""
+    """The messages of one line."""
     if isinstance(line, Event):
         event = NAMES[type(line)]
         yield lambda: channels.tell(f"/events/{event}", "event", event, event_to_json(line), ns)
@@ -235,7 +235,7 @@ def _writers(
 
 
 def _files(side: Side) -> dict[str, list[VideoBegan]]:
-    """By camera, its video files, by the time of their first frames."""
+    """By camera, its video files, in the order of their first frames."""
     files: dict[str, list[VideoBegan]] = {}
     for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
         files.setdefault(line.camera, []).append(line)
@@ -252,9 +252,9 @@ def _pictures(
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
 ) -> Iterator[McapMessage]:
-    """The frames of one camera on one side, at the times of their capture.
+    """The frames of one camera on one side, at their capture times.
 
-    known  capture times from the log, ns since 1970, rising
+    known  capture times from the log, ns since 1970, increasing
     """
     topic = topic.format(camera=camera)
     last = -1
@@ -267,7 +267,7 @@ def _pictures(
             offset = 0
             for unit in read_video(directory / line.file):
                 offset = follow(known, first + unit.after_ns, offset)
-                # A pipeline that was built anew begins after the one before has ended, but clocks may be set.
+                # A rebuilt pipeline begins after the previous one has ended, but clocks may be set.
                 last = max(first + unit.after_ns + offset, last + 1)
                 yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
@@ -275,7 +275,7 @@ def _pictures(
 
 
 def _captures(side: Side, camera: str) -> list[int]:
-    """When the frames that came of a camera were captured, ns since 1970, rising; nothing where the log has no word."""
+    """Capture times of a camera's received frames, ns since 1970, increasing; empty if they were not logged."""
     samples = (sample.cameras[camera] for sample in side.of(Sample) if camera in sample.cameras)
     arrivals = (arrival for sample in samples for arrival in sample.arrivals)
     began = side.began.time
@@ -285,14 +285,14 @@ def _captures(side: Side, camera: str) -> list[int]:
 
 
 def follow(known: Sequence[int], ns: int, offset: int) -> int:
-    """What is to be added to a frame's time in a file, ns, so that it is when the frame was captured.
+    """The offset to add to a frame's time in a file, ns, to get its capture time.
 
-    known   capture times from the log, rising, ns
+    known   capture times from the log, increasing, ns
     ns      the frame's time by the file alone
-    offset  what the frame before needed
+    offset  that of the previous frame
 
-    A receiver smooths times, and takes away slowly by how much the first frame was late: 0.1 s and more. What is
-    missing in file or log does not lead to the wrong frame, as each is looked for near where the one before was found.
+    A receiver smooths times, and slowly removes the delay of the first frame: 0.1 s and more. Frames missing in file or
+    log do not lead to a wrong match, as each frame is searched for near the match of the previous one.
     """
     wanted = ns + offset
     at = bisect_left(known, wanted)
@@ -306,7 +306,7 @@ def _cameras(drive: Drive) -> list[str]:
 
 
 def _span(drive: Drive) -> tuple[int, int]:
-    """From when to when the drive was, ns since 1970."""
+    """Start and end of the drive, ns since 1970."""
     began = [side.began.time for side in drive.sides.values()]
     ended = [side.began.time + line.t for side in drive.sides.values() for line in side.lines[-1:]]
     return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)

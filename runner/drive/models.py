@@ -13,13 +13,13 @@ from runner.errors import UserError
 def find_models(
     config: Mapping[str, Any], directory: Path | None, bases: Sequence[Path]
 ) -> tuple[dict[str, Model], list[str]]:
-    """The models there are.
+    """The available models.
 
     config     of the drive; a camera may name its model as `rate_quality.model`
-    directory  where models are looked up by the name of their camera, or by the name the configuration gives; or None
-    bases      where a model that the configuration names is looked up, first match wins
-    returns    by camera; and a line on the cameras without one
-    raises     UserError for a directory that is none, or a file that is no model
+    directory  in which models are looked up by the name of their camera, or by the name in the configuration; or None
+    bases      directories in which a model named by the configuration is looked up, first match wins
+    returns    by camera; and a line about the cameras without one
+    raises     UserError if the directory does not exist, or a file is not a model
     """
     if directory is not None and not directory.is_dir():
         raise UserError("command line", "models", repr(str(directory)), "no such directory")

@@ -1,4 +1,4 @@
-"""The figures in a column's width of a paper, as PNG and PDF."""
+"""The figures at the column width of a paper, as PNG and PDF."""
 
 from __future__ import annotations
 
@@ -61,41 +61,41 @@ STYLE: dict[Any, Any] = {
     "legend.handletextpad": 0.5,
     "legend.borderaxespad": 0.0,
     "text.parse_math": False,  # a drive's name may hold any character
-    "pdf.fonttype": 42,  # fonts as text, as journals want them
+    "pdf.fonttype": 42,  # fonts as text, as journals require
     "savefig.dpi": 300,
 }
-CHART_IN, LINE_IN = 1.15, 0.115  # height of a chart without what is around it, and of a line of text
-LEGEND_IN = 0.38  # under the panel: below the numbers and the label of the axis
+CHART_IN, LINE_IN = 1.15, 0.115  # height of a chart without its surroundings, and of a line of text
+LEGEND_IN = 0.38  # under the panel: below the numbers and label of the axis
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.2)), (0, (1.4, 0.9)), (0, (5, 1, 1.2, 1)))
-SEEN = 0.006  # of the axis: the least width of a freeze that is seen
-LETTERS = 70  # that fit into a line of a legend as wide as the column
+SEEN = 0.006  # of the axis: the smallest visible width of a freeze
+LETTERS = 70  # that fit into a legend line of column width
 
 
 def write_figures(figures: Sequence[Figure], directory: Path, progress: Progress) -> None:
     """Write each figure as .png and .pdf.
 
-    raises  RunError where a file cannot be written
+    raises  RunError if a file cannot be written
     """
     for number, figure in enumerate(figures):
         progress("figures", number / len(figures))
         sheet = drawn(figure)
         for form in FORMATS:
             write_whole(directory / f"{figure.name}.{form}", _rendered(sheet, form))
-            sheet.set_layout_engine("none")  # the first has laid it out
+            sheet.set_layout_engine("none")  # already laid out for the first format
     progress("figures", 1.0)
 
 
 @mpl.rc_context(STYLE)
 def _rendered(sheet: Sheet, form: str) -> bytes:
     buffer = io.BytesIO()
-    # Without a date in it the same drive gives the same file.
+    # Without a date, the same drive gives the same file.
     sheet.savefig(buffer, format=form, metadata={"CreationDate": None} if form == "pdf" else None)
     return buffer.getvalue()
 
 
 @mpl.rc_context(STYLE)
 def drawn(figure: Figure) -> Sheet:
-    """Rows of charts on a sheet; those that share axis of x and legend have both once, below the last."""
+    """Rows of charts on a sheet; those with the same x axis and legend show both once, below the last."""
     rows, columns = figure.rows, max(map(len, figure.rows))
     last = [below is None or _below(row) != _below(below) for row, below in zip_longest(rows, rows[1:])]
     strips = [_strip_height(row[0].strip) if row[0].strip else 0.0 for row in rows]
@@ -126,7 +126,7 @@ def drawn(figure: Figure) -> Sheet:
 
 
 def _below(row: Sequence[Chart]) -> object:
-    """What stands below a row of charts."""
+    """Axis and legends below a row of charts."""
     legends = [[(curve.label, curve.colour, curve.dash) for curve in chart.curves] for chart in row]
     return [chart.x for chart in row if chart.curves] or row, legends
 
@@ -134,7 +134,7 @@ def _below(row: Sequence[Chart]) -> object:
 def _height(chart: Chart) -> float:
     if chart.track is None:
         return CHART_IN
-    return 2.4 * (chart.y.high - chart.y.low) / (chart.x.high - chart.x.low)  # of a map that fills the width
+    return 2.4 * (chart.y.high - chart.y.low) / (chart.x.high - chart.x.low)  # for a map that fills the width
 
 
 def _draw(axes: Axes, chart: Chart) -> None:
@@ -194,9 +194,9 @@ def _strip_height(strip: Strip) -> float:
 
 
 def _draw_track(axes: Axes, track: MapTrack) -> None:
-    """The way, where it begins and ends, arrows along it, and the bitrate by colour."""
+    """The way, its start and end, arrows along it, and the bitrate by colour."""
     x, y = track.way
-    viridis = ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.93, 256)))  # its lightest is not seen on white
+    viridis = ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.93, 256)))  # its lightest is invisible on white
     style: dict[str, Any] = {"mfc": "white", "mec": "black", "ls": ""}
     axes.plot(x, y, color=NAMED["link"], lw=1.2, zorder=1)  # also where no bitrate is known
     points = axes.scatter(track.east, track.north, c=track.kbps, s=7, lw=0, cmap=viridis, zorder=2)
@@ -217,13 +217,13 @@ def _draw_track(axes: Axes, track: MapTrack) -> None:
 
 
 def _across(labels: Iterable[str], columns: int) -> int:
-    """As many names as fit beside each other."""
+    """Number of labels that fit side by side."""
     longest = max((len(label) for label in labels), default=1)
     return max(1, min(4, LETTERS // columns // (min(longest, LETTERS // columns) + 5)))
 
 
 def _lines(row: Sequence[Chart], columns: int) -> int:
-    """Lines of text that the legends below a row take, and a few for where they stand."""
+    """Lines of text that the legends below a row take, plus a margin."""
     labels = [[_wrapped(curve.label, columns) for curve in chart.curves] for chart in row]
     lines = [sum(label.count("\n") + 1 for label in each) / _across(each, columns) for each in labels if each]
     return ceil(max(lines)) + 2 if lines else 0

@@ -1,4 +1,4 @@
-"""Drives as they lie on disk, read back and checked."""
+"""Drives on disk, read back and checked."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ SKIPPED_KINDS = (
     "video",
     "dropped",
     "ended",
-)  # where the vehicle's events alone are wanted
+)  # if only the vehicle's events are wanted
 
 
 @dataclass(frozen=True)
 class Side:
-    """What one side wrote.
+    """The log of one side.
 
-    lines  events and records between its first line and the end, in their order
-    ended  whether it came to a clean end
+    lines  events and records between its first line and the end, in order
+    ended  whether it was closed cleanly
     """
 
     began: Began
@@ -47,7 +47,7 @@ class Drive:
     """A directory that `log=` wrote.
 
     sides     by name: vehicle, operator, link; a drive may lack any of them
-    warnings  what a person should know before trusting it
+    warnings  caveats for the user
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Drive:
 
 
 def read_drive(directory: Path) -> Drive:
-    """All that lies in the directory of a drive.
+    """Everything in the directory of a drive.
 
     raises  UserError with file and line of the first mistake
     """
@@ -98,7 +98,7 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
 def check_began(line: Json | None, name: str) -> Began:
     """The first line of a drive's file.
 
-    raises  UserError where it is another
+    raises  UserError if it is something else
     """
     if line is None:
         raise UserError(name, "", None, "is empty: nothing was logged")
@@ -116,9 +116,9 @@ def read_lines(
 ) -> Iterator[tuple[int, Json]]:
     """The lines of a drive's file with their numbers, each checked against its schema.
 
-    events  give events only, and the beginning; what else a side wrote is not looked at
+    events  yield events and the first line only; other lines of a side are not checked
 
-    In a drive, a last line without an end, which a killed process left, is left out with a warning.
+    An incomplete last line of a drive, left by a killed process, is skipped with a warning.
 
     raises  UserError with the number of the first line that is wrong
     """

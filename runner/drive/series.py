@@ -1,8 +1,8 @@
 """From the lines of a drive to quantities over time: one time axis for all sides, arrays for figures. Pure.
 
-The axis is s since the vehicle's log began, or the operator's where the vehicle kept none; sides are joined by the
+The axis is s since the vehicle's log began, or the operator's if the vehicle kept none; sides are aligned by the
 epoch time in their first lines, so that clocks that differ shift the sides against each other. Bitrates are kbit/s.
-`nan` stands for what is not known at a time.
+`nan` stands for a value unknown at a time.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ FloatSeries = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 T = TypeVar("T")
 
-RATE_WINDOW_S = 1.0  # rates of what was sent are taken over at least this long, as the operator's are
+RATE_WINDOW_S = 1.0  # rates of sent video are measured over at least this long, as the operator's are
 DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
-PANEL_CAMERAS = 4  # as many curves can be distinguished in one panel; more are split where the mounting gives no groups
+PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
 
 class TimeSeries(NamedTuple):
-    """A quantity over time: t s, rising; y its values."""
+    """A quantity over time: t s, increasing; y its values."""
 
     t: FloatSeries
     y: FloatSeries
@@ -52,7 +52,7 @@ class TimeSeries(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DecidedSeries:
-    """What was decided for one camera, each entry in force until the next.
+    """The decisions for one camera, each entry in force until the next.
 
     roi_share  pixels of the region of interest over those of the full image
     scaling    nan while the camera is off
@@ -70,16 +70,16 @@ class DecidedSeries:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedSeries:
-    """What the operator got of one camera. Counters run on where the log's own began again from 0.
+    """What the operator received from one camera. Counters continue where the log's own restarted from 0.
 
     t                        s, of each sample
     kbps                     over the second before
     width, height            px of the picture, 0 before the first
-    latency_ms               capture to decode of the last sampled frame, nan where it is not known
+    latency_ms               capture to decode of the last sampled frame, nan if unknown
     frames, bytes            counters at each sample
     lost, rebuilt            packets, counters at each sample
-    arrival_t, arrival_ms    when each access unit came, s, and its latency from capture to arrival, likewise
-    clocks_ms                time of arrival by the operator's clock less time of capture by the vehicle's
+    arrival_t, arrival_ms    arrival of each access unit, s, and its latency from capture to arrival, likewise
+    clocks_ms                time of arrival by the operator's clock minus time of capture by the vehicle's
     """
 
     t: FloatSeries
@@ -98,7 +98,7 @@ class ReceivedSeries:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """What the vehicle's encoder has put out: counters that run on, and the rate over the last second."""
+    """Output of the vehicle's encoder: continuous counters, and the rate over the last second."""
 
     t: FloatSeries
     frames: FloatSeries
@@ -117,14 +117,14 @@ class CameraSeries:
 
     @property
     def actual(self) -> TimeSeries:
-        """The bitrate as received, or as sent where no operator logged."""
+        """The bitrate as received, or as sent if no operator logged."""
         source = self.received or self.sent
         return TimeSeries(source.t, source.kbps) if source else EMPTY
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """Where the vehicle was: degrees, and m east and north of its first place."""
+    """Positions of the vehicle: degrees, and m east and north of the first one."""
 
     t: FloatSeries
     lat: FloatSeries
@@ -135,7 +135,7 @@ class Positions:
 
 @dataclass(frozen=True, slots=True)
 class LinkSeries:
-    """The limited link of an experiment: rate in force, kbit/s; wait of a packet, ms; packets dropped so far."""
+    """The limited link of an experiment: rate in force, kbit/s; queueing delay, ms; packets dropped so far."""
 
     t: FloatSeries
     kbps: FloatSeries
@@ -163,15 +163,15 @@ class Panel(NamedTuple):
 class Series:
     """A drive over time.
 
-    label      what it is called beside others
+    label      its name among others
     began      s since 1970 at t = 0
     end        s; the last line of the side that gives the axis
-    measured   "received" or "sent": what `actual` is; "" where neither was logged
+    measured   "received" or "sent": what `actual` is; "" if neither was logged
     predicted, allocated  each value holds until the next
     modes      (from s, mode)
     notes      (s, text)
-    refused    requests
-    ended      by side, whether its log was ended cleanly
+    refused    number of requests
+    ended      by side, whether its log was closed cleanly
     """
 
     label: str
@@ -203,26 +203,26 @@ EMPTY = TimeSeries(np.empty(0), np.empty(0))
 def series(drive: Drive, label: str = "") -> Series:
     """A drive's quantities over time.
 
-    label   what it is called beside others, its name where that is enough
-    raises  UserError where nothing was logged but the beginning, or nothing was decided yet
+    label   its name among others; "": the drive's own name
+    raises  UserError if only the first line was logged, or nothing was decided yet
     """
     return _series(drive, label or drive.name)
 
 
 def held(line: TimeSeries, at: FloatSeries) -> FloatSeries:
-    """What of a quantity whose values hold until the next is in force at some times; nan before the first."""
+    """Values in force at some times, of a quantity whose values hold until the next; nan before the first."""
     index = np.searchsorted(line.t, at, "right") - 1
     return np.where(index >= 0, line.y[np.maximum(index, 0)], np.nan) if line.t.size else np.full(at.shape, np.nan)
 
 
 def spans(t: FloatSeries, begin: float, end: float) -> FloatSeries:
-    """How long each entry of something that holds until the next is in force within [begin, end], s."""
+    """How long each entry of a series whose values hold until the next is in force within [begin, end], s."""
     edges = np.clip(np.append(t, end), begin, end)
     return np.asarray(np.diff(edges))
 
 
 def mean_held(line: TimeSeries, begin: float, end: float) -> float:
-    """Mean over time of a quantity whose values hold until the next; nan where none is known."""
+    """Mean over time of a quantity whose values hold until the next; nan if none is known."""
     weights = spans(line.t, begin, end)
     known = np.isfinite(line.y) & (weights > 0)
     return float(np.average(line.y[known], weights=weights[known])) if known.any() else float("nan")
@@ -241,11 +241,11 @@ def sending_spans(decided: DecidedSeries, end: float) -> list[tuple[float, float
     return found
 
 
-# --- the whole --------------------------------------------------------------------------------------------------------
+# --- the whole drive --------------------------------------------------------------------------------------------------
 
 
 class _Shifted(NamedTuple):
-    """The lines of a side, to be read with `t` on the drive's axis."""
+    """The lines of a side, with the shift of `t` to the drive's axis."""
 
     lines: Sequence[Event | Record]
     shift: float
@@ -296,7 +296,7 @@ def _series(drive: Drive, label: str) -> Series:
 
 
 def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
-    """What looks wrong about the clocks of the two sides."""
+    """Problems with the clocks of the two sides."""
     if {"vehicle", "operator"} <= sides.keys() and not samples:
         yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
     received = [camera.received for camera in cameras.values() if camera.received]
@@ -315,7 +315,7 @@ def _line(points: Iterable[tuple[float, float | None]]) -> TimeSeries:
 
 
 def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> TimeSeries:
-    """Predictions as they came, or what the samples say was in force."""
+    """Predictions as received, or those in force according to the samples."""
     events = vehicle.of(BitratePredicted)
     if events:
         return _line((t, float(event.kbps)) for t, event in events)
@@ -323,7 +323,7 @@ def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[An
 
 
 def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeSeries:
-    """Measured total; unknown before the first second of video, whose rate is taken over a window yet to fill."""
+    """Measured total; unknown before the first second of video, while the window of the rate is still filling."""
     received = [camera.received for camera in cameras.values() if camera.received]
     if received:
         t, y = _line((t, sample.actual_kbps) for t, sample in samples)
@@ -340,16 +340,16 @@ def _link(lines: Sequence[Any]) -> LinkSeries | None:
 
 
 def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
-    """As the vehicle received them, or else as the operator received them; None where there are none.
+    """As the vehicle received them, otherwise as the operator received them; None if there are none.
 
-    Metres by equirectangular projection around the first place, right for some km.
+    Metres by equirectangular projection around the first place, accurate for some km.
     """
     known: list[tuple[float, PositionReported | Position]] = [*vehicle.of(PositionReported)]
     known = known or [(t, sample.position) for t, sample in samples if sample.position]
     if not known:
         return None
     t, lat, lon = np.array([(t, place.lat, place.lon) for t, place in known], dtype=float).T
-    around = np.remainder(lon - lon[0] + 180, 360) - 180  # also where the drive crosses the 180th meridian
+    around = np.remainder(lon - lon[0] + 180, 360) - 180  # also if the drive crosses the 180th meridian
     east = np.radians(around) * np.cos(np.radians(lat[0])) * EARTH_M
     return Positions(t, lat, lon, east, np.radians(lat - lat[0]) * EARTH_M)
 
@@ -363,7 +363,7 @@ def _modes(decisions: Sequence[Any]) -> Iterator[tuple[float, str]]:
 
 
 def _reasons(decisions: Sequence[Any]) -> Iterator[Reason]:
-    """Each change of factor or sending, as the vehicle reports them while it drives."""
+    """Each change of factor or sending, as the vehicle reports them during the drive."""
     last: Mapping[str, CameraDecision] = {}
     for t, line in decisions:
         for name, now in line.cameras.items():
@@ -419,7 +419,7 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
-    moved = np.diff(frames, prepend=0) > 0  # else the latency is that of a frame already counted
+    moved = np.diff(frames, prepend=0) > 0  # otherwise the latency is that of a frame already counted
     return ReceivedSeries(
         t=t,
         kbps=_settled(t, column("kbps"), frames),
@@ -434,7 +434,7 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
 
 
 def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, CameraSeries]:
-    """Without the latencies around those that are negative: all cameras of a vehicle have its clock."""
+    """Without the latencies around negative ones: all cameras of a vehicle share its clock."""
     received = {name: camera.received for name, camera in cameras.items() if camera.received}
     ahead = [got.arrival_t[got.clocks_ms < CLOCKS_APART_MS] for got in received.values()]
     ahead += [got.t[got.latency_ms < CLOCKS_APART_MS] for got in received.values()]
@@ -448,7 +448,7 @@ def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, Came
 
 
 def _known(t: FloatSeries, ms: FloatSeries, apart: FloatSeries) -> FloatSeries:
-    """Latencies, nan where one is negative or was, or will be, within `TRUSTED_AGAIN_S`."""
+    """Latencies, nan if negative or within `TRUSTED_AGAIN_S` before or after a negative one."""
     near = np.searchsorted(apart, t + TRUSTED_AGAIN_S, "right") > np.searchsorted(apart, t - TRUSTED_AGAIN_S)
     return np.where(near | (ms < 0), np.nan, ms)
 
@@ -461,13 +461,13 @@ def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:
 
 
 def _settled(t: FloatSeries, kbps: FloatSeries, frames: FloatSeries) -> FloatSeries:
-    """A rate that is nan until its window has filled with video twice: the first holds what waited for the line."""
+    """A rate that is nan until its window has filled with video twice: the first includes the backlog."""
     came = t[frames > 0]
     return np.where(t >= (came[0] if came.size else np.inf) + 2 * RATE_WINDOW_S, kbps, np.nan)
 
 
 def counted(counter: FloatSeries) -> FloatSeries:
-    """A running counter that goes on where the logged one began again from 0."""
+    """A running counter that continues where the logged one restarted from 0."""
     if not counter.size:
         return counter
     steps = np.diff(counter)
@@ -475,7 +475,7 @@ def counted(counter: FloatSeries) -> FloatSeries:
 
 
 def rate(t: FloatSeries, sizes: FloatSeries) -> FloatSeries:
-    """kbit/s at each time over the second before, from a running counter of bytes; nan before there is a second."""
+    """kbit/s at each time over the second before, from a running counter of bytes; nan in the first second."""
     before = np.searchsorted(t, t - RATE_WINDOW_S + 1e-6, "right") - 1
     known = before >= 0
     first = np.maximum(before, 0)
@@ -489,11 +489,11 @@ def rate(t: FloatSeries, sizes: FloatSeries) -> FloatSeries:
 def panels(cameras: Mapping[str, Any]) -> tuple[Panel, ...]:
     """Which cameras share a panel: those that look along the road, and those pitched down at the surroundings.
 
-    cameras  the configuration's, with `pose` and `place` where they are mounted
+    cameras  the configuration's, with `pose` and `place` if they are mounted
     returns  one or two panels, cameras in the configuration's order
 
-    On the paper's vehicle these are the front- and rear-mounted ones and the top views, as in its figures. Where pitch
-    tells no difference, up to four cameras share one panel; more are split in half, in the order of their tiles.
+    On the paper's vehicle these are the front- and rear-mounted ones and the top views, as in its figures. If pitch
+    makes no difference, up to four cameras share one panel; more are split in half, in the order of their tiles.
     """
     down = [name for name, camera in cameras.items() if (camera.get("pose") or {}).get("pitch_deg", 0) > DOWN_DEG]
     along = [name for name in cameras if name not in down]
@@ -512,7 +512,7 @@ def _tile(camera: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _panel(names: Iterable[str]) -> Panel:
-    """Called after what the names begin with, or after its only camera."""
+    """Named after the prefixes of the cameras' names, or after its only camera."""
     cameras = tuple(names)
     if len(cameras) == 1:
         return Panel(cameras[0], cameras)

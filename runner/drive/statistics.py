@@ -1,7 +1,7 @@
-"""What a drive comes to in figures: bitrates, latencies, freezes, losses, estimated quality. Pure.
+"""A drive in figures: bitrates, latencies, freezes, losses, estimated quality. Pure.
 
-Means over time are taken while the operator received, or while the vehicle sent where no operator logged. `nan` stands
-for what is not known; in JSON it is null.
+Means over time are taken while the operator received, or while the vehicle sent if no operator logged. `nan` stands
+for unknown values; in JSON it is null.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from runner.drive.series import (
     spans,
 )
 
-FREEZE_GAPS = 30  # gaps that the mean is taken over (W3C webrtc-stats, freezeCount)
+FREEZE_GAPS = 30  # gaps over which the mean is taken (W3C webrtc-stats, freezeCount)
 FREEZE_FACTOR = 3.0  # of the mean gap
 FREEZE_MORE_S = 0.15  # over the mean gap
-FREEZE_STALLED_S = 2.0  # a stream that stops before it can be judged so, and for so long
-FREEZE_FIRST = 5  # gaps before a gap can be judged; the text leaves it open, libwebrtc waits for as many
+FREEZE_STALLED_S = 2.0  # a stream that stops for this long before the criterion applies
+FREEZE_FIRST = 5  # gaps before a gap can be judged; the specification leaves it open, libwebrtc uses the same
 SECOND_S = 1.0
 NAN = float("nan")
 
 
 class Freeze(NamedTuple):
-    """A picture that stood still: from when, s, and for how long, s."""
+    """A frozen picture: its start, s, and duration, s."""
 
     t: float
     seconds: float
@@ -52,7 +52,7 @@ class Latency(NamedTuple):
 
 
 class PerSecond(NamedTuple):
-    """Latency of the frames of all cameras in each second: where it begins, s; median and 95th percentile, ms."""
+    """Latency of the frames of all cameras in each second: its start, s; median and 95th percentile, ms."""
 
     t: FloatSeries
     median: FloatSeries
@@ -60,7 +60,7 @@ class PerSecond(NamedTuple):
 
 
 class RateCurve(NamedTuple):
-    """Quality of one factor as measured: kbit/s that came out of the encoder, rising, and the quality."""
+    """Measured quality of one factor: kbit/s out of the encoder, increasing, and the quality."""
 
     kbps: FloatSeries
     quality: FloatSeries
@@ -68,7 +68,7 @@ class RateCurve(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """Quality by a rate-quality model: a curve by factor, in units of the metric."""
+    """Quality by a rate-quality model: one curve per factor, in units of the metric."""
 
     metric: str
     curves: Mapping[float, RateCurve]
@@ -76,16 +76,16 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Estimated quality of one camera over time, of each picture against the scene that it shows.
+    """Estimated quality of one camera over time, of each picture compared with the scene that it shows.
 
-    While a picture stands still it keeps the quality it had. What it lacks against the scene as it is by then is not in
-    it: that would take the pictures. So `mean` is an upper bound, reached where nothing moves, and says little without
-    the share of the time in which pictures stood still (`CameraStatistics.frozen`).
+    While a picture is frozen it keeps the quality it had. Its difference from the scene as it has become is not
+    included: that would require the pictures. So `mean` is an upper bound, reached if nothing moves, and says little
+    without the share of the time in which pictures were frozen (`CameraStatistics.frozen`).
 
-    line     in units of the metric; nan while nothing was shown, the rate is not known or the factor was not measured
-    moving   mean of the time in which pictures moved
-    clamped  share of the values while pictures moved at bitrates outside the measured ones, where the nearest stands in
-    unknown  factors that were in force and are not in the model
+    line     in units of the metric; nan while nothing was shown, the rate is unknown or the factor was not measured
+    moving   mean over the time in which pictures moved
+    clamped  share of the values while pictures moved at bitrates outside the measured ones, where the nearest is used
+    unknown  factors in force that are not in the model
     """
 
     metric: str
@@ -108,9 +108,9 @@ class CameraStatistics:
     factors           share of the time by factor, 0 for off or paused
     sizes             share of the time by size of the picture, px
     arrival, decode   latency from capture to arrival, and to decode, ms
-    freezes           None where arrivals were not logged
-    frozen            share of `sending_s` in which the picture stood still; nan where arrivals were not logged
-    lost, rebuilt     packets; None where no operator logged
+    freezes           None if arrivals were not logged
+    frozen            share of `sending_s` in which the picture was frozen; nan if arrivals were not logged
+    lost, rebuilt     packets, pipelines; None if no operator logged
     quality           None without a rate-quality model
     """
 
@@ -159,7 +159,7 @@ class DriveStatistics:
 def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> DriveStatistics:
     """All figures of a drive.
 
-    models  by camera, where there is one
+    models  by camera, if there is one
     """
     models = models or {}
     cameras = {name: camera_statistics(c, drive.end, models.get(name)) for name, c in drive.cameras.items()}
@@ -223,12 +223,12 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
 
 
 def _arrivals_logged(received: ReceivedSeries) -> bool:
-    """An operator that logged frames but no arrivals kept none of them."""
+    """Whether arrivals were logged; False if there are frames but no arrivals."""
     return bool(received.arrival_t.size) or not received.frames[-1]
 
 
 def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
-    """What is missing, and what to know of the estimates of quality."""
+    """Missing data, and caveats of the quality estimates."""
     if not drive.measured:
         yield "neither sent nor received video was logged: only decisions are known"
     if drive.positions is None:
@@ -257,22 +257,22 @@ def _part(share: float) -> str:
 
 
 def latency(values: FloatSeries) -> Latency:
-    """Median, 95th and 99th percentile by linear interpolation; nan of none."""
+    """Median, 95th and 99th percentile by linear interpolation; nan if there are none."""
     known = values[np.isfinite(values)]
     return Latency(*map(float, np.percentile(known, (50, 95, 99)))) if known.size else Latency()
 
 
 def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> list[Freeze]:
-    """Where the picture stood still.
+    """The freezes of a picture.
 
         gap >= max(3 * mean, mean + 150 ms)      mean: of the last 30 gaps before it    (W3C webrtc-stats, freezeCount)
 
-    arrivals  s, rising: when each access unit came; they stand for the frames that the definition counts when rendered
-    sending   when the camera was to be sent; gaps reach over none of the pauses between, and the mean starts anew
-    returns   the whole gap of each, as totalFreezesDuration takes it
+    arrivals  s, increasing: arrival of each access unit; they replace the rendered frames that the definition counts
+    sending   when the camera was to be sent; gaps do not span the pauses between, and the mean starts anew
+    returns   the whole gap of each, as in totalFreezesDuration
 
-    The definition counts a freeze when the next frame comes. A stream that stops for good while it is to be sent is
-    counted too, up to the end of the span, and one that never begins: else the worst case would look perfect.
+    The definition counts a freeze when the next frame arrives. A stream that stops for good while it is to be sent is
+    counted too, up to the end of the span, and one that never begins: otherwise the worst case would look perfect.
     """
     found = []
     for begin, until in sending:
@@ -293,7 +293,7 @@ def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> li
 
 
 def per_second(drive: Series) -> PerSecond:
-    """Latency over time across all cameras: to arrival where arrivals were logged, else to decode."""
+    """Latency over time across all cameras: to arrival if arrivals were logged, otherwise to decode."""
     times, values = latencies(drive)
     edges = np.arange(0.0, drive.end + SECOND_S, SECOND_S)
     order = np.argsort(times, kind="stable")
@@ -303,7 +303,7 @@ def per_second(drive: Series) -> PerSecond:
 
 
 def latencies(drive: Series, camera: str | None = None) -> tuple[FloatSeries, FloatSeries]:
-    """When and how late, s and ms, for each frame of one or of all cameras that a latency is known of."""
+    """Time and latency, s and ms, of each frame of one or of all cameras whose latency is known."""
     chosen = [drive.cameras[camera]] if camera else list(drive.cameras.values())
     received = [c.received for c in chosen if c.received]
     if to_arrival(drive):
@@ -316,7 +316,7 @@ def latencies(drive: Series, camera: str | None = None) -> tuple[FloatSeries, Fl
 
 
 def to_arrival(drive: Series) -> bool:
-    """Whether latencies to the arrival are known; else they are those of sampled frames to their decode."""
+    """Whether latencies to arrival are known; otherwise they are those of sampled frames to decode."""
     received = (c.received for c in drive.cameras.values())
     return any(got is not None and bool(np.isfinite(got.arrival_ms).any()) for got in received)
 
@@ -329,14 +329,14 @@ def together(values: Iterable[FloatSeries]) -> FloatSeries:
 
 
 def factor_shares(camera: CameraSeries, begin: float, end: float) -> dict[float, float]:
-    """Share of the time in which each factor was in force, rising; 0 stands for off or paused."""
+    """Share of the time in which each factor was in force, increasing; 0 stands for off or paused."""
     decided = camera.decided
     factors = np.where(decided.sending & np.isfinite(decided.scaling), decided.scaling, 0.0)
     return _shares([float(factor) for factor in factors], spans(decided.t, begin, end))
 
 
 def size_shares(camera: CameraSeries, begin: float, end: float) -> dict[tuple[int, int], float]:
-    """Share of the time by size of the picture received, or of the one decided where no operator logged, px."""
+    """Share of the time by size of the picture received, or of the one decided if no operator logged, px."""
     received, decided = camera.received, camera.decided
     t, width, height = (
         (received.t, received.width, received.height) if received else (decided.t, decided.width, decided.height)
@@ -368,12 +368,12 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
 
 
 def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] = ()) -> Estimate:
-    """Quality that the pictures of a camera have by its rate-quality model.
+    """Quality of a camera's pictures by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
     bits per pixel (paper, left side of Eq. 4), linear between measured points in log bitrate.
 
-    stood  when the picture stood still: it keeps the quality it had before, see `Estimate`
+    frozen_spans  when the picture was frozen: it keeps the quality it had before, see `Estimate`
     """
     t, kbps = camera.actual
     decided = camera.decided
@@ -397,9 +397,9 @@ def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] 
 
 
 def _hold(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:
-    """Let a picture that stands still keep the quality it had; where there was none before, there is none.
+    """Let a frozen picture keep the quality it had; if there was none before, there is none.
 
-    Rates are those of a second, which for as long after a freeze holds some of it, or what had piled up meanwhile.
+    Rates cover a second: for that long after a freeze they include part of it, or a backlog that had built up.
     """
     end = freeze.t + freeze.seconds
     during = (t > freeze.t) & (t <= end)
@@ -409,17 +409,17 @@ def _hold(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -
     moving[during] = False
 
 
-# --- small things -----------------------------------------------------------------------------------------------------
+# --- helpers ----------------------------------------------------------------------------------------------------------
 
 
 def mean(values: FloatSeries) -> float:
-    """Mean of what is known; nan of nothing."""
+    """Mean of the known values; nan if there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else NAN
 
 
 def sum_known(values: Iterable[float]) -> float:
-    """Sum of what is known; nan of nothing."""
+    """Sum of the known values; nan if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) if known else NAN
 

@@ -15,7 +15,7 @@ MEANING = (
     " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
     " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
 )
-SIZES = 3  # as many picture sizes are listed, those received longest
+SIZES = 3  # number of picture sizes listed, those received longest
 
 
 def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
@@ -54,7 +54,7 @@ def _camera(camera: CameraStatistics) -> TableRow:
         shown(camera.allocated),
         percent(camera.share),
         "\n".join(f"{f:g}: {share:.0%}" if f else f"off: {share:.0%}" for f, share in camera.factors.items()),
-        "\n".join(f"{width}x{height}" for width, height in sorted(longest)) or NOTHING,  # rising, as factors are
+        "\n".join(f"{width}x{height}" for width, height in sorted(longest)) or NOTHING,  # increasing, as factors are
         _latency(camera.arrival),
         _latency(camera.decode),
         counted(len(frozen) if known else None),
@@ -88,7 +88,7 @@ def _latency(latency: Latency) -> str:
 
 
 def shown(value: float | None, digits: int = 0) -> str:
-    """A number; "-" for what is not known."""
+    """A number; "-" if unknown."""
     return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 

@@ -1,4 +1,4 @@
-"""Everything that touches GStreamer, behind the one door `runner/apply.py`.
+"""Everything that touches GStreamer, used only through `runner/apply.py`.
 
 raises  MissingBindings on import, with every part that does not load
 """
@@ -9,8 +9,8 @@ from importlib import import_module
 
 from runner.errors import MissingBindings
 
-# GStreamer brings libunwind, whose functions stand in for those of libgcc in all libraries loaded later: the next C++
-# exception, in Matplotlib or OpenCV, ends the process. What is loaded first, is found first.
+# GStreamer loads libunwind, whose functions replace those of libgcc in all libraries loaded later: the next C++
+# exception, in Matplotlib or OpenCV, then ends the process. The library loaded first is found first.
 with suppress(OSError):
     ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
 
@@ -26,10 +26,10 @@ TYPELIBS = {  # Debian package by typelib
 
 
 def _load() -> None:
-    """Load PyGObject and the typelibs: one that is installed may still not load."""
+    """Load PyGObject and the typelibs; an installed one may still fail to load."""
     try:
         gi = import_module("gi")
-    except Exception as error:  # a half installed one raises what it likes
+    except Exception as error:  # a partial installation may raise anything
         how = "apt-get install python3-gi, and a virtual environment that sees it"
         raise MissingBindings({"Python module gi": f"{error}; {how}"}) from None
     missing = {}
@@ -37,7 +37,7 @@ def _load() -> None:
         try:
             gi.require_version(name, "1.0")
             import_module(f"gi.repository.{name}")
-        except Exception as error:  # ValueError, ImportError, GLib.Error: of the loader, of the file
+        except Exception as error:  # ValueError, ImportError, GLib.Error: from the loader or the file
             why = str(error).partition("\n")[0]
             missing[f"typelib {name}"] = f"{why}; apt-get install {package}"
     if missing:

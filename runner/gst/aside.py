@@ -1,4 +1,4 @@
-"""State changes that may never return, kept away from the thread that serves all cameras."""
+"""State changes that may never return, kept off the thread that serves all cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from gi.repository import Gst
 
-HUNG_S = 5.0  # a state change that takes longer hangs
+HUNG_S = 5.0  # a state change that takes longer counts as hung
 HUNG = f"has not stopped within {HUNG_S:g} s, and is left alone"
 
 _workers: set[threading.Thread] = set()
@@ -21,12 +21,12 @@ def set_state_aside(
     on_hung: Callable[[], None] = lambda: None,
     after: threading.Thread | None = None,
 ) -> threading.Thread:
-    """Change an element's state in a thread of its own, which ends with the change.
+    """Change an element's state in a separate thread, which ends with the change.
 
-    Network elements can lock up in it. Nothing ends such a thread, so that it is left alone.
+    Network elements can deadlock in a state change. Such a thread cannot be ended, so it is left alone.
 
     on_hung  called once, from another thread, when the change has taken HUNG_S
-    after    an earlier change of this element, which has to be over first
+    after    an earlier change of this element, which has to finish first
     """
     watchdog = threading.Timer(HUNG_S, on_hung)
     watchdog.daemon = True
@@ -48,7 +48,7 @@ def set_state_aside(
 
 
 def settle(limit_s: float) -> None:
-    """Wait for all changes under way, but no longer than a limit."""
+    """Wait for all pending changes, up to a time limit."""
     until = time.monotonic() + limit_s
     with _lock:
         workers = list(_workers)

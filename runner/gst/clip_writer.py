@@ -1,4 +1,4 @@
-"""Frames made in Python into an H.264 clip: offline work, so Python per frame is fine here."""
+"""Encodes frames generated in Python into an H.264 clip. Offline work, so Python per frame is fine here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from gi.repository import GLib, Gst
 
-QUANTIZER = 28  # constant: 37 dB and more, far above what is sent of it, and half as dear to decode as 20
+QUANTIZER = 28  # constant: at least 37 dB, far above the quality of the sent stream, at half the decoding cost of 20
 FRAMES_IN_FLIGHT = 3
 
 
@@ -34,7 +34,7 @@ def write_clip(
     )
     pipeline.get_by_name("file").set_property("location", str(path))
     try:
-        pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
+        pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
         _push(pipeline, frames, fps)
         _wait(pipeline, Gst.CLOCK_TIME_NONE, Gst.MessageType.EOS)
     finally:
@@ -49,9 +49,9 @@ def _parse(description: str) -> Any:
 
 
 def _push(pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> None:
-    """Feed all frames with exact times, then the end of the stream.
+    """Push all frames with exact timestamps, then the end of the stream.
 
-    The queue is watched here and not left to `block=true`: behind a pipeline that failed, a blocked push never returns.
+    The queue level is checked here instead of using `block=true`: if the pipeline fails, a blocked push never returns.
     """
     source = pipeline.get_by_name("frames")
     for number, frame in enumerate(frames):
@@ -65,7 +65,7 @@ def _push(pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> None:
 
 
 def _wait(pipeline: Any, nanoseconds: int, for_what: Any) -> None:
-    """Wait for a message or that long; an error is raised."""
+    """Wait for a message or the timeout; an error is raised."""
     message = pipeline.get_bus().timed_pop_filtered(nanoseconds, for_what | Gst.MessageType.ERROR)
     if message and message.type == Gst.MessageType.ERROR:
         error, _ = message.parse_error()

@@ -1,4 +1,4 @@
-"""What the clock of the wall showed at a time in a pipeline."""
+"""Converts pipeline times to wall-clock times."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 
 from gi.repository import Gst
 
-CLOSE_NS = 20_000  # two clocks read within this are read at once
+CLOSE_NS = 20_000  # two clocks read within this count as read simultaneously
 TRIES = 10
 
 
@@ -19,12 +19,12 @@ def unix_time(clock: Gst.Clock, base_time: int, running: int) -> float:
 
 
 def _ahead(clock: Gst.Clock) -> int:
-    """By how much the clock of the wall is ahead of another, ns.
+    """By how much the wall clock is ahead of another, ns.
 
-    Another thread may run between reading one and the other. So one is read before and after the other, several times
-    where it took long, and the closest reading holds.
+    Another thread may run between the two readings. So the wall clock is read before and after the other, several
+    times if that took long, and the closest reading counts.
     """
-    readings: list[tuple[int, int]] = []  # between its ends, ns: what lies in the middle of them
+    readings: list[tuple[int, int]] = []  # duration of the reading, ns; difference at its middle
     while len(readings) < TRIES and min(readings, default=(CLOSE_NS + 1, 0))[0] > CLOSE_NS:
         before, there, after = time.time_ns(), clock.get_time(), time.time_ns()
         readings.append((after - before, (before + after) // 2 - there))

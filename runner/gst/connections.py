@@ -1,4 +1,4 @@
-"""The TCP connections of the RTSP server: how far a reader lags, and how one is closed from any thread."""
+"""The RTSP server's TCP connections: measures how far a reader lags, and closes one from any thread."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from gi.repository import GstRtspServer
 
 from runner.gst.viewers import StreamViewer, operator_of
 
-USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data is not taken for so long (RFC 5482)
-KEEPALIVE_S, KEEPALIVES = 2, 3  # a machine that answers none of so many, so far apart, has gone
+USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data stays unacknowledged for this long (RFC 5482)
+KEEPALIVE_S, KEEPALIVES = 2, 3  # a machine that answers none of this many probes, this far apart, is gone
 _SIOCOUTQ = 0x5411  # bytes that are not acknowledged yet (linux/sockios.h)
 _BYTES_ACKED, _MIN_RTT = 120, 148  # offsets in struct tcp_info (linux/tcp.h)
-BUFFER_S = 0.35  # of video in the send buffer, beyond what the way takes
+BUFFER_S = 0.35  # of video in the send buffer, in addition to the round-trip time
 LEAST_BUFFER_BYTES = 16_384
 
 
 class RtspConnection:
-    """One client of the RTSP server, as its TCP connection shows it.
+    """One client of the RTSP server, seen through its TCP connection.
 
-    silent_s     how long the other machine may be silent before the kernel asks whether it is still there
+    silent_s     how long the other machine may be silent before the kernel probes it
 
-    viewer       where it comes from and for whom
-    cameras      what it watches, with the library's transport once there is one
-    interleaved  whether video runs through this connection, too
+    viewer       its address and its operator
+    cameras      what it watches, with the library's transport once it is set up
+    interleaved  whether this connection also carries video
     last_request monotonic time of its last complete request, s
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
         connection = client.get_connection()
-        # A descriptor of our own: the library closes its one from another thread, and the next file gets its number.
+        # Our own descriptor: the library closes its one from another thread, and the next file opened gets its number.
         self._socket = socket.socket(fileno=os.dup(connection.get_write_socket().get_fd()))
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
@@ -55,17 +55,17 @@ class RtspConnection:
         self.viewer = self.viewer._replace(operator=operator_of(agent))
 
     def carry_video(self) -> None:
-        """Video will run through this connection: the kernel closes it when nothing is taken any more."""
+        """This connection will carry video: the kernel closes it when data is no longer acknowledged."""
         self.interleaved = True
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
 
     def lag(self, kbps: int, shared: bool) -> float:
         """Age of the oldest byte that the other side has not acknowledged, s; to be called a few times a second.
 
-        kbps    of its video, by which the send buffer is bounded: of its own, the kernel keeps up to 4 MB
-        shared  whether others watch the same. Then the video goes on while the send buffer is full, and what waits in
-                front of the buffer is not seen here: the time since it last had room counts as well. A reader that is
-                alone holds back the encoder, and what it gets is no older than the buffer.
+        kbps    of its video, which sizes the send buffer: by default, the kernel buffers up to 4 MB
+        shared  whether others watch the same. Then the video continues while the send buffer is full, and data queued
+                before the buffer is not visible here: the time since it last had room counts as well. A single reader
+                exerts back-pressure on the encoder, and its data is no older than the buffer.
         """
         now = time.monotonic()
         info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
@@ -91,7 +91,7 @@ class RtspConnection:
         return bool(room.poll(0))
 
     def close(self) -> None:
-        """End the connection. The server then finds it closed, in its own thread."""
+        """End the connection. The server then notices this in its own thread."""
         with suppress(OSError):  # it may have ended already
             self._socket.shutdown(socket.SHUT_RDWR)
 

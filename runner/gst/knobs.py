@@ -1,4 +1,4 @@
-"""Turn the knobs of a pipeline that plays: everything of one change between the same two frames."""
+"""Turn the knobs of a playing pipeline: all parts of one change between the same two frames."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from runner.graph import Assignment, assignments, text
 
 
 class KnobPanel:
-    """The knobs of one camera's pipeline, built anew with the pipeline.
+    """The knobs of one camera's pipeline, rebuilt with the pipeline.
 
-    Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe in front of the first
-    element that changes then sets them all at once. Set one after the other while a frame passes, crop edges leave
-    moments without any picture, which ends the stream.
+    Values wait in `_waiting` until the streaming thread is between two frames: an IDLE probe before the first element
+    that changes then sets them all at once. If crop edges were set one by one while a frame passes, the crop could
+    be empty for a moment, which ends the stream.
 
-    on_turned  called, from any thread, when knobs were set: `applied` holds the values that were read back
+    on_turned  called, from any thread, after knobs were set: `applied` holds the values read back
     """
 
     def __init__(self, pipeline: Gst.Bin, camera: Camera, on_turned: Callable[[], None]) -> None:
         self._camera, self._on_turned = camera, on_turned
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
-        # Reentrant: new caps send an event up through the very pad whose probe sets them, which calls it once more.
+        # Reentrant: new caps send an event upstream through the pad whose probe sets them, which calls the probe again.
         self._lock = threading.RLock()
         self._waiting: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
         self.faults: list[str] = []
 
     def set_now(self, values: Mapping[str, KnobValue]) -> None:
-        """Set knobs of a pipeline that does not play yet."""
+        """Set knobs of a pipeline that is not playing yet."""
         with self._lock:
             self._waiting |= values
         self._set_waiting()
 
     def turn(self, values: Mapping[str, KnobValue]) -> None:
-        """Set knobs between two frames, soon; returns at once."""
+        """Set knobs at the next gap between two frames; returns at once."""
         with self._lock:
             alone = not self._waiting
             self._waiting |= values
         turned = [turned for knob, value in values.items() for turned in self._assignments(knob, value)]
         if alone and len(turned) == 1:
-            # One property has nothing to agree with: the encoder takes it up with its next frame by itself.
+            # A single property needs no synchronisation: the encoder applies it from its next frame on.
             self._set_waiting()
             return
         touched = {element for element, _, _ in turned}
         first = next(element for element in self._elements if element.get_name() in touched)
-        # Only a source pad knows that a frame it has pushed is still on its way below.
+        # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()
         above.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
 

@@ -1,6 +1,6 @@
 """Many encoders on one sequence: decoded once, scaled once for each factor, encoded and decoded again in lanes.
 
-Offline work: frames are looked at in Python here.
+Offline work, so Python per frame is fine here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from runner.lanes import FRAMES, LaneSet
 
 LumaPlane = NDArray[np.uint8]  # height x width
 POLL_NS = 200 * 1_000_000
-STALLED_S = 60  # no frame for so long: something waits for something else
+STALLED_S = 60  # without a frame for this long the pipeline is deadlocked
 
 OnFrame = Callable[[int, LumaPlane], None]  # number of the frame from 0, its luma
 OnDecoded = Callable[[int, int, LumaPlane], None]  # lane, number of the frame, its luma as decoded
@@ -30,11 +30,11 @@ OnDecoded = Callable[[int, int, LumaPlane], None]  # lane, number of the frame, 
 
 @dataclass(slots=True)
 class Encoded:
-    """What one lane came to.
+    """Result of one lane.
 
     frames    pictures that came out of the decoder
     bytes     of coded video
-    encode_s  processor time of the encoder in its own thread, s
+    encode_s  CPU time of the encoder in its own thread, s
     """
 
     frames: int = 0
@@ -56,13 +56,13 @@ class _Run:
 def run_lanes(
     lanes: LaneSet, on_frame: OnFrame, on_picture: OnDecoded, on_progress: Callable[[int], None]
 ) -> list[Encoded]:
-    """Run a sequence through all lanes, as fast as it goes.
+    """Run a sequence through all lanes, as fast as possible.
 
-    on_frame     called with each frame of the sequence before any lane has it, from one thread
+    on_frame     called with each frame of the sequence before any lane gets it, from one thread
     on_picture   called with each decoded picture, from one thread per lane; it may block
     on_progress  called with the number of frames so far, a few times a second
     returns      by lane
-    raises       RunError with GStreamer's message; exceptions of the callbacks
+    raises       RunError with GStreamer's message; exceptions from the callbacks
     """
     pipeline = _parsed(lanes.line)
     run = _Run(lanes.fps)
@@ -94,7 +94,7 @@ def _parsed(line: str) -> Gst.Pipeline:
 
 
 def _wait(pipeline: Gst.Pipeline, run: _Run, on_progress: Callable[[int], None]) -> None:
-    """Until the end of the sequence."""
+    """Wait for the end of the sequence."""
     bus = pipeline.get_bus()
     while True:
         message = bus.timed_pop_filtered(POLL_NS, Gst.MessageType.ERROR | Gst.MessageType.EOS)
@@ -138,7 +138,7 @@ def _check_form(run: _Run, caps: Gst.Caps) -> None:
 
 
 def _watch_encoder(encoder: Gst.Element, result: Encoded) -> None:
-    """Count the processor time between a frame that goes in and its packet that comes out, in the encoder's thread."""
+    """Add up the CPU time from each frame's entry to its packet's exit, in the encoder's thread."""
     began: dict[int, float] = {}
 
     def goes_in(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
@@ -158,7 +158,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     sample = sink.emit("pull-sample")
     buffer = sample.get_buffer()
     running_ns = sample.get_segment().to_running_time(Gst.Format.TIME, buffer.pts)
-    # An encoder may leave out frames; its time identifies it.
+    # An encoder may skip frames; the timestamp identifies this one.
     number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
     result.frames += 1
     run.moved = time.monotonic()
@@ -167,7 +167,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
 
 
 def _guarded(run: _Run, work: Callable[[], None]) -> None:
-    """What goes wrong in a streaming thread is raised in the one that waits."""
+    """Run work in a streaming thread; its exceptions are raised in the waiting thread."""
     if run.failed:
         return
     try:

@@ -11,7 +11,7 @@ GATHER_MS = 300
 
 
 class Outage:
-    """The present outage of one camera. Times are s by the monotonic clock.
+    """The current outage of one camera. Times are s by the monotonic clock.
 
     on_report  called with a sentence for each new reason, and one at the end
     """
@@ -27,9 +27,9 @@ class Outage:
         return self._reasons[0] if self._reasons else None
 
     def failed(self, why: str, since: float) -> None:
-        """Another failure.
+        """Record a failure.
 
-        since  when the camera last worked; counts for the first failure
+        since  when the camera last worked; used for the first failure only
         """
         if not self._reasons:
             self._began = since
@@ -38,14 +38,14 @@ class Outage:
             self._on_report(why)
 
     def over(self, now: float) -> None:
-        """The camera works."""
+        """The camera works again."""
         if self._reasons:
             self._on_report(f"works again after {now - self._began:.0f} s")
         self._reasons.clear()
 
 
 class Gathered:
-    """Reports of several cameras that say the same at about the same time, made one: `front, rear: no frame for 2 s`.
+    """Merges identical reports of several cameras at about the same time: `front, rear: no frame for 2 s`.
 
     on_report  called from GLib's thread: cameras, what happened to them
     """

@@ -18,11 +18,11 @@ CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with 
 
 
 class CameraPipeline:
-    """What is done to a pipeline that was just built, and the knobs that it has from then on.
+    """Sets up a newly built pipeline, and turns its knobs from then on.
 
-    wanted  where the knobs are to be
-    turned  called, from any thread, when knobs were set
-    source  the source where it is watched
+    wanted     the wanted knob values
+    on_turned  called, from any thread, after knobs were set
+    source     the source, if it is watched
     """
 
     def __init__(
@@ -52,34 +52,34 @@ class CameraPipeline:
         return self._source.outage.reason if self._source else None
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
-        """Take the knobs to where they are wanted; `changed` is what is new."""
+        """Set the knobs to the wanted values; `changed` holds those that are new."""
         self._wanted = wanted
         allowed = self._allowed(changed)
         if allowed:
             self.knobs.turn(allowed)
 
     def _allowed(self, values: Mapping[str, KnobValue]) -> Mapping[str, KnobValue]:
-        """Until the first frame is out, sending stays as it is.
+        """Until the first frame is out, sending is not changed.
 
-        A gate that is closed from the start lets no caps through, and a client's DESCRIBE would wait for them in vain.
+        A gate that is closed from the start passes no caps, and a client's DESCRIBE would wait for them in vain.
         """
         return values if self._started else {knob: value for knob, value in values.items() if knob != "sending"}
 
     @property
     def paused(self) -> bool:
-        """Whether the gate was read back as shut."""
+        """Whether the gate was read back as closed."""
         return self.knobs.applied.get("sending") is False
 
     @property
     def kbps(self) -> int:
-        """The encoder's bitrate as it was read back, 0 before it was set."""
+        """The encoder's bitrate as read back, 0 before it was set."""
         bitrate = self.knobs.applied.get("bitrate", 0)
         return bitrate if isinstance(bitrate, int) else 0
 
     def push(self, frame: Any) -> bool:
         """Hand one frame to the source, which must be an appsrc.
 
-        raises  ValueError for a frame of another length than width * height * 3 / 2
+        raises  ValueError if the frame's length is not width * height * 3 / 2
         """
         width, height = self._plan.camera.source_size
         data = bytes(memoryview(frame).cast("B"))
@@ -90,7 +90,7 @@ class CameraPipeline:
         return bool(source.emit("push-buffer", Gst.Buffer.new_wrapped(data)) == Gst.FlowReturn.OK)
 
     def counters(self) -> tuple[int, int]:
-        """Frames and bytes that the encoder has put out so far, counted in C."""
+        """Frames and bytes that the encoder has output so far, counted in C."""
         sent = self._pipeline.get_by_name("sent")
         return counted(sent) if sent else (0, 0)
 
@@ -110,19 +110,19 @@ class CameraPipeline:
 
 
 def _keep_below(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """New caps make every element above negotiate again. The source need not: what it delivers stays as it is.
+    """New caps make every upstream element renegotiate. The source need not: its output does not change.
 
-    And it must not: it asks for caps between two frames, just when the next knobs are turned, and finds half of them.
+    And it must not: it queries caps between two frames, just when the next knobs are turned, and sees half of them.
     """
     wanted = info.get_event().type != Gst.EventType.RECONFIGURE
     return Gst.PadProbeReturn.OK if wanted else Gst.PadProbeReturn.DROP
 
 
 def _refuse_seeks(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """A camera cannot be sought; a query that is answered as it was asked says so.
+    """A camera is not seekable; a query that is answered unchanged says so.
 
-    The RTSP server believes what a source says. It would seek a clip or a test picture for every PLAY with a Range, a
-    Scale or a Speed: flush what others watch, and wait for a frame that a closed gate never lets through.
+    The RTSP server trusts the source's answer. It would seek a clip or a test picture for every PLAY with a Range, a
+    Scale or a Speed: flush the stream of all viewers, and wait for a frame that a closed gate never passes.
     """
     seeking = info.get_query().type == Gst.QueryType.SEEKING
     return Gst.PadProbeReturn.HANDLED if seeking else Gst.PadProbeReturn.OK

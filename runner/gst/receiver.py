@@ -1,4 +1,4 @@
-"""The operator's side: each camera received, decoded and measured by a pipeline of its own."""
+"""The operator's side: each camera received, decoded and measured by its own pipeline."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
-STALL_S = 2.0  # a camera that should send, and neither sends nor answers for longer, is built anew
-GRACE_S = 0.75  # a camera that is known to send only now may take so long
+STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
+GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """What has come of one camera; counters run since the start and go on through rebuilt pipelines.
+    """What was received of one camera; counters run from the start and continue across rebuilt pipelines.
 
     frames      access units received
     bytes       their payload
     decoded     frames that reached the sink
-    lost        RTP packets that never came
-    foreign     RTP and RTCP packets that came from elsewhere than the vehicle and were dropped
+    lost        RTP packets that never arrived
+    foreign     RTP and RTCP packets from hosts other than the vehicle, dropped
     width, height  px of the decoded picture, 0 before the first
     latency_ms  capture to decode of the last sampled frame; None before the first
-    rebuilt     how often a pipeline that had received frames was built anew
-    arrivals    of each access unit since the sample before, where wanted: when it came and when it was captured,
-                s since 1970 by this machine's and by the vehicle's clock
+    rebuilt     how often a pipeline that had received frames was rebuilt
+    arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
+                by this machine's and by the vehicle's clock
     """
 
     frames: int = 0
@@ -50,7 +50,7 @@ class Reception:
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
-OnUnit = Callable[[str, AccessUnit], None]  # camera, what came
+OnUnit = Callable[[str, AccessUnit], None]  # camera, what was received
 OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
 PICTURES = (
     "videoconvert ! video/x-raw,format=RGB "
@@ -59,14 +59,14 @@ PICTURES = (
 
 
 class Receiver:
-    """Receives one camera. `sample` is to be called a few times a second; it keeps watch over a silent stream.
+    """Receives one camera. `sample` is to be called a few times a second; it also detects a silent stream.
 
     on_unit     called with each access unit, from the streaming thread
     on_picture  called with each decoded picture, from the streaming thread
-    arrivals    keep when each access unit came
-    video       where what comes is kept; the plan has `video` then
+    arrivals    record when each access unit arrived
+    video       where to keep what is received; the plan then has `video`
     Without these no Python runs per frame.
-    operator    id of the operator on the control link, which the vehicle lets in first; "" for another viewer
+    operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class Receiver:
         self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
-        self._before = Reception()  # what earlier pipelines have counted
+        self._before = Reception()  # counts of earlier pipelines
         self._latency_ms: float | None = None
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
-        self._silent = time.monotonic()  # when it was last not known that the camera should send
-        self.should_send: bool | None = None  # None: nobody knows, as the vehicle is not heard
+        self._silent = time.monotonic()  # when the camera was last not expected to send
+        self.should_send: bool | None = None  # None: unknown while the vehicle is offline
 
     def start(self) -> None:
         self._supervised.start()
@@ -105,7 +105,7 @@ class Receiver:
         self._close_filter()
 
     def sample(self) -> Reception:
-        """What has come so far; asks for the latency of the next frame."""
+        """What was received so far; requests the latency of the next frame."""
         received = self._count()
         received = replace(received, arrivals=self._arrived(received.frames))
         if received.foreign and not self._foreign_reported:
@@ -121,7 +121,7 @@ class Receiver:
             self._supervised.restart(f"no frame for {STALL_S:g} s")
         else:
             return received
-        # One frame in many is looked at: no Python runs for the others.
+        # Only one frame in many is inspected: no Python runs for the others.
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
 
@@ -150,19 +150,19 @@ class Receiver:
         return self._received.get_static_pad("src")
 
     def _on_progress(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
-        """The client connects, and the server answers: over a slow link that takes time."""
+        """The client is connecting and the server answers: over a slow link this takes time."""
         self._moved = (self._moved[0], time.monotonic())
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
-            # Frames come in bursts: the packet that is guessed to be next is the next frame's, and not missing.
+            # Frames come in bursts: the packet expected next belongs to the next frame and is not missing.
             element.set_property("rtx-next-seqnum", False)
             self._jitter_buffers.append(element)
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
 
     def _filter_senders(self, source: Gst.Element) -> None:
-        """Let a socket of the client take what the vehicle sends, and nothing else. From the client's thread."""
+        """Let a socket of the client accept only what the vehicle sends. From the client's thread."""
         taken = source.get_property("used-socket")
         if taken is None:
             return
@@ -203,7 +203,7 @@ class Receiver:
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """An access unit has come: page and log share its times."""
+        """An access unit has arrived: page and log share its times."""
         arrived, buffer = time.time(), info.get_buffer()
         captured = capture_time(buffer)
         if self._arrivals is not None:
@@ -214,13 +214,13 @@ class Receiver:
 
     def _pass_on(self, buffer: Gst.Buffer, captured: float | None, arrived: float, on_unit: OnUnit) -> None:
         data = buffer.extract_dup(0, buffer.get_size())
-        # The depayloader marks the first unit of all, and each that packets are missing of.
+        # The depayloader marks the very first unit, and each unit with missing packets.
         damaged, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
         if unit := read_unit(data, captured, arrived, damaged=damaged, codec=self._codec):
             on_unit(self._name, unit)
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
-        """Arrivals since the last call, of those frames that have been counted; more may come meanwhile."""
+        """Arrivals since the last call, only of frames already counted; more may come meanwhile."""
         if self._arrivals is None:
             return ()
         new = tuple(self._arrivals.popleft() for _ in range(min(len(self._arrivals), frames - self._sampled)))
@@ -231,21 +231,21 @@ class Receiver:
         sample = sink.emit("pull-sample")
         picture, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
         width, height = picture.get_int("width")[1], picture.get_int("height")[1]
-        data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder uses its memory again
+        data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
 
 
 def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:
-    """When a frame was captured, s since 1970; when it came, where the line does not carry that."""
+    """Capture time of a frame, s since 1970; its arrival time if the transport does not carry it."""
     captured = capture_time(buffer)
     return time.time() if captured is None else captured
 
 
 def take_feedback(client: Gst.Element) -> None:
-    """Let an RTSP client take the stream in the profile in which lost packets are asked for again (RFC 4585, 4588).
+    """Let an RTSP client choose the profile with retransmission of lost packets (RFC 4585, 4588).
 
-    A server that offers both states the stream twice; by itself the client takes the first, which has no feedback.
+    A server that offers both profiles lists the stream twice; by default the client takes the first, without feedback.
     """
     chosen = [0]
 
@@ -258,6 +258,6 @@ def take_feedback(client: Gst.Element) -> None:
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:
-    """When a frame was captured, s since 1970 by the vehicle's clock; None where the line does not carry it."""
+    """Capture time of a frame, s since 1970 by the vehicle's clock; None if the transport does not carry it."""
     meta = buffer.get_reference_timestamp_meta(None)
     return meta.timestamp / Gst.SECOND - NTP_EPOCH_S if meta else None

@@ -1,4 +1,4 @@
-"""One camera recorded from its source into a file: every frame as it enters the pipeline, nothing lost unnoticed."""
+"""One camera recorded from its source into a file: every frame as it enters the pipeline, no loss unnoticed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from runner.gst.pipeline import counted
 from runner.gst.source import fixed_rate, loop_clip
 
 CHECK_MS = 100
-SILENT_S = 10.0  # a source that delivers nothing for so long has failed
-WRITE_S = 60.0  # an encoder or a disk that does nothing for so long has failed
-LAST_S = 1.0  # each of the last frames is looked at, so that the file ends with the right one
+SILENT_S = 10.0  # a source that delivers nothing for this long has failed
+WRITE_S = 60.0  # an encoder or a disk that makes no progress for this long has failed
+LAST_S = 1.0  # each frame of this last period is checked, so that the file ends with the right one
 
 
 class Stage(Enum):
-    """How far a recording is."""
+    """State of a recording."""
 
     RECORDING = "recording"
     FINISHED = "finished"
@@ -32,14 +32,14 @@ class Recorded:
     """What was recorded of one camera so far.
 
     frames     frames kept
-    seconds    from the first to the end of the last one, by their own time
+    seconds    from the first to the end of the last one, by their timestamps
     missing    frames expected in this time that are absent
-    overruns   frames that found the queue before the encoder full, also beyond the end
-    repeated   frames that the source sent twice to keep its rate, those of a clip not counted
-    left_out   frames that the source left out to keep its rate, likewise
+    overruns   frames dropped at the full queue before the encoder, even after the end
+    repeated   frames that the source repeated to keep its rate, not counted for a clip
+    left_out   frames that the source dropped to keep its rate, likewise
     width, height  px, 0 before the first frame
     began      time of the first frame, s since 1970; 0 before it
-    failure    what failed; None: nothing
+    failure    what failed, or None
     """
 
     stage: Stage = Stage.RECORDING
@@ -76,11 +76,11 @@ class Recorder:
         self._rated = fixed_rate(self._pipeline) if not plan.loops else []
 
     def start(self) -> None:
-        """Begin; what cannot begin is FAILED at the next look."""
+        """Begin; a recording that cannot begin is FAILED at the next check."""
         self._queue.connect("overrun", self._on_overrun)
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
-            element.set_property("skip-to-first", True)  # else the first frame is repeated for the time before it
+            element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)
         bus = self._pipeline.get_bus()
@@ -89,7 +89,7 @@ class Recorder:
         bus.connect("message::eos", self._on_eos)
         self._moved = (0, time.monotonic())
         self._watching = GLib.timeout_add(CHECK_MS, self._watch)
-        self._pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
+        self._pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
 
     def sample(self) -> Recorded:
         """What was recorded so far."""
@@ -98,7 +98,7 @@ class Recorder:
         return self._recorded
 
     def finish(self) -> None:
-        """Keep what the source has delivered, and end the file; soon the stage is FINISHED."""
+        """Keep what the source has delivered, and end the file; the stage soon becomes FINISHED."""
         if self._recorded.stage is not Stage.RECORDING or self._finishing:
             return
         if self._first == Gst.CLOCK_TIME_NONE:
@@ -124,7 +124,7 @@ class Recorder:
     def _count(self) -> Recorded:
         if self._first == Gst.CLOCK_TIME_NONE:
             return self._recorded
-        # The counter is read last: a frame that passes meanwhile must not look as if it were missing.
+        # The counter is read last: a frame that passes meanwhile must not appear to be missing.
         end, frames = self._end or (self._out.query_position(Gst.Format.TIME)[1], counted(self._counter)[0])
         seconds = max(0, end - self._first) / Gst.SECOND
         picture = self._out.get_current_caps().get_structure(0)
@@ -141,7 +141,7 @@ class Recorder:
         )
 
     def _began(self) -> float:
-        """The clock of the wall at the first frame."""
+        """Wall-clock time of the first frame."""
         clock = self._pipeline.get_clock()
         if clock is None:
             return 0.0
@@ -150,7 +150,7 @@ class Recorder:
     # --- watching -----------------------------------------------------------------------------------------------------
 
     def _watch(self) -> bool:
-        """A few times a second: whether frames come, and whether the end is near."""
+        """A few times a second: check that frames arrive, and whether the end is near."""
         now = self._count()
         self._recorded = replace(self._recorded, began=now.began)
         if now.frames != self._moved[0] and not self._finishing:
@@ -164,7 +164,7 @@ class Recorder:
         return True
 
     def _stuck(self) -> str | None:
-        """What has made no progress for too long; None: nothing."""
+        """What has made no progress for too long, or None."""
         still_s = time.monotonic() - self._moved[1]
         if self._finishing or self._end is not None:
             return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else None
@@ -173,7 +173,7 @@ class Recorder:
         return f"no frame for {SILENT_S:g} s" if still_s > SILENT_S else None
 
     def _count_down(self) -> None:
-        """Look at every frame from now on, to cut at the right one."""
+        """Check every frame from now on, to cut at the right one."""
         if not self._counting_down:
             self._counting_down = True
             self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_late_frame)
@@ -201,7 +201,7 @@ class Recorder:
         return Gst.PadProbeReturn.OK
 
     def _on_overrun(self, _queue: Gst.Element) -> None:
-        """From the streaming thread, for each frame that is thrown away."""
+        """From the streaming thread, for each frame that is dropped."""
         self._overruns += 1
 
     def _on_error(self, _bus: Gst.Bus, message: Gst.Message) -> None:

@@ -1,4 +1,4 @@
-"""Check a plan against the GStreamer registry of this machine: what could only fail while driving fails here."""
+"""Check a plan against this machine's GStreamer registry: finds errors that would otherwise show only while driving."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import Element, ModelError, Value, suggest
 from runner.graph import Plan, assignments, launch, text
 
-PACKAGES = {  # Debian package that brings an element; `doctor` and missing plugins name it
+PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
     " udpsink v4l2src rtpbin jpegdec qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay rtpvp8depay",
@@ -24,17 +24,17 @@ PACKAGES = {  # Debian package that brings an element; `doctor` and missing plug
     "gstreamer1.0-x": "textoverlay",
     "nvidia-l4t-gstreamer": "nvvidconv nvv4l2h264enc",
 }
-HARDWARE = {"vah264enc": "va", "nvh264enc": "nvcodec"}  # plugin by element that is there only beside its hardware
+HARDWARE = {"vah264enc": "va", "nvh264enc": "nvcodec"}  # plugin by element that exists only with its hardware
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
 
 
 def missing_plugins(plan: Plan) -> list[str]:
-    """A sentence for each element that streaming needs, this project knows and this machine lacks."""
+    """One sentence for each known element that streaming needs and this machine lacks."""
     return _missing((*plan.source, *plan.vehicle, *plan.operator, *plan.video_elements))
 
 
 def missing_recorders(plan: Plan) -> list[str]:
-    """The same for what recording needs."""
+    """The same for recording."""
     return _missing((*plan.source, *plan.recorder))
 
 
@@ -51,7 +51,7 @@ def _why_missing(name: str) -> str:
 
 
 def versions(elements: Iterable[Element]) -> dict[str, str]:
-    """GStreamer's version, and by element that of the plugin it comes from."""
+    """GStreamer's version, and by element the version of its plugin."""
     found = {"GStreamer": ".".join(map(str, Gst.version()[:3]))}
     for element in elements:
         factory = Gst.ElementFactory.find(element.factory)
@@ -62,9 +62,9 @@ def versions(elements: Iterable[Element]) -> dict[str, str]:
 
 
 def check_plan(plan: Plan) -> list[ModelError]:
-    """All that the registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
+    """Everything the registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
 
-    Elements that are known and not installed are the business of `missing_plugins` and `missing_recorders`.
+    Known elements that are not installed are reported by `missing_plugins` and `missing_recorders`.
     """
     parts = {
         "source.elements": plan.source,
@@ -94,7 +94,7 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
 
 
 def _check_knobs(plan: Plan) -> Iterator[ModelError]:
-    """Each knob's property exists, may change while PLAYING and takes the largest value that can come."""
+    """Each knob's property must exist, be mutable while PLAYING and accept the knob's largest value."""
     camera = plan.camera
     factories = {element.name: element.factory for element in (*plan.source, *plan.vehicle)}
     largest: dict[str, KnobValue] = {
@@ -124,7 +124,7 @@ def _may_change(element: Gst.Element, key: str) -> bool:
 
 
 def _check_links(plan: Plan) -> list[ModelError]:
-    """Whether neighbours can be linked at all."""
+    """Check that neighbouring elements can be linked."""
     errors: dict[str, str] = {}
     for where, line in _lines(plan):
         if where not in errors and (message := _unlinkable(line)):
@@ -133,9 +133,9 @@ def _check_links(plan: Plan) -> list[ModelError]:
 
 
 def _lines(plan: Plan) -> Iterator[tuple[str, str]]:
-    """The plan's pipelines as GStreamer parses them, without those that this machine lacks an element for.
+    """The plan's pipelines as GStreamer parses them, except those with an element that this machine lacks.
 
-    Behind a filter all sources are alike: the source is a line of its own, which many graphs share, and so is the rest.
+    After a filter all sources are alike: the source becomes one line, which many graphs share, and the rest another.
     """
     filtered = bool(plan.source) and plan.source[-1].factory == "capsfilter"
     rest = replace(plan, source=plan.source[-1:]) if filtered else plan
@@ -150,7 +150,7 @@ def _lines(plan: Plan) -> Iterator[tuple[str, str]]:
 
 @cache
 def _unlinkable(line: str) -> str | None:
-    """GStreamer's message on a line whose neighbours cannot be linked."""
+    """GStreamer's message if neighbours in a line cannot be linked, otherwise None."""
     try:
         Gst.parse_launch(line)
     except GLib.Error as error:
@@ -178,7 +178,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
 
 
 def _readable(kind: str, value: str) -> bool:
-    """Whether GStreamer reads a text as a property of that type; the text of a structure is where it tells."""
+    """Whether GStreamer parses a text as a property of that type; parsing it within a structure reports errors."""
     quoted = value.replace("\\", "\\\\").replace('"', '\\"')
     for written in (value, f'"{quoted}"'):
         try:
@@ -199,12 +199,12 @@ def _nicks(spec: GObject.ParamSpec) -> list[str]:
 
 @cache
 def _template(factory: str) -> Gst.Element | None:
-    """One element of a factory, to ask for its properties."""
+    """An element of a factory, to inspect its properties."""
     return Gst.ElementFactory.make(factory, None)
 
 
 def _factory_names(like: str) -> list[str]:
-    """Names that a misspelt one may have meant; all of them would be a thousand."""
+    """Names that a misspelt one may stand for; a list of all would have a thousand."""
     every = Gst.Registry.get().get_feature_list(Gst.ElementFactory)
     from difflib import get_close_matches
 

@@ -1,7 +1,7 @@
-"""UDP sockets that take packets from one sender only: a filter in the kernel, which also counts what it drops.
+"""UDP sockets that accept packets from one sender only: a kernel filter, which also counts the packets it drops.
 
-An RTSP client binds its RTP and RTCP sockets to all addresses, so that anybody who reaches the machine could mix in
-packets of his own. No Python runs per packet.
+An RTSP client binds its RTP and RTCP sockets to all addresses, so any host that reaches the machine could inject
+packets. No Python runs per packet.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 SO_ATTACH_FILTER, SO_MEMINFO = 26, 55  # asm-generic/socket.h
-WAITING = 100_000  # packets that a socket may hold before it has its filter; more than any buffer
+WAITING = 100_000  # packets that a socket may hold before its filter is attached; more than any buffer
 MEMINFO_QUEUED, MEMINFO_BUFFER, MEMINFO_DROPS, MEMINFO_VALUES = 0, 1, 8, 9  # linux/sock_diag.h
-PROMPT_S = 0.5  # a client's buffer holds more than what comes in this time
-# Classic BPF (linux/filter.h, bpf_common.h). Loads from NET on begin at the IP header.
+PROMPT_S = 0.5  # a client's buffer holds more than arrives in this time
+# Classic BPF (linux/filter.h, bpf_common.h). Load offsets from NET on start at the IP header.
 LOAD_BYTE, LOAD_WORD, SHIFT_RIGHT, JUMP_EQUAL, JUMP, RETURN = 0x30, 0x20, 0x74, 0x15, 0x05, 0x06
 NET = 0xFFF00000
 IPV4_SOURCE, IPV6_SOURCE = NET + 12, NET + 8
@@ -29,23 +29,23 @@ Instruction = tuple[int, int, int, int]  # code, jump if true, jump if false, op
 
 
 class SenderFilter:
-    """The filter on all sockets of one client, for as long as it lives.
+    """The filter on all sockets of one client, for the client's lifetime.
 
-    host    the only sender, name or address
-    raises  OSError where the name is unknown
+    host    the only accepted sender, name or address
+    raises  OSError if the name is unknown
     """
 
     def __init__(self, host: str) -> None:
         found = {str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(host, None)}
         self._program = program(sorted(map(ipaddress.ip_address, found), key=str))
-        self._sockets: dict[int, socket.socket] = {}  # by inode: copies, which outlive an element's own
+        self._sockets: dict[int, socket.socket] = {}  # by inode: duplicates, which outlive an element's own
         self._dropped = self._seen = 0
         self._overflows, self._looked = _overflows(), time.monotonic()
 
     def attach(self, descriptor: int) -> None:
-        """Filter a bound socket; what waits in it from before is thrown away.
+        """Filter a bound socket; packets already waiting in it are discarded.
 
-        raises  OSError where the system has no such filter
+        raises  OSError if the system has no such filter
         """
         inode = os.fstat(descriptor).st_ino
         if inode in self._sockets:
@@ -58,10 +58,10 @@ class SenderFilter:
                 break
 
     def dropped(self) -> int:
-        """Packets dropped so far that came from elsewhere; to be called a few times a second.
+        """Packets from other senders dropped so far; to be called a few times a second.
 
-        The kernel counts packets that find a socket's buffer full with them. Where that may have happened, as after a
-        process that stood still, all that overflowed on this machine meanwhile is taken off.
+        The kernel's counter includes packets dropped at a full socket buffer. If that may have happened, for example
+        after the process was stalled, all overflows on this machine since the last call are subtracted.
         """
         looked, overflows = time.monotonic(), _overflows()
         infos = [_memory_info(taken) for taken in list(self._sockets.values())]
@@ -73,7 +73,7 @@ class SenderFilter:
         return self._dropped
 
     def close(self) -> None:
-        """Give up the copies, at the client's end; the count stays."""
+        """Close the duplicates when the client ends; the count is kept."""
         self.dropped()
         for taken in self._sockets.values():
             taken.close()
@@ -82,7 +82,7 @@ class SenderFilter:
 
 
 def program(senders: Iterable[IpAddress]) -> list[Instruction]:
-    """A filter that takes packets of these senders, over IPv4 and IPv6, and drops all others."""
+    """A filter that accepts packets from these senders, over IPv4 and IPv6, and drops all others."""
     senders = list(senders)
     four = [step for sender in senders if sender.version == 4 for step in _takes(sender, IPV4_SOURCE)]
     six = [step for sender in senders if sender.version == 6 for step in _takes(sender, IPV6_SOURCE)]
@@ -92,7 +92,7 @@ def program(senders: Iterable[IpAddress]) -> list[Instruction]:
 
 
 def _takes(sender: IpAddress, offset: int) -> list[Instruction]:
-    """Take a packet whose source is this address, else go on behind."""
+    """Accept a packet from this address, otherwise continue after these steps."""
     words = struct.unpack(f">{len(sender.packed) // 4}I", sender.packed)
     steps: list[Instruction] = []
     for index, word in enumerate(words):
@@ -107,7 +107,7 @@ def _attach(taken: socket.socket, steps: Sequence[Instruction]) -> None:
 
 
 def _waiting(taken: socket.socket) -> bool:
-    """Take one packet out of a socket, if there is one."""
+    """Discard one waiting packet of a socket; returns whether there was one."""
     try:
         taken.recv(1, socket.MSG_DONTWAIT)
     except BlockingIOError:
@@ -120,7 +120,7 @@ def _memory_info(taken: socket.socket) -> tuple[int, ...]:
 
 
 def _overflows() -> int:
-    """UDP packets that found a full buffer on this machine so far, over IPv4 and IPv6."""
+    """UDP packets dropped at full receive buffers on this machine so far, over IPv4 and IPv6."""
     names, values = (
         line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")
     )

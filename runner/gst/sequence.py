@@ -1,4 +1,4 @@
-"""What a clip is before anything is measured on it."""
+"""Format of a clip, read before anything is measured on it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from runner.errors import UserError
 from runner.system.files import file_problem
 
 TIMEOUT_S = 20
-# Caps of codecs that keep every sample, as far as their caps alone show it.
+# Caps of codecs that keep every sample, as far as caps alone show it.
 LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", "video/x-utvideo", "image/png")
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """Form of a clip.
+    """Format of a clip.
 
     width, height  px
-    fps            frames a second, as its container states
+    fps            frames per second, as stated by the container
     codec          as GStreamer describes it
     lossless       whether the codec keeps every sample
     """
@@ -34,10 +34,10 @@ class Form:
 
 
 def discover(path: Path, where: str) -> Form:
-    """Look at the head of a clip.
+    """Read the format from the beginning of a clip.
 
     where   the argument that names it, for messages
-    raises  UserError where it is no readable video
+    raises  UserError if it is not a readable video
     """
     if not path.is_file():
         raise UserError("command line", where, repr(str(path)), file_problem(path))

@@ -1,7 +1,7 @@
-"""The vehicle's RTSP server: one shared factory per camera, its settings written again whenever it is built anew.
+"""The vehicle's RTSP server: one shared factory per camera, its settings rewritten whenever its pipeline is rebuilt.
 
-Each client has a thread of the server library, so that one that waits holds up nobody else: what the library calls
-here comes from any of them, and whatever they share is behind one lock.
+The server library runs each client in its own thread, so that one that waits does not delay the others. Its callbacks
+arrive from any of these threads, and all shared state is behind one lock.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from runner.system.ports import check_port_free
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 
-OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it goes on opening for a later request
-HELD_S = 5.0  # how long an open one waits for a later request
-GONE_S = 5.0  # how long one that is opened again waits for the end of the pipeline before
-QUEUE_BYTES = 2_000_000  # more than a viewer may lag by at any bitrate
-LAG_S = 1.0  # a TCP viewer that is behind by more is closed
+OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it continues to open for a later request
+HELD_S = 5.0  # how long an open camera waits for a later request
+GONE_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
+QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
+LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
 SESSIONS_EVERY_S = 1.0
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
@@ -42,25 +42,25 @@ OK, REFUSED, UNAVAILABLE, MOVED = (
 
 
 class _Stage(Enum):
-    """Where a camera's pipeline stands."""
+    """State of a camera's pipeline."""
 
     NONE = auto()
-    BUILT = auto()  # and has delivered nothing yet
+    BUILT = auto()  # but has delivered nothing yet
     OPEN = auto()
     ENDING = auto()
 
 
 class _Factory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
-    """A camera's factory. It has one media, whatever URL leads there: another port, a slash or a query at its end."""
+    """A camera's factory. It has one media for every URL of the camera: another port, a trailing slash or a query."""
 
     def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
         return "media"
 
 
 class _Opening:
-    """An attempt to open a camera, in a thread of its own.
+    """An attempt to open a camera, in a separate thread.
 
-    held  set when a client holds what was opened
+    held  set when a client holds the opened camera
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class _Camera:
 class CameraServer:
     """RTSP server with one mount point per camera.
 
-    build   makes a `CameraPipeline` of each that was built
+    build      makes a `CameraPipeline` from each new pipeline
     on_report  called when pipelines start and stop, and when viewers are disconnected
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
@@ -102,7 +102,7 @@ class CameraServer:
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
-        self._left: set[str] = set()  # cameras that a viewer has left lately
+        self._left: set[str] = set()  # cameras that a viewer has left recently
         self._stopped = threading.Event()
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
@@ -138,7 +138,7 @@ class CameraServer:
         settings = plan.camera.graph.settings
         factory = _Factory()
         factory.set_launch(plan.server)
-        factory.set_shared(True)  # else a second viewer takes the pipeline from the first
+        factory.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         factory.set_latency(0)
         if self._addresses:
             factory.set_address_pool(self._addresses)
@@ -163,7 +163,7 @@ class CameraServer:
             self.pipelines[camera.name] = built
         media.connect("prepared", self._on_stage, camera, _Stage.OPEN)
         media.connect("target-state", self._on_target_state, camera)
-        # Only after the factory's own handler, which forgets the media, is another one built.
+        # After the factory's own handler, which forgets the media: only then is another one built.
         media.connect_after("unprepared", self._on_unprepared, camera, built)
         self._on_report(camera.name, "pipeline built")
 
@@ -189,20 +189,20 @@ class CameraServer:
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
-            return  # that ends the file, and not the stream
+            return  # this ends the file, not the stream
         self._on_report(camera.name, message.parse_error()[0].message)
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
-        # The library lets nobody else in to a pipeline that failed, and ends it when its last viewer has left.
+        # The library admits no new client to a failed pipeline, and ends it when its last viewer has left.
         for connection in self._watching(camera.name):
             connection.close()
 
     def _hold(self, client: GstRtspServer.RTSPClient, camera: _Camera) -> bool:
-        """Keep a camera open for a client until its DESCRIBE is answered; False where it delivers nothing by OPEN_S.
+        """Keep a camera open for a client until its DESCRIBE is answered; False if it delivers nothing within OPEN_S.
 
-        The library would open it in the client's thread and answer after 20 s only. Here it is opened in a thread of
-        its own, so that a camera that is slow to start is open for a client that asks again.
+        The library would open it in the client's thread and answer only after 20 s. Here it is opened in a separate
+        thread, so that a camera that is slow to start is open when the client asks again.
         """
         end = time.monotonic() + OPEN_S
         while True:
@@ -222,10 +222,10 @@ class CameraServer:
                 return True
             if (opening and opening.failed) or time.monotonic() >= end:
                 return False
-            # Else its last viewer has just left, and it is ending.
+            # Otherwise its last viewer has just left, and it is ending.
 
     def _release(self, wanted: Callable[[float, GstRtspServer.RTSPClient], bool]) -> None:
-        """Hold no longer what was held since a time, for a client, as `wanted` tells."""
+        """Release the holds that `wanted` selects by their start and client."""
         with self._changed:
             released = [media for since, client, media in self._holds if wanted(since, client)]
             self._holds = [hold for hold in self._holds if not wanted(*hold[:2])]
@@ -233,7 +233,7 @@ class CameraServer:
             media.unprepare()
 
     def _open(self, camera: _Camera, opening: _Opening) -> None:
-        """Build a camera's pipeline, wait for what it delivers, and keep it until somebody holds it."""
+        """Build a camera's pipeline, wait until it delivers, and keep it until a client holds it."""
         try:
             with self._changed:
                 self._changed.wait_for(lambda: camera.stage is not _Stage.ENDING, GONE_S)
@@ -253,7 +253,7 @@ class CameraServer:
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
         try:
             connection = RtspConnection(client, self._media.session_timeout_s)
-        except OSError:  # it has gone already, or there are no descriptors left: it may not watch
+        except OSError:  # the client is gone already, or there are no descriptors left: it may not watch
             return
         with self._changed:
             self._connections[client] = connection
@@ -295,7 +295,7 @@ class CameraServer:
         return OK if self._hold(client, camera) else UNAVAILABLE
 
     def _redirect(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
-        """Answer with the URL that is right: with a query the library would find the camera here, but not in PLAY."""
+        """Answer with the correct URL: with a query the library would find the camera here, but not in PLAY."""
         uri = context.uri
         _, message = GstRtsp.rtsp_message_new_response(MOVED, GstRtsp.rtsp_status_as_text(MOVED), context.request)
         message.add_header(GstRtsp.RTSPHeaderField.LOCATION, f"rtsp://{uri.host}:{uri.port}/{_path(context)}")
@@ -303,13 +303,13 @@ class CameraServer:
         client.send_message(None, message)
         connection = self._connection(client)
         if connection:
-            connection.close()  # the library would answer as well, without a Location
+            connection.close()  # the library would also answer, without a Location
 
     def _on_described(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
         self._release(lambda _, holder: holder is client)
 
     def _on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
-        """Let a viewer in, or refuse it where its copy of the stream would overload the uplink."""
+        """Admit a viewer, or refuse it if its copy of the stream would overload the uplink."""
         camera = next((c for c in self._cameras.values() if c.media is context.media), None)
         with self._changed:
             newcomer = self._connections.get(client)
@@ -340,10 +340,10 @@ class CameraServer:
         self._wake({_camera_name(context)})
 
     def _wake(self, cameras: Iterable[str]) -> None:
-        """Let the library look again which interleaved viewers are ready.
+        """Make the library check again which interleaved viewers are ready.
 
-        It stops a camera's interleaved stream while none is, and looks again when one of them has taken something.
-        Nothing makes it look when the one that it waits for leaves, or a ready one joins.
+        It stops a camera's interleaved stream while none is, and checks again when one of them has accepted data.
+        Nothing makes it check when the viewer that it waits for leaves, or a ready one joins.
         """
         for name in cameras:
             for connection in self._watching(name):
@@ -392,22 +392,22 @@ class CameraServer:
         return connection.lag(sum(pipeline.kbps for pipeline in pipelines), shared)
 
     def _expire_sessions(self) -> None:
-        """End sessions whose viewer sends neither requests nor RTCP any more.
+        """End sessions whose viewer no longer sends requests or RTCP.
 
-        In a thread of its own, since the end of the last one takes the pipeline down.
+        In a separate thread, since the end of the last session tears the pipeline down.
         """
         pool = self._server.get_session_pool()
         while not self._stopped.wait(SESSIONS_EVERY_S):
             self._keep_silent()
             pool.cleanup()
-            # What a client was refused after all is not described to it.
+            # A DESCRIBE that is refused after all does not release its hold.
             old = time.monotonic() - OPEN_S
             self._release(lambda since, _, old=old: since < old)  # type: ignore[misc]
 
     def _keep_silent(self) -> None:
-        """Let no session expire for silence on a camera that is paused, or whose source is being replaced.
+        """Keep sessions from expiring on a camera that is paused, or whose source is being replaced.
 
-        Nothing is sent there, and players such as ffmpeg send nothing in return. Who has left is noticed by TCP.
+        Nothing is sent there, and players such as ffmpeg send nothing in return. TCP detects viewers that have left.
         """
         with self._changed:
             watching = [(client, list(connection.cameras)) for client, connection in self._connections.items()]
@@ -422,7 +422,7 @@ class CameraServer:
 
 
 def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool | None:
-    """Addresses for RTP and RTCP: the server's own. None where it listens on all."""
+    """Addresses for RTP and RTCP: the server's own. None if it listens on all."""
     address = socket.gethostbyname(media.host)
     if address == "0.0.0.0":
         return None
@@ -433,12 +433,12 @@ def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool | None:
 
 
 def _camera_name(context: GstRtspServer.RTSPContext) -> str:
-    """The camera that a request's URL names, or what it has in its place; SETUP has a stream below the camera."""
+    """First component of the path of a request's URL: the camera, if valid; in SETUP a stream follows it."""
     return _path(context).partition("/")[0]
 
 
 def _path(context: GstRtspServer.RTSPContext) -> str:
-    """The path of a request's URL without slashes at its ends; "" where path or host is not text."""
+    """The path of a request's URL without leading and trailing slashes; "" if path or host is not text."""
     try:
         return str(context.uri.abspath).strip("/") if isinstance(context.uri.host, str) else ""
     except UnicodeDecodeError:
@@ -461,16 +461,16 @@ def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:
 
 
 def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element) -> None:
-    """Settle what the server library makes by itself around a pipeline."""
+    """Configure the elements that the server library adds around a pipeline."""
     if parent is pipeline and element.get_factory().get_name() == "queue":
-        # In front of its sinks, where it has several. One that takes nothing must not hold up the others. Not limited
-        # by time: the first packet after a pause would seem to be as old as the pause, and be dropped for the second.
+        # In front of its sinks, if it has several. One that takes nothing must not block the others. Not limited by
+        # time: the first packet after a pause would seem as old as the pause, and be dropped for the second.
         element.set_property("leaky", "downstream")
         element.set_property("max-size-buffers", 0)
         element.set_property("max-size-time", 0)
         element.set_property("max-size-bytes", QUEUE_BYTES)
     if element.find_property("processing-deadline"):
-        # Sinks of a live pipeline hold packets back for 20 ms: here pure latency.
+        # Sinks of a live pipeline delay packets by 20 ms: here pure latency.
         element.set_property("processing-deadline", 0)
     if element.find_property("rtcp-sync-send-time"):
         # Packets state when their frame was captured, not when they leave.

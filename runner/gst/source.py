@@ -1,4 +1,4 @@
-"""What a source needs beyond its elements: clips that loop without a gap, and a truthful capture time."""
+"""What a source needs beyond its elements: clips that loop without a gap, and correct capture times."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 
 CHECK_MS = 1000
-BEHIND_S = 0.3  # a clip that is behind by more has lost it
+BEHIND_S = 0.3  # a longer lag of a clip is written off, not caught up
 
 
 def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
-    """Make a clip start again at its end, with running time going on.
+    """Make a clip restart at its end while running time continues.
 
-    A segment seek tells the demuxer to say SEGMENT_DONE in place of EOS; the next seek then queues the clip behind
+    A segment seek makes the demuxer send SEGMENT_DONE instead of EOS; the next seek then queues the clip behind
     itself. Python runs once per round, not per frame.
     """
     identity = pipeline.get_by_name(plan.source[-1].name)
@@ -27,18 +27,18 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
 
 
 class _Loop:
-    """Watches the pad in front of the pacing element. Nothing of the first seek, a flush, is seen behind it."""
+    """Watches the pad before the pacing element. The first seek, which flushes, is invisible downstream of it."""
 
     def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
         self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
-        self._begins = True  # the next segment is a round, and not one repeated with another offset
+        self._begins = True  # the next segment starts a round; it is not the current one with another offset
         self._round: tuple[int, int] | None = None  # where this round began: running time in ns, frames before it
         self._sought = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
         pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
 
     def _on_early_frame(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """Frames from before the first seek would come twice."""
+        """Drop frames from before the first seek, which would otherwise come twice."""
         if self._flushed:
             return Gst.PadProbeReturn.REMOVE
         if not self._sought:
@@ -63,14 +63,14 @@ class _Loop:
         return Gst.PadProbeReturn.OK
 
     def _make_room(self, base: int) -> None:
-        """Let a round last as long as its frames.
+        """Make a round last as long as its frames.
 
-        Demuxers count it to the beginning of its last frame, which the first one of the next round then coincides with.
+        Demuxers end it at the start of its last frame, so that the next round's first frame coincides with that one.
         """
         identity = self._identity()
         if identity is None:
             return
-        base -= self._pad.get_offset()  # as the demuxer states it
+        base -= self._pad.get_offset()  # as stated by the demuxer
         frames = identity.get_property("stats").get_value("num-buffers")
         if self._round:
             began, before = self._round
@@ -80,14 +80,14 @@ class _Loop:
 
     def _seek(self, flags: Gst.SeekFlags) -> None:
         event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
-        # Not from the streaming thread, which the seek has to wait for. A source pad takes it from below.
+        # Not from the streaming thread, since the seek has to wait for it. A source pad accepts it from downstream.
         threading.Thread(target=self._pad.send_event, args=(event,), daemon=True).start()
 
 
 class _Pace:
-    """Lets a clip lose the time that it is behind, as a camera loses frames.
+    """Writes off the time by which a clip lags, as a camera loses frames.
 
-    A machine that was too busy for a while would else play what is overdue as fast as it can, and stay too busy.
+    Otherwise a machine that was overloaded for a while would play overdue frames at full speed, and stay overloaded.
     """
 
     def __init__(self, identity: Gst.Element, fps: float) -> None:
@@ -114,13 +114,13 @@ class _Pace:
 
 
 def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
-    """The elements that repeat frames and leave some out to keep a rate, and count them."""
+    """The elements that repeat and drop frames to keep a constant rate, and count them."""
     counts = ("duplicate", "drop", "skip-to-first")
     return [e for e in pipeline.children if all(e.find_property(key) for key in counts)]
 
 
 def _report_no_latency(pad: Gst.Pad) -> None:
-    """A frame of a clip is captured when it is released: decoding ahead of time is no latency."""
+    """A frame of a clip counts as captured when it is released: decoding ahead of time is not latency."""
 
     def on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         query = info.get_query()

@@ -1,4 +1,4 @@
-"""Pipelines that bring their own network elements: they run by themselves and are built anew when they fail."""
+"""Pipelines with their own network elements: they run independently and are rebuilt when they fail."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from runner.gst.aside import HUNG, set_state_aside
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline
 
-RETRY_S = 1.0  # between the beginnings of two attempts, at least
-STOPPED_S = 2.0  # how long the next pipeline waits for the end of the one before, whose port it needs
-PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for so long
+RETRY_S = 1.0  # minimum time between the starts of two attempts
+STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to end, whose port it needs
+PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for this long
 
 
 class SupervisedPipeline:
-    """A pipeline that is torn down and built anew when it fails or ends; it is never repaired in place.
+    """A pipeline that is torn down and rebuilt when it fails or ends; it is never repaired in place.
 
-    All methods are called in the thread of GLib's main loop. State changes run in threads of their own: an element that
-    locks up holds up nobody else.
+    All methods are called in the thread of GLib's main loop. State changes run in separate threads: an element that
+    deadlocks does not delay the others.
 
     on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
-    on_report  called with each reason once, until the pipeline works again
-    rebuilt    how often a pipeline that had worked was built anew
+    on_report  called once with each reason, until the pipeline works again
+    rebuilt    how often a pipeline that had worked was rebuilt
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class SupervisedPipeline:
     ) -> None:
         self._launch, self._on_built, self._on_report = launch, on_built, on_report
         self._pipeline: Gst.Pipeline | None = None
-        self._change: threading.Thread | None = None  # the last change of state of the last pipeline
+        self._change: threading.Thread | None = None  # the last state change of the last pipeline
         self._retry = 0
         self._attempt = 0
         self._begun = time.monotonic()  # the last attempt
@@ -46,7 +46,7 @@ class SupervisedPipeline:
 
     def start(self) -> None:
         pipeline = Gst.parse_launch(self._launch)
-        if not isinstance(pipeline, Gst.Pipeline):  # a single element comes without one
+        if not isinstance(pipeline, Gst.Pipeline):  # a single element is returned without a pipeline
             element, pipeline = pipeline, Gst.Pipeline.new(None)
             pipeline.add(element)
         self._pipeline, self._begun, self._works = pipeline, time.monotonic(), False
@@ -68,7 +68,7 @@ class SupervisedPipeline:
             self._pipeline = None
 
     def restart(self, why: str) -> None:
-        """Tear down now, build anew soon."""
+        """Tear down now, rebuild soon."""
         if self._retry:
             return
         now = time.monotonic()
@@ -107,7 +107,7 @@ class SupervisedPipeline:
 class CameraCaller:
     """One camera's supervised pipeline on the vehicle.
 
-    build  makes a `CameraPipeline` of each that was built
+    build  makes a `CameraPipeline` from each new pipeline
     """
 
     def __init__(self, plan: Plan, build: Build, on_report: Callable[[str, str], None]) -> None:

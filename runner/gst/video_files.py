@@ -1,4 +1,4 @@
-"""One camera's stream on one side, as it is, into a file: MPEG-TS, which can be read up to wherever it ends."""
+"""Writes one camera's stream on one side into a file, unchanged: MPEG-TS, which is readable even if cut off."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gi.repository import Gst
 
 from runner.gst.clocks import unix_time
 
-DIRECTORY = "video"  # below that of the drive
-_MARK = "video-"  # how the names of the elements in front of the file begin, see runner/graph.py
+DIRECTORY = "video"  # below the drive's directory
+_MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
 Captured = Callable[[Gst.Pad, Gst.Buffer], float]  # when a frame was captured, s since 1970
 
@@ -23,9 +23,9 @@ Captured = Callable[[Gst.Pad, Gst.Buffer], float]  # when a frame was captured, 
 class VideoFiles:
     """Where the video of the cameras is kept.
 
-    directory  that of the drive; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counting the pipelines with a frame
-    on_video   called when a file has its first frame, from another thread: camera, name of the file from the
-               directory on, capture time of that frame in s since 1970
+    directory  the drive's; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counts the pipelines with a frame
+    on_video   called when a file has its first frame, from another thread: camera, name of the file relative to the
+               directory, capture time of that frame in s since 1970
     """
 
     directory: Path
@@ -35,11 +35,11 @@ class VideoFiles:
 class VideoFile:
     """The file of one pipeline. It begins with the first frame: a pipeline without frames leaves none.
 
-    Whatever fails here ends the file, is reported once, and leaves the stream alone. After the first frame no Python
-    runs. Elements are looked up when they are needed: whom a probe keeps alive must not keep alive the pipeline.
+    Any failure here ends the file, is reported once, and does not affect the stream. After the first frame no Python
+    runs. Elements are looked up when needed: an object that a probe keeps alive must not keep the pipeline alive.
 
     side       vehicle or operator
-    captured   when a frame was captured; asked between queue and parser
+    captured   returns a frame's capture time; called between queue and parser
     on_report  called with camera and what failed
     """
 
@@ -48,13 +48,13 @@ class VideoFile:
     ) -> None:
         self._files, self._camera, self._side = files, camera, side
         self._captured, self._on_report = captured, on_report
-        self._came: dict[int, float] = {}  # by time in the stream, ns: when it was captured
+        self._came: dict[int, float] = {}  # by stream time, ns: the capture time
         self._begun = self._failed = self._late = False
 
     def follow(self, pipeline: Gst.Bin) -> None:
-        """Watch a pipeline that was just built from a plan with `video`."""
+        """Watch a newly built pipeline of a plan with `video`."""
         elements = {name: pipeline.get_by_name(f"{_MARK}{name}") for name in ("gate", "queue", "parser", "file")}
-        elements["file"].set_locked_state(True)  # not opened with the pipeline, and no reason for it to fail
+        elements["file"].set_locked_state(True)  # not opened with the pipeline, so that it cannot fail the pipeline
         queries = Gst.PadProbeType.QUERY_DOWNSTREAM | Gst.PadProbeType.QUERY_UPSTREAM
         elements["gate"].get_static_pad("sink").add_probe(queries, _on_query)
         elements["queue"].connect("overrun", self._on_overrun)
@@ -63,7 +63,7 @@ class VideoFile:
         _outermost(pipeline).get_bus().set_sync_handler(self._on_message)
 
     def _on_unit(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """From the queue's thread, until the file has begun: the parser passes on nothing before parameter sets."""
+        """From the queue's thread, until the file has begun: the parser outputs nothing before parameter sets."""
         if self._begun:
             return Gst.PadProbeReturn.REMOVE
         buffer = info.get_buffer()
@@ -71,7 +71,7 @@ class VideoFile:
         return Gst.PadProbeReturn.OK
 
     def _on_first_parsed(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """From the queue's thread: open the file, in front of its first frame."""
+        """From the queue's thread: open the file, just before its first frame."""
         self._begun = True
         captured = self._came.get(info.get_buffer().pts) or max(self._came.values(), default=time.time())
         self._came.clear()
@@ -84,19 +84,19 @@ class VideoFile:
         sink = parts.get_by_name(f"{_MARK}file")
         sink.set_property("location", str(path))
         sink.set_locked_state(False)
-        if sink.sync_state_with_parent():  # else the message has come
+        if sink.sync_state_with_parent():  # otherwise an error was posted
             self._files.on_video(self._camera, str(path.relative_to(self._files.directory)), captured)
         return Gst.PadProbeReturn.REMOVE
 
     def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:
-        """From any thread, before the pipeline hears of it."""
+        """From any thread, before the pipeline receives it."""
         if message.type != Gst.MessageType.ERROR or not concerns_file(message):
             return Gst.BusSyncReply.PASS
         self._fail(message.src.get_parent(), message.parse_error()[0].message)
         return Gst.BusSyncReply.DROP
 
     def _fail(self, parts: Gst.Bin, why: str) -> None:
-        """Shut the gate. It takes what comes from then on, and also forgives the failure of the frame on its way."""
+        """Close the gate. It discards all further frames, and also hides the failure of the frame in flight."""
         parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
         if not self._failed:
             self._failed = True
@@ -104,7 +104,7 @@ class VideoFile:
 
     def _on_overrun(self, queue: Gst.Element) -> None:
         """From the stream's thread, when the queue is full for the first time."""
-        queue.set_property("silent", True)  # it need not say so again
+        queue.set_property("silent", True)  # once is enough
         if not (self._late or self._failed):
             self._late = True
             self._on_report(self._camera, "the disk is too slow: frames are missing in the video file")
@@ -116,7 +116,7 @@ def concerns_file(message: Gst.Message) -> bool:
 
 
 def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
-    """When a frame was captured on this machine, s since 1970, by its place in the stream's running time."""
+    """Capture time of a frame on this machine, s since 1970, from its running time."""
     element = pad.get_parent_element()
     segment, clock = pad.get_sticky_event(Gst.EventType.SEGMENT, 0), element.get_clock()
     if segment is None or clock is None:
@@ -126,7 +126,7 @@ def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
 
 
 def _new_file(directory: Path, camera: str, side: str) -> Path:
-    """An empty file that did not exist before.
+    """Create an empty file that did not exist before.
 
     raises  OSError
     """
@@ -142,10 +142,10 @@ def _new_file(directory: Path, camera: str, side: str) -> Path:
 
 
 def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """The file takes whatever the stream is, and has no say in its form and its latency.
+    """The file branch accepts any stream, and must not influence its format or latency.
 
-    Else an encoder would choose the form that the file likes, and the sink of the stream would hold packets back until
-    the slowest branch is ready.
+    Otherwise an encoder would choose the format that the file prefers, and the sink of the stream would hold packets
+    back until the slowest branch is ready.
     """
     query = info.get_query()
     if query.type == Gst.QueryType.CAPS:

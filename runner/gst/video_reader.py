@@ -1,4 +1,4 @@
-"""The access units of a video file of a drive, one by one. Offline work, so Python per frame is fine here."""
+"""Reads the access units of a drive's video file one by one. Offline work, so Python per frame is fine here."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from runner.errors import RunError
 from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
-SILENT = 100  # waits without a unit, an end or an error, after which the file is given up
-_PARSED = {  # by codec, how its units become whole pictures as Annex B, parameter sets with each keyframe
+SILENT = 100  # consecutive waits without a unit, EOS or error before the file is given up
+_PARSED = {  # by codec, the parser: whole pictures as Annex B, parameter sets with each keyframe
     codec: f"{codec}parse config-interval=-1 ! capsfilter caps=video/x-{codec},stream-format=byte-stream,alignment=au"
     for codec in ("h264", "h265")
 }
@@ -22,7 +22,7 @@ _PARSED = {  # by codec, how its units become whole pictures as Annex B, paramet
 class Unit(NamedTuple):
     """One access unit.
 
-    after_ns  its time since the first unit of the file, ns
+    after_ns  time since the first unit of the file, ns
     codec     h264 or h265
     data      Annex B
     """
@@ -33,9 +33,9 @@ class Unit(NamedTuple):
 
 
 def read_video(path: Path) -> Iterator[Unit]:
-    """All that can be read, in order.
+    """Yield all readable units, in order.
 
-    raises  RunError where the file is none or is damaged; what was read before stays good
+    raises  RunError if the path names no file or the file is damaged; units already yielded stay valid
     """
     if not path.is_file():
         raise RunError(f"{path}: {file_problem(path)}")
@@ -43,14 +43,14 @@ def read_video(path: Path) -> Iterator[Unit]:
     pipeline.get_by_name("file").set_property("location", str(path))
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
     try:
-        pipeline.set_state(Gst.State.PLAYING)  # a failure is on the bus, in words
+        pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
         yield from _pulled(pipeline, path)
     finally:
         pipeline.set_state(Gst.State.NULL)
 
 
 def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
-    """The file's stream is found: put what its codec needs in front of the end. Nothing runs per frame here."""
+    """The demuxer has found the stream: insert the parser for its codec before the sink. Not called per frame."""
     codec = pad.get_current_caps().get_structure(0).get_name().removeprefix("video/x-")
     if codec not in _PARSED or out.get_static_pad("sink").is_linked():
         return  # the waiting consumer gets no units
@@ -79,6 +79,6 @@ def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
         if not codec:
             codec, first = sample.get_caps().get_structure(0).get_name().removeprefix("video/x-"), buffer.pts
         if buffer.pts == Gst.CLOCK_TIME_NONE:
-            continue  # a unit that is damaged at its head
+            continue  # a unit whose beginning is damaged
         yield Unit(buffer.pts - first, codec, buffer.extract_dup(0, buffer.get_size()))
     raise RunError(f"{path}: is damaged" if codec else f"{path}: contains no readable video")

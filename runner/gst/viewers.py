@@ -1,9 +1,9 @@
 """Who may watch a camera over the uplink: each copy of its stream that leaves the vehicle costs the same bitrate again.
 
-A viewer on the vehicle itself (loopback) costs no uplink; it is always let in and never counted. The controller, the
-operator in control, is always let in. RTSP carries no operator of its own, so an operator's RTSP client states it as
-its User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
-name and no proof; nothing on either link is authenticated yet.
+A viewer on the vehicle itself (loopback) costs no uplink; it is always admitted and never counted. The controller, the
+operator in control, is always admitted. RTSP has no field for an operator, so an operator's RTSP client states its id
+as User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
+name, not a proof; nothing on either link is authenticated yet.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class StreamViewer(NamedTuple):
     """One viewer of one camera.
 
     address   IP address that its requests come from
-    operator  id of the operator that it belongs to, "" where it states none
+    operator  id of the operator that it belongs to, "" if it states none
     since     monotonic time at which it connected, s; distinguishes viewers from one address
     """
 
@@ -29,7 +29,7 @@ class StreamViewer(NamedTuple):
 
 
 def user_agent(operator: str) -> str:
-    """What an operator's RTSP client states as its User-Agent."""
+    """The User-Agent of an operator's RTSP client."""
     return f"{_PRODUCT}{operator}"
 
 
@@ -39,7 +39,7 @@ def operator_of(agent: str | None) -> str:
 
 
 def over_uplink(address: str) -> bool:
-    """Whether what is sent to an IP address leaves this machine; an address of its own other than loopback counts."""
+    """Whether traffic to an IP address leaves this machine; its own addresses other than loopback count as leaving."""
     ip = ip_address(address.partition("%")[0])
     mapped = ip.ipv4_mapped if isinstance(ip, IPv6Address) else None
     return not (mapped or ip).is_loopback
@@ -48,13 +48,13 @@ def over_uplink(address: str) -> bool:
 def admit(
     viewers: Sequence[StreamViewer], new_viewer: StreamViewer, limit: int, controller: str
 ) -> list[StreamViewer] | None:
-    """Which viewers of a camera have to leave for a newcomer, or None where the newcomer is refused.
+    """Which viewers of a camera have to leave for a newcomer, or None if the newcomer is refused.
 
-    viewers     of this camera, in the order in which they came
+    viewers     of this camera, in order of arrival
     limit       viewers over the uplink at once, at least 1
     controller  id of the operator in control, "" for none
-    returns     for the controller the newest of the others, and where all are the controller's own, the oldest: it is
-                what an operator leaves behind whose address changed
+    returns     for the controller the newest of the others; if all are the controller's own, the oldest: the one left
+                behind by an operator whose address changed
     """
     if not over_uplink(new_viewer.address):
         return []

@@ -1,4 +1,4 @@
-"""A camera's watched source: where it freezes or fails, it is replaced while the rest of the pipeline continues."""
+"""A camera's watched source: if it freezes or fails, it is replaced while the rest of the pipeline continues."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from runner.gst.outage import Outage
 from runner.gst.source import fixed_rate
 
 CHECK_MS = 100
-FIRST_FRAME_S = 10.0  # a camera may offer UDP in vain for 5 s, and keep back its first key frame
-BACKOFF_S = (1.0, 10.0)  # between the beginnings of two attempts: doubled from the first to the second
+FIRST_FRAME_S = 10.0  # UDP may fail only after 5 s, and the first keyframe may come late
+BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
 
 class WatchedSource(Gst.Bin):  # type: ignore[misc]
-    """Stands in the place of a source's elements and holds them as its child.
+    """Takes the place of a source's elements and holds them as its child.
 
-    A source without a frame for `Plan.frozen_s` while the pipeline plays, or that fails or ends, is taken out and built
-    anew. What follows sees a pause: clock and running time go on, while the source's errors, its end and its
-    asynchronous state changes stay in here. The frames are counted in C in front of the gate, so that a camera which is
-    paused or off counts as fine.
+    A source that delivers no frame for `Plan.frozen_s` while the pipeline plays, fails or ends is removed and rebuilt.
+    Downstream elements only see a pause: clock and running time continue, and the source's errors, its EOS and its
+    asynchronous state changes do not leave this bin. Frames are counted in C before the gate, so a camera that is
+    paused or off counts as working.
 
     Until the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
@@ -42,16 +42,16 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
         self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, self._on_event)
-        self._lock = threading.Lock()  # of the child: the server's threads start and stop, GLib's one replaces
+        self._lock = threading.Lock()  # of the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
         self._timer = 0
-        self._failed: str | None = None  # the error of the source itself, from its threads
+        self._failed: str | None = None  # the source's own error, set from its threads
         self._moved = (0, 0.0)  # frames at the last change of the counter, and when
         self._attempts = 0  # of this outage
-        self._tried = (0, 0.0)  # frames when the last one began, and when
+        self._tried = (0, 0.0)  # frames when the last attempt began, and when
 
     def take_place(self, pipeline: Gst.Bin, plan: Plan) -> None:
-        """Replace the plain elements of the source in a pipeline that was just built."""
+        """Replace the plain elements of the source in a newly built pipeline."""
         for element in plan.source:
             pipeline.remove(pipeline.get_by_name(element.name))
         pipeline.add(self)
@@ -93,7 +93,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
         if frames != self._moved[0] or not self._plays():
-            self._moved, self._failed = (frames, now), None  # an error that stops no frame is not the picture's
+            self._moved, self._failed = (frames, now), None  # an error that stops no frames is not the video's
         if not frames:
             return True
         if not self._attempts:
@@ -106,17 +106,17 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         return True
 
     def _look(self, now: float) -> None:
-        """While all is well."""
+        """During normal operation."""
         if now - self._moved[1] <= self._frozen_s:
             return
         if self._idle():
             self.outage.failed(f"source: {self._failed or f'no frame for {self._frozen_s:g} s'}", self._moved[1])
             self._replace(now)
         else:
-            self._moved = (self._moved[0], now)  # its next frame comes when this one has gone
+            self._moved = (self._moved[0], now)  # its next frame follows once this one has passed
 
     def _look_again(self, now: float) -> None:
-        """After an attempt that has not brought a frame yet."""
+        """After an attempt that has not delivered a frame yet."""
         if self._failed:
             self.outage.failed(f"source: {self._failed}", self._moved[1])
         first, longest = BACKOFF_S
@@ -141,7 +141,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child = Gst.parse_bin_from_description(self._launch, ghost_unlinked_pads=False)
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
         for element in fixed_rate(child):
-            element.set_property("skip-to-first", True)  # else the first frame is repeated for the time before it
+            element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
         self.add(child)
         child.link(self._counter)
         self._child = child
@@ -163,7 +163,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         return bool(self._counter.get_state(0).state == Gst.State.PLAYING)
 
     def _idle(self) -> bool:
-        """Whether no frame is held up behind the source, as by a sink that connects again."""
+        """Whether no frame is blocked downstream of the source, for example by a sink that is reconnecting."""
         pad = self._counter.get_static_pad("src")
         here: list[bool] = []
         probe = pad.add_probe(Gst.PadProbeType.IDLE, _remember, here)

@@ -1,1 +1,1 @@
-"""What is read from an H.264 or H.265 byte stream without decoding it."""
+"""Reads H.264 and H.265 byte streams without decoding them."""

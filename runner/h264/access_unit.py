@@ -11,19 +11,19 @@ from runner.h264.keyframe import Bits, grey_idr
 SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
-PERIODS = 2  # of refresh, that make any picture exact: the second holds a whole wave, wherever the first began
-LATE = 4  # how much longer than stated a wave may take
-LONGEST_S = 20.0  # what is kept of a stream that never starts anew and states no refresh period
+PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, wherever the first one began
+LATE = 4  # factor by which a wave may take longer than stated
+LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh period is unknown
 
 
 class AccessUnit(NamedTuple):
     """One encoded picture, H.264 or H.265, Annex B.
 
-    captured  when it was captured, s since 1970 by the vehicle's clock; None where the line does not carry it
-    arrived   when it came, s since 1970 by this machine's clock
+    captured  capture time, s since 1970 by the vehicle's clock; None if the transport does not carry it
+    arrived   arrival time, s since 1970 by this machine's clock
     key       whether a decoder can start with it (IDR; of H.265 any IRAP picture)
-    recovery  frames after which a decoder that follows from here is exact, where a refresh wave begins; else None
-    exact     False: decoded, it still shows something that was never sent
+    recovery  frames after which a decoder that starts here is exact, if a refresh wave begins here; otherwise None
+    exact     False: the decoded picture still shows content that was never sent
     """
 
     data: bytes
@@ -37,12 +37,12 @@ class AccessUnit(NamedTuple):
 def read_unit(
     data: bytes, captured: float | None, arrived: float, *, damaged: bool = False, codec: str = "h264"
 ) -> AccessUnit | None:
-    """An access unit that has come, in Annex B: whether it starts anew is read from its NAL units.
+    """A received access unit, in Annex B: its NAL units show whether a decoder can start with it.
 
     damaged  packets of it were lost
     codec    h264 or h265
-    returns  None for one that is of no use: browsers' decoders give up on half a picture, and bear one that is missing.
-             Half an IDR picture of H.264 becomes a grey one, over which the next refresh wave paints.
+    returns  None for a useless one: browsers' decoders fail on an incomplete picture, but tolerate a missing one.
+             An incomplete IDR picture of H.264 becomes a grey one, over which the next refresh wave paints.
 
     Parameter sets do not identify an IDR picture: encoders repeat them at every wave.
     """
@@ -62,7 +62,7 @@ def read_unit(
 
 
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
-    """As `read_unit`. A recovery point is not looked for: a viewer that joins waits for the next IRAP picture."""
+    """As `read_unit`. Recovery points are ignored: a viewer that joins waits for the next IRAP picture."""
     for header, _ in _nal_units(data):
         kind = header >> 1 & 0x3F
         if kind in H265_VCL:
@@ -71,7 +71,7 @@ def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUni
 
 
 def _nal_units(data: bytes) -> Iterator[tuple[int, int]]:
-    """First byte of the header of each NAL unit, and the place behind it."""
+    """First byte of the header of each NAL unit, and the offset after it."""
     at = data.find(b"\0\0\1")
     while 0 <= at < len(data) - 3:
         yield data[at + 3], at + 4
@@ -84,14 +84,14 @@ def _recovery(message: bytes) -> int | None:
 
 
 class Recent:
-    """The units of one camera that a late decoder needs: the last IDR, and what came since or in the last periods.
+    """The units of one camera that a late decoder needs: the last IDR, and the units since or of the last periods.
 
-    With intra-refresh an IDR comes only when the picture changes its size. Shown alone it mixes an old picture with
-    new changes; after two refresh periods, or one whole wave that the stream announces, nothing of the old one is left.
-    A stream that others watched before has no IDR for a viewer that joins: it starts from a grey one.
+    With intra-refresh an IDR comes only when the picture changes its size. Starting from it alone mixes an old picture
+    with new changes; after two refresh periods, or one whole wave that the stream announces, the old picture is gone.
+    A stream that others already watch has no IDR for a viewer that joins: it starts from a grey one.
 
-    refresh_s  length of a refresh wave or distance of key frames, s; None where the graph does not state it
-    codec      h264 or h265; a stream of H.265 that others watched before starts with its next IRAP picture
+    refresh_s  length of a refresh wave or keyframe interval, s; None if the graph does not state it
+    codec      h264 or h265; an H.265 stream that others already watch starts with its next IRAP picture
     """
 
     def __init__(self, refresh_s: float | None, codec: str = "h264") -> None:
@@ -99,10 +99,10 @@ class Recent:
         self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
         self._key: AccessUnit | None = None
         self._since: deque[AccessUnit] = deque()
-        self._exact_from = 0.0  # a grey start: when two periods have passed
+        self._exact_from = 0.0  # after a grey start: when two periods have passed
 
     def add(self, unit: AccessUnit) -> AccessUnit:
-        """Keep a unit that has just come; returns it with `exact` as it is for a decoder that follows from here."""
+        """Keep a newly received unit; returns it with `exact` set for a decoder that starts from the kept units."""
         if unit.key:
             self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
             self._since.clear()
@@ -121,7 +121,7 @@ class Recent:
         return unit
 
     def _forget(self, now: float) -> None:
-        """Drop what is older than the window; waves that take longer, because frames come late, are kept whole."""
+        """Drop units older than the window; waves that take longer, because frames come late, are kept whole."""
         if any(unit.recovery is not None for unit in self._since):
             spare, oldest = self._wave() or 0, now - LATE * self._window
         else:
@@ -131,14 +131,14 @@ class Recent:
             spare -= 1
 
     def burst(self) -> list[AccessUnit]:
-        """Units to decode in order, of which the last is the newest; none before there is one to start with."""
+        """Units to decode, in order, the newest last; empty until there is one to start with."""
         if self._key is None:
             return []
         units = list(self._since)
         return [self._key, *units[self._wave() or 0 :]]
 
     def _wave(self) -> int | None:
-        """Where the last wave began that has run to its end by now; None if there is none."""
+        """Index where the last completed wave began; None if there is none."""
         for at in range(len(self._since) - 1, -1, -1):
             recovery = self._since[at].recovery
             if recovery is not None and len(self._since) - 1 - at >= recovery:

@@ -1,7 +1,7 @@
-"""A grey IDR picture, for a decoder that joins a stream in its middle and insists on starting with one. Pure.
+"""A grey IDR picture, for a decoder that joins a running stream and must start with an IDR. Pure.
 
-With intra-refresh a stream that is joined late never has an IDR: its pictures become exact by refresh waves alone. What
-a wave is painted over does not matter, so any IDR of the right size will do. ITU-T H.264 (08/2021), clause 7.3.
+With intra-refresh a stream that is joined late never has an IDR: its pictures become exact by refresh waves alone. The
+picture under a wave does not matter, so any IDR of the right size will do. ITU-T H.264 (08/2021), clause 7.3.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 NAL_IDR, NAL_SPS, NAL_PPS = 0x65, 0x67, 0x68  # with nal_ref_idc 3
-OWN_PPS = 31  # id of the parameter set made here; encoders use the first ones
-# Profiles whose parameter set goes on with chroma format and bit depths (7.3.2.1.1).
+OWN_PPS = 31  # id of the parameter set generated here; encoders use the lowest ones
+# Profiles whose parameter set contains chroma format and bit depths (7.3.2.1.1).
 _HIGH_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 # CAVLC: ue(3) I_16x16 with DC prediction and nothing coded, ue(0) DC chroma prediction, se(0) QP, no DC coefficients.
 _GREY_MACROBLOCK = "00100111"
 
 
 class _Sps(NamedTuple):
-    """What a slice header and the size of the picture depend on."""
+    """The fields that determine the slice header and the picture size."""
 
     identity: int
     frame_num_bits: int
@@ -28,12 +28,12 @@ class _Sps(NamedTuple):
 
 
 def grey_idr(unit: bytes) -> bytes | None:
-    """An access unit in Annex B with the parameter sets of a given one, and a picture that is grey all over.
+    """An access unit in Annex B with the parameter sets of a given one, and an all-grey picture.
 
-    It has all its parameter sets, since those units that follow may come without.
+    It repeats all parameter sets, since the units that follow may have none.
 
     unit     an access unit in Annex B
-    returns  None where it has no sequence parameter set, or one this cannot follow (scaling lists, 4:4:4, fields)
+    returns  None if it has no sequence parameter set, or an unsupported one (scaling lists, 4:4:4, fields)
     """
     nals = [nal.rstrip(b"\0") for nal in unit.split(b"\0\0\1")[1:]]
     sps = next((nal for nal in nals if nal and nal[0] & 0x1F == 7), None)
@@ -106,14 +106,14 @@ def _nal(header: int, bits: str) -> bytes:
 
 
 class Bits:
-    """Reads bits, most significant first; past the end there are zeros."""
+    """Reads bits, most significant first; zeros past the end."""
 
     def __init__(self, data: bytes) -> None:
         self._bits = "".join(f"{byte:08b}" for byte in data)
         self._at = 0
 
     def u(self, count: int) -> int:
-        """So many bits as a number."""
+        """The next `count` bits as a number."""
         self._at += count
         return int(self._bits[self._at - count : self._at] or "0", 2)
 

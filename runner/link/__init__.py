@@ -1,8 +1,8 @@
 """A limited link between the vehicle's and the operator's process, whose rate follows a trace.
 
-What arrives, what is lost and what is late is then measured and not assumed. Two kinds: `netns` (root; the kernel
-limits real network devices) and `relay` (no root; a process between the two). Both limit everything that goes from the
-vehicle to the operator in one queue; the other way is free.
+Arrivals, losses and delays are then measured, not assumed. Two kinds: `netns` (root; the kernel limits real network
+devices) and `relay` (no root; a process between the two). Both limit all traffic from the vehicle to the operator in
+one queue; the other direction is unlimited.
 
 with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):
     ...  # [*link.vehicle_command, python, ..., *link.vehicle_overrides] and [python, ..., *link.operator_overrides]
@@ -28,16 +28,16 @@ __all__ = ["KINDS", "Limit", "LimitedLink", "limited_link"]
 
 KINDS = {"netns": namespaced, "relay": relayed}
 LOG_S = 0.1  # between two lines of the log
-LOOK_S = 0.02  # how late a change of the rate may be
+LOOK_S = 0.02  # how late a rate change may be
 STOP_S = 0.5  # how long the last line of the log may take
 
 OnLinkSample = Callable[[LinkSample], None]
 
 
 class LimitedLink:
-    """A link that exists. Its rate is the initial one until `start` sets the beginning of the drive.
+    """A link that is set up. Its rate is the initial one until `start` sets the beginning of the drive.
 
-    on_sample  called with each sample from a thread of the link
+    on_sample  called with each sample, from a thread of the link
 
     `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
     """
@@ -51,17 +51,17 @@ class LimitedLink:
         self._thread: threading.Thread | None = None
 
     def start(self, began: float) -> None:
-        """Let the rate follow the trace from now on, and write the log; once.
+        """Make the rate follow the trace from now on, and write the log; to be called once.
 
         began  the drive's time 0, s since 1970
         """
         assert self._thread is None, "a link starts once"
-        zero = time.monotonic() - (time.time() - began)  # the system's clock may be set while driving
+        zero = time.monotonic() - (time.time() - began)  # the system clock may be set while driving
         self._thread = threading.Thread(target=self._run, args=(zero,), name="link", daemon=True)
         self._thread.start()
 
     def check(self) -> None:
-        """raises RunError where the link does not do what it should any more"""
+        """raises RunError if the link no longer works as it should"""
         if isinstance(self._failure, RunError):
             raise self._failure
         if self._failure:
@@ -109,14 +109,14 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
 def limited_link(
     kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample
 ) -> Iterator[LimitedLink]:
-    """The link while it is needed; everything that belongs to it is gone at the end.
+    """The link, for the duration of the block; everything that belongs to it is removed at the end.
 
     kind            netns or relay
-    limit           what it does
-    media, control  RTSP server and broker as the configuration states them
+    limit           its rate, queue and delay
+    media, control  RTSP server and broker as configured
     on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
                     since the link was made
-    raises          RunError where it cannot be made, with what to do; at the end, where it has failed meanwhile
+    raises          RunError if it cannot be set up, with the remedy; at the end, if it has failed meanwhile
     """
     if kind not in KINDS:
         raise RunError(f"link={kind}: unknown kind{suggest(kind, KINDS)}")

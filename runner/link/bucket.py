@@ -1,4 +1,4 @@
-"""A drop-tail queue behind a token bucket: what the relay does, as the kernel's tbf does it. Pure: time is given."""
+"""A drop-tail queue behind a token bucket: the relay's limit, like the kernel's tbf. Pure: time is passed in."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ T = TypeVar("T")
 class Bucket(Generic[T]):
     """Packets wait until the bucket holds as many tokens (bytes) as they are long.
 
-    Departures are reckoned, not observed: a late caller finds every packet with the time at which it left, and a
-    scheduler that is late costs no rate. Times are seconds of any clock that does not go back.
+    Departures are computed, not observed: a late caller gets every packet with its departure time, and a late
+    scheduler costs no rate. Times are seconds of any monotonic clock.
     """
 
     def __init__(self, kbps: float, queue_ms: float, now: float) -> None:
         self._queue_ms = queue_ms
         self._items: deque[tuple[int, T]] = deque()
-        self._left: deque[tuple[float, T]] = deque()  # and when
+        self._left: deque[tuple[float, T]] = deque()  # with departure times
         self._backlog = 0  # bytes
-        self._at = now  # when `_tokens` was right
+        self._at = now  # the time for which `_tokens` holds
         self._passed = self._packets = self._dropped = 0
         self._set(kbps)
         self._tokens: float = self._burst
@@ -33,7 +33,7 @@ class Bucket(Generic[T]):
         self._burst, self._limit = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
 
     def set_rate(self, kbps: float, now: float) -> None:
-        """From now on. What waits stays, even if it now waits longer than queue_ms."""
+        """From now on. Queued packets stay, even if they now wait longer than queue_ms."""
         self._advance(now)
         self._fill(now)
         self._set(kbps)
@@ -42,7 +42,7 @@ class Bucket(Generic[T]):
         return self._backlog + size <= self._limit
 
     def put(self, size: int, item: T, now: float, *, keep: bool = False) -> None:
-        """A packet comes; it is dropped where the queue has no room, unless it is to be kept."""
+        """Queue a packet; it is dropped if the queue has no room, unless it is to be kept."""
         self._advance(now)
         if not (keep or self.has_room(size)):
             self._dropped += 1
@@ -53,11 +53,11 @@ class Bucket(Generic[T]):
         self._backlog += size
 
     def due(self) -> float | None:
-        """When the next packet leaves, or has left; None: nothing waits."""
+        """When the next packet departs, or has departed; None: the queue is empty."""
         return self._left[0][0] if self._left else self._next()
 
     def take(self, now: float) -> Iterator[tuple[float, T]]:
-        """Packets that have left by now, each with the time when it did."""
+        """Packets that have departed by now, each with its departure time."""
         self._advance(now)
         while self._left:
             yield self._left.popleft()
@@ -74,7 +74,7 @@ class Bucket(Generic[T]):
         return self._at + max(0.0, self._items[0][0] - self._tokens) / self._rate
 
     def _advance(self, now: float) -> None:
-        """Let go of what leaves by now."""
+        """Let packets depart that are due by now."""
         while (when := self._next()) is not None and when <= now:
             self._fill(when)
             size, item = self._items.popleft()
@@ -85,7 +85,7 @@ class Bucket(Generic[T]):
             self._left.append((when, item))
 
     def _fill(self, now: float) -> None:
-        # A packet longer than the bucket gets the tokens that it needs, too.
+        # A packet longer than the bucket also gets the tokens that it needs.
         most = max(self._burst, self._items[0][0]) if self._items else self._burst
         self._tokens = min(most, self._tokens + max(0.0, now - self._at) * self._rate)
         self._at = max(self._at, now)

@@ -1,4 +1,4 @@
-"""A child process that is asked in lines and answers in lines of JSON."""
+"""A child process that takes requests as lines and answers in lines of JSON."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from typing import Any
 from runner.errors import RunError
 from runner.system import children, signals
 
-ANSWER_S = 5.0  # one that has not answered by then never will
-END_S = 0.5  # how long it may take to end once nobody asks any more
+ANSWER_S = 5.0  # a child that has not answered by then never will
+END_S = 0.5  # how long it may take to end once its input is closed
 LOOK_MS = 50  # how soon a signal to this process is noticed
 
 
 class Child:
-    """Asked through its standard input; every output line that is not JSON is an error.
+    """Takes requests on its standard input; every output line that is not JSON is an error.
 
-    name     for people
-    command  ends when its standard input does; it is killed with the thread that makes this
+    name     for messages
+    command  ends when its standard input does; it is killed with the thread that creates this
     """
 
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self._name = name
         pipe = subprocess.PIPE
-        # A session of its own: Ctrl-C ends the parent, not the child, which counts until the end.
+        # Its own session: Ctrl-C ends the parent, not the child, which counts until the end.
         self._process = subprocess.Popen(
             children.bound(command),
             stdin=pipe,
@@ -65,21 +65,21 @@ class Child:
                 return json.loads(line)
             errors.append(line.strip())
         else:
-            # Of a traceback the last line is enough.
+            # The last line of a traceback is enough.
             errors = errors[-1:] if errors[:1] == ["Traceback (most recent call last):"] else errors
             errors.append(f"it ended: {children.ending(self._process.wait(END_S))}")
         raise RunError(f"{self._name}: {'; '.join(errors)}")
 
     def check(self) -> None:
-        """raises RunError where it has ended"""
+        """raises RunError if it has ended"""
         status = self._process.poll()
         if status is not None:
             raise RunError(f"{self._name}: it ended: {children.ending(status)}")
 
     def end(self) -> None:
-        """Let it end, by force if need be."""
+        """End it, by force if necessary."""
         assert self._process.stdin and self._process.stdout
-        with suppress(OSError):  # it is gone, with what was not written yet
+        with suppress(OSError):  # it is gone, and unwritten input is lost
             self._process.stdin.close()
         children.end(self._process, END_S)
         self._process.stdout.close()
@@ -87,7 +87,7 @@ class Child:
     def _lines(self) -> Iterator[str]:
         """Its output lines, until it ends or answers.
 
-        raises  RunError where it neither speaks nor ends
+        raises  RunError if it neither answers nor ends
         """
         until, ready = time.monotonic() + ANSWER_S, select.poll()
         ready.register(self._out, select.POLLIN)

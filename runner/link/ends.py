@@ -1,4 +1,4 @@
-"""What a link of either kind looks like from outside."""
+"""The interface of both kinds of link."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from runner.link.limit import Shaper
 
 @dataclass(frozen=True)
 class Ends:
-    """How both sides are started so that what goes from vehicle to operator passes the link.
+    """How to start both sides so that traffic from vehicle to operator passes the link.
 
-    vehicle_command     what comes before the vehicle's command line
+    vehicle_command     prefix of the vehicle's command line
     vehicle_overrides   where the vehicle's RTSP server listens and where it finds the broker
     operator_overrides  where the operator finds both
-    broker              where the broker is to listen
+    broker              where the broker has to listen
     shaper              sets the rate and counts
     """
 

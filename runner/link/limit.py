@@ -1,4 +1,4 @@
-"""What a limited link does to packets, stated once for both kinds of link. Pure.
+"""What a limited link does to packets, defined once for both kinds of link. Pure.
 
 Sizes are bytes as each kind counts them: netns the Ethernet frame, the relay the IP packet (14 bytes less).
 """
@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from typing import Protocol
 
 FRAME_BYTES = 1514  # the largest Ethernet frame of an MTU of 1500
-BURST_S = 0.002  # what a link that was idle passes on at once; below it timers of a busy machine would cost rate
-SLOWEST_KBPS = 1.0  # tbf knows no standstill; at this rate one packet passes in 10 s
+BURST_S = 0.002  # of data that an idle link passes at once; with less, late timers on a busy machine would cost rate
+SLOWEST_KBPS = 1.0  # tbf cannot stop completely; at this rate one packet passes in 10 s
 
 
 @dataclass(frozen=True)
 class Limit:
-    """What the link does to everything that goes from the vehicle to the operator.
+    """What the link does to all traffic from the vehicle to the operator.
 
     kbps_at   rate in force t seconds after the start of the drive; below 1 kbit/s it is 1 kbit/s
-    queue_ms  what would wait longer is dropped
-    delay_ms  one way, on top of the wait
+    queue_ms  packets that would wait longer are dropped
+    delay_ms  one way, in addition to the wait
     """
 
     kbps_at: Callable[[float], float]
@@ -28,16 +28,16 @@ class Limit:
     delay_ms: float
 
     def kbps(self, t: float) -> float:
-        """The rate that is set, kbit/s; before the start that of the start."""
+        """The rate to set, kbit/s; before the start, the rate at the start."""
         return max(SLOWEST_KBPS, float(self.kbps_at(max(0.0, t))))
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCounters:
-    """What a link has done since it was made.
+    """Counters of a link since it was set up.
 
-    queue_ms  wait of a packet that comes now
-    bytes     passed on from vehicle to operator
+    queue_ms  wait of a packet that arrives now
+    bytes     forwarded from vehicle to operator
     packets   of these
     dropped   packets
     """
@@ -49,13 +49,13 @@ class LinkCounters:
 
 
 class Shaper(Protocol):
-    """Where rates are set and counters read."""
+    """Sets rates and reads counters."""
 
     def limit(self, kbps: float) -> LinkCounters:
-        """Set the rate; what has passed so far. raises RunError where the link is gone"""
+        """Set the rate; returns the counters. raises RunError if the link is gone"""
 
     def check(self) -> None:
-        """raises RunError where the link is gone"""
+        """raises RunError if the link is gone"""
 
 
 def burst_bytes(kbps: float) -> int:
@@ -64,5 +64,5 @@ def burst_bytes(kbps: float) -> int:
 
 
 def queue_bytes(kbps: float, queue_ms: float) -> int:
-    """What may wait at a rate: queue_ms of it, and never less than the bucket, or a slow link would pass nothing."""
+    """Length of the queue at a rate: queue_ms of it, but at least the bucket, or a slow link would pass nothing."""
     return max(burst_bytes(kbps), round(kbps * queue_ms / 8))

@@ -1,13 +1,13 @@
-"""A link in the kernel: the vehicle in a network namespace of its own, behind a router whose way out is limited by tbf.
+"""A link in the kernel: the vehicle in its own network namespace, behind a router whose egress is limited by tbf.
 
     vehicle's namespace link0 ---- in0 router's namespace out0 (tbf) ---- tod-N this machine's namespace
 
 The operator, its page and the broker stay in this machine's namespace. Everything that the vehicle sends shares the
-limit: RTP, retransmissions, RTCP, RTSP, MQTT; the other way is free. tbf counts Ethernet frames, which is the IP packet
-and 14 bytes. Each change of the rate fills tbf's bucket again: up to two frames more pass than the rate allows.
+limit: RTP, retransmissions, RTCP, RTSP, MQTT; the other direction is unlimited. tbf counts Ethernet frames, i.e. the IP
+packet plus 14 bytes. Each rate change refills tbf's bucket: up to two frames more pass than the rate allows.
 
-Without the router a packet that waits would count against the buffer of the socket that sent it: once that is full
-(some 90 packets) the camera's pipeline would stand still, where behind a modem packets are lost.
+Without the router a queued packet would count against the send buffer of its socket: once that is full (some 90
+packets) the camera's pipeline would block, whereas behind a modem packets are lost.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from runner.link.ends import Ends, overrides
 from runner.link.limit import Limit, LinkCounters, burst_bytes, queue_bytes
 from runner.system.signals import urgent
 
-NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # cut into twice two addresses per link
+NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # split into two pairs of addresses per link
 LINK, IN, OUT = "link0", "in0", "out0"  # devices of vehicle and router
-RUN = Path("/run/netns")  # where ip keeps them by name
+RUN = Path("/run/netns")  # where ip keeps namespaces by name
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
-DELAYED_PACKETS = 100_000  # netem drops what is more; the queue that may drop is tbf's
+DELAYED_PACKETS = 100_000  # netem drops beyond this; only tbf's queue is meant to drop
 COMMAND_S = 10.0  # how long a command of iproute2 may take
 OTHERWISE = "or choose link=relay"
 
 
 @contextmanager
 def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
-    """The link while it is needed; what still runs in its namespace at the end is killed.
+    """The link, for the duration of the block; processes still running in its namespace at the end are killed.
 
     media, control  their ports are used, on addresses of the link
-    raises          RunError with what to do
+    raises          RunError with the remedy
     """
     ip, tc = _find("ip"), _find("tc")
     _check_allowed()
@@ -64,7 +64,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
 
 
 class _Tbf:
-    """tbf on the router's way out, behind netem where there is a delay. One tc runs all the time."""
+    """tbf on the router's egress, behind netem if there is a delay. One tc process runs all the time."""
 
     def __init__(self, tc: str, name: str, limit: Limit) -> None:
         self._queue_ms, self._kbps = limit.queue_ms, 0.0
@@ -108,7 +108,7 @@ def _delay(tc: str, name: str, delay_ms: float) -> None:
 
 
 def _connect(ip: str, name: str, network: ipaddress.IPv4Network) -> tuple[str, str]:
-    """Make both namespaces and what joins them; the addresses of this machine's end and of the vehicle's."""
+    """Create and connect both namespaces; returns the addresses of this machine's end and of the vehicle's."""
     near, far = network.subnets(prefixlen_diff=1)
     (machine, out), (into, vehicle) = (map(str, pair.hosts()) for pair in (near, far))
     router = _router(name)
@@ -132,31 +132,31 @@ _End = tuple[tuple[str, ...], str, str]  # ip in the right namespace, device, ad
 def _join(one: _End, other: _End) -> None:
     """Let two ends of a pair reach each other."""
     for command, device, address in (one, other):
-        with suppress(RunError):  # a kernel without IPv6 has no such setting, and nothing to say unasked
+        with suppress(RunError):  # a kernel without IPv6 has no such setting, and sends nothing unprompted
             _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
         _run(*command, "link", "set", "dev", device, "address", _mac(address), "up")
         _run(*command, "addr", "add", f"{address}/30", "dev", device)
-    # Nobody has to ask for addresses: an answer that is dropped would stop everything for a second.
+    # Static entries make ARP unnecessary: a dropped reply would stop all traffic for a second.
     for (command, device, _), (_, _, peer) in ((one, other), (other, one)):
         _run(*command, "neigh", "replace", peer, "lladdr", _mac(peer), "dev", device, "nud", "permanent")
 
 
 def _remove(ip: str, name: str) -> None:
-    """Remove a link and whatever still runs in it; missing parts are skipped."""
-    _output_of(ip, "link", "delete", "dev", name)  # with the namespace it would go, too, but some time later
+    """Remove a link and kill the processes still running in it; missing parts are skipped."""
+    _output_of(ip, "link", "delete", "dev", name)  # it would also go with the namespace, but some time later
     for namespace in (name, _router(name)):
         try:
             identity = (RUN / namespace).stat().st_ino
         except FileNotFoundError:
             continue
-        _output_of(ip, "netns", "delete", namespace)  # first: from now on nobody enters
+        _output_of(ip, "netns", "delete", namespace)  # first, so that no process can enter any more
         for pid in _inside(identity):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
 
 def _inside(identity: int) -> Iterator[int]:
-    """Processes in a network namespace, known by its inode; none where that is this process's own."""
+    """Processes in a network namespace, identified by its inode; none if that is this process's own."""
     if identity == Path("/proc/self/ns/net").stat().st_ino:
         return
     for process in Path("/proc").glob("[0-9]*"):
@@ -172,10 +172,10 @@ def _router(name: str) -> str:
 
 @contextmanager
 def _claimed(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
-    """A name and addresses that nobody else uses.
+    """A name and addresses that are not in use elsewhere.
 
-    The claim is a bound abstract socket: the kernel lets go of it with the process, so whatever still bears a claimed
-    name was left behind by a run that was killed, and is removed.
+    The claim is a bound abstract socket: the kernel releases it with the process, so anything that still bears a
+    claimed name was left behind by a run that was killed, and is removed.
     """
     for number, network in enumerate(NETWORK.subnets(new_prefix=29)):
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
@@ -200,12 +200,12 @@ def _addresses(ip: str) -> list[ipaddress.IPv4Address]:
 
 
 def _mac(address: str) -> str:
-    """A locally administered Ethernet address made from an IPv4 address."""
+    """A locally administered Ethernet address derived from an IPv4 address."""
     return ":".join(["02", "00", *(f"{byte:02x}" for byte in ipaddress.IPv4Address(address).packed)])
 
 
 def _find(program: str) -> str:
-    """Path of a program of iproute2, which Debian puts where only root looks."""
+    """Path of a program of iproute2, which Debian installs in a directory that is only in root's PATH."""
     path = shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if path is None:
         raise RunError(f"link=netns needs {program}; on Debian: apt-get install iproute2, {OTHERWISE}")
@@ -221,7 +221,7 @@ def _check_allowed() -> None:
 
 
 def _run(*command: str) -> str:
-    """Standard output of a command. raises RunError with its error output where it fails"""
+    """Standard output of a command. raises RunError with its error output if it fails"""
     done = _done(command)
     if done.returncode:
         message = " ".join(done.stderr.split()) or f"status {done.returncode}"

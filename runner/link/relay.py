@@ -1,14 +1,14 @@
 """usage: python -m runner.link.relay '{"media": [HOST, PORT], "control": [HOST, PORT], "kbps": N, "queue_ms": N, ...}'
 
-The process between vehicle and operator. It listens on two ports of its own, which its first line of output names:
-`media` for the operator's RTSP, passed on to the vehicle's server, and `control` for the vehicle's MQTT, passed on to
-the broker. In RTSP's SETUP it puts UDP ports of its own in place of both sides', so that RTP and RTCP come by.
-What goes from vehicle to operator shares one `Bucket`; UDP that finds no room is dropped, TCP waits before it. Packets
-count as IP packets: payload and 28 bytes (UDP), 52 bytes for each 1448 (TCP). RTSP messages and interleaved packets
-pass as wholes. The other way is free.
+The process between vehicle and operator. It listens on two ports of its own, named in its first line of output:
+`media` for the operator's RTSP, forwarded to the vehicle's server, and `control` for the vehicle's MQTT, forwarded to
+the broker. In RTSP's SETUP it replaces both sides' UDP ports with its own, so that RTP and RTCP pass through it.
+Traffic from vehicle to operator shares one `Bucket`; UDP that finds it full is dropped, TCP waits before it. Packets
+count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP messages and interleaved
+packets are never split. The other direction is unlimited.
 
-Each line of input is a rate in kbit/s, answered with the counters; at its end the relay ends. A delay comes after the
-wait.
+Each line of input is a rate in kbit/s, answered with the counters; at the end of its input the relay ends. A delay is
+added after the queue.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ UDP_HEADERS = 28  # bytes of IPv4 and UDP
 TCP_HEADERS = 52  # bytes of IPv4 and TCP with time stamps
 SEGMENT = 1448  # bytes of TCP payload in one packet of 1500
 WINDOW = 32_768  # bytes that TCP may hold here before the limit; the rest waits at the sender, as on a real link
-DATAGRAMS_PER_TURN = 64  # datagrams that are read before others get their turn
+DATAGRAMS_PER_TURN = 64  # datagrams that are read before other sockets get their turn
 PAIR_TRIES = 200
-WAIT_S = 0.5  # for a server that has to accept
+WAIT_S = 0.5  # for a server to accept
 
 SocketAddress = tuple[str, int]
 Cut = Callable[[bytes], Iterable[bytes]]
@@ -73,7 +73,7 @@ class Uplink:
             await self._departed.wait()
 
     def _deliver(self) -> None:
-        """Deliver what has been queued and delayed long enough, and come back for the rest."""
+        """Deliver what has been queued and delayed long enough, and set a timer for the rest."""
         now = time.monotonic()
         for left, delivery in self._bucket.take(now):
             self._delayed.append((left + self._delay_s, delivery))
@@ -90,8 +90,8 @@ class Uplink:
 async def join(uplink: Uplink, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
     """Pass bytes between two connections until one ends.
 
-    vehicle   the end whose bytes pass the limit
-    up, down  cut the bytes of each direction into units that pass as wholes
+    vehicle   the end whose bytes are limited
+    up, down  cut the bytes of each direction into units that are never split
     """
     arrived: asyncio.Queue[bytes] = asyncio.Queue()
     for sock in (vehicle, other):
@@ -125,7 +125,7 @@ async def _pass_limited(uplink: Uplink, source: socket.socket, arrived: asyncio.
 
 
 async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
-    """Send units until the empty one, which stands for the end."""
+    """Send units until the empty one, which marks the end."""
     loop = asyncio.get_running_loop()
     with suppress(OSError):
         while unit := await arrived.get():
@@ -142,10 +142,10 @@ async def _pass(source: socket.socket, sink: socket.socket, cut: Cut) -> None:
 
 
 class Ports:
-    """Two UDP sockets that stand between both sides' RTP and RTCP ports.
+    """Two UDP sockets between both sides' RTP and RTCP ports.
 
     operator  address of the operator's RTP
-    server    host of the vehicle's server; its ports are known when it has answered
+    server    host of the vehicle's server; its ports are known once it has answered
     """
 
     def __init__(self, uplink: Uplink, host: str, operator: SocketAddress, server: str) -> None:
@@ -180,7 +180,7 @@ class Ports:
             except OSError:
                 return
             if self.server_port is None:
-                continue  # too early for anybody
+                continue  # too early: the server's ports are not known yet
             if source[1] - self.server_port in (0, 1):
                 self._uplink.put(len(data) + UDP_HEADERS, _sender(sock, data, operator))
             else:
@@ -188,11 +188,11 @@ class Ports:
 
 
 class Rtsp:
-    """What the relay changes in an RTSP connection: whose UDP ports both sides hear of.
+    """Rewrites the UDP ports in an RTSP connection: both sides see the relay's.
 
-    operator  its host
+    operator  the operator's host
     far       the connection to the vehicle's server
-    server    host of that
+    server    the server's host
     """
 
     def __init__(self, uplink: Uplink, operator: str, far: socket.socket, server: str) -> None:
@@ -221,7 +221,7 @@ class Rtsp:
             ports.close()
 
     def _own(self, port: int) -> int:
-        """Ports of the relay's own for a pair of the operator's."""
+        """The relay's own ports for a pair of the operator's."""
         for ports in self._ports:
             if ports.operator_port == port:
                 return ports.port
@@ -231,7 +231,7 @@ class Rtsp:
 
 def _sender(sock: socket.socket, data: bytes, address: SocketAddress) -> Delivery:
     def send() -> None:
-        with suppress(OSError):  # closed meanwhile, or nobody is there: a packet lost behind the link
+        with suppress(OSError):  # closed meanwhile, or no receiver: a packet lost after the link
             sock.sendto(data, address)
 
     return send
@@ -274,7 +274,7 @@ async def serve_control(uplink: Uplink, broker: SocketAddress, near: socket.sock
 
 @asynccontextmanager
 async def connected(address: SocketAddress) -> AsyncIterator[socket.socket | None]:
-    """None where nobody listens: the client then sees its own connection end, and tries again."""
+    """None if nothing listens there: the client then sees its own connection end, and tries again."""
     with socket.socket() as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
         sock.setblocking(False)
@@ -287,7 +287,7 @@ async def connected(address: SocketAddress) -> AsyncIterator[socket.socket | Non
 
 
 def listen(host: str) -> socket.socket:
-    """A socket that listens on a port of the system's choice; ends the relay where it cannot."""
+    """A socket that listens on a port chosen by the system; ends the relay if that fails."""
     try:
         server = socket.create_server((host, 0))
     except OSError as error:
@@ -297,7 +297,7 @@ def listen(host: str) -> socket.socket:
 
 
 async def accept(server: socket.socket, uplink: Uplink, serve: Serve, address: SocketAddress) -> None:
-    """Serve each connection in a task of its own, without end."""
+    """Serve each connection in its own task, forever."""
     async with asyncio.TaskGroup() as tasks:
         while True:
             near, client = await asyncio.get_running_loop().sock_accept(server)
@@ -310,7 +310,7 @@ async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> No
 
 
 async def take_rates(uplink: Uplink) -> None:
-    """Follow rates from standard input, each answered with the counters, until it ends."""
+    """Set rates from standard input, each answered with the counters, until the input ends."""
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     while line := await lines.readline():
@@ -324,7 +324,7 @@ async def main() -> None:
     listening = {"media": listen(media[0]), "control": listen(control[0])}
     print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)
     gc.freeze()
-    gc.disable()  # nothing here is a ring for long; a collection would hold up packets
+    gc.disable()  # no reference cycle here lasts long; a collection would delay packets
     async with asyncio.TaskGroup() as tasks:
         serving = [
             tasks.create_task(accept(listening["media"], uplink, serve_media, media)),

@@ -1,4 +1,4 @@
-"""A link without root: a process of its own between vehicle and operator, `runner.link.relay`."""
+"""A link without root: a separate process between vehicle and operator, `runner.link.relay`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runner.system import children
 
 @contextmanager
 def relayed(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
-    """The relay while it is needed: the operator's RTSP and the vehicle's MQTT go through it.
+    """The relay, for the duration of the block: the operator's RTSP and the vehicle's MQTT pass through it.
 
     media, control  where RTSP server and broker listen, on this machine
     raises          RunError

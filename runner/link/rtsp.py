@@ -1,4 +1,4 @@
-"""RTSP as the relay reads it in passing (RFC 2326): where messages end, and which UDP ports they agree on. Pure."""
+"""RTSP as far as the relay parses it (RFC 2326): where messages end, and which UDP ports they agree on. Pure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Units:
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Whole units, in order; the rest is kept for the next call.
 
-        raises  ValueError for what is not RTSP
+        raises  ValueError if the bytes are not RTSP
         """
         self._data += data
         while (length := self._length()) and length <= len(self._data):

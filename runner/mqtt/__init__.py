@@ -1,1 +1,1 @@
-"""The control link over MQTT, and a broker of one's own."""
+"""The control link over MQTT, and a private broker."""

@@ -18,15 +18,15 @@ from runner.system import children, signals
 from runner.system.ports import check_port_free
 
 START_S = 5.0
-END_S = 0.3  # the broker keeps nothing that would take time to write
+END_S = 0.3  # the broker stores nothing that would take time to write
 KEPT_LINES = 20
-# Errors alone: each connection would be a line.
+# Log errors only: otherwise each connection adds a line.
 SETTINGS = (
     "allow_anonymous true",
     "persistence false",
     "set_tcp_nodelay true",
     "connection_messages false",
-    "user root",  # where root starts it: with another user the kernel forgets to end it with this process
+    "user root",  # when started by root: after a change of user the kernel no longer ends it with this process
     "log_type error",
     "log_timestamp false",
 )
@@ -51,23 +51,23 @@ class Broker:
                 text=True,
                 errors="replace",
                 pass_fds=[file],
-                start_new_session=True,  # Ctrl-C is for this process, and both sides say goodbye first
+                start_new_session=True,  # Ctrl-C is for this process, and both sides sign off first
             )
         finally:
             os.close(file)
-        # A pipe that nobody reads fills up, and the broker then stands still.
+        # A pipe that is not read fills up, and the broker then blocks.
         self._reader = threading.Thread(target=self._read, name="broker", daemon=True)
         self._reader.start()
 
     def check(self) -> None:
-        """raises RunError where the broker has ended"""
+        """raises RunError if the broker has ended"""
         status = self._process.poll()
         if status is not None:
             message = "; ".join(filter(None, (children.ending(status), self._last_line())))
             raise RunError(f"the MQTT broker on {self._where} ended: {message}")
 
     def wait_until_it_answers(self) -> None:
-        """raises RunError where it does not within `START_S`"""
+        """raises RunError if it does not answer within `START_S`"""
         until = time.monotonic() + START_S
         while time.monotonic() < until and self._process.poll() is None:
             signals.check()
@@ -96,9 +96,9 @@ class Broker:
 
 @contextmanager
 def private_broker(endpoint: Endpoint) -> Iterator[Broker]:
-    """mosquitto, listening on one address for anybody there, remembering nothing; gone at the end.
+    """mosquitto on one address, without authentication or persistence, for the duration of the block.
 
-    raises  RunError where mosquitto is missing or does not come up
+    raises  RunError if mosquitto is missing or does not start
     """
     check_port_free(endpoint)
     broker = Broker(endpoint)
@@ -110,7 +110,7 @@ def private_broker(endpoint: Endpoint) -> Iterator[Broker]:
 
 
 def find_mosquitto() -> str:
-    """Path of the broker, which Debian puts where only root looks.
+    """Path of the broker, which Debian installs in a directory that is only in root's PATH.
 
     raises  RunError
     """

@@ -1,4 +1,4 @@
-"""One side's connection to the MQTT broker: kept up, repeated after a loss, survived."""
+"""One side's connection to the MQTT broker: kept alive, re-established after a loss, robust against its errors."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
-STALLED_S = 2  # a connection without progress for so long is dropped
+STALLED_S = 2  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
-LOOP_S = 0.25  # how often the keepalive is looked at
-CLOSE_S = 2.0  # for the goodbye
-FAULTS = 100  # different faults of messages that are reported; others are counted only
+LOOP_S = 0.25  # how often the keepalive is checked
+CLOSE_S = 2.0  # for signing off
+FAULTS = 100  # distinct message faults that are reported; further ones are only counted
 RETAINED = ("state", "telemetry", "configuration")
 
 
 class _Client(Client):
-    """A client whose loop survives a broker that breaks the protocol.
+    """A client whose loop survives a broker that violates the protocol.
 
     on_broken  called with what was wrong
     """
@@ -49,14 +49,14 @@ class _Client(Client):
 
 
 class ControlLink:
-    """One side's connection to the broker, kept for as long as it is open. Callbacks come from the link's own thread.
+    """One side's connection to the broker, kept alive until it is closed. Callbacks run in the link's own thread.
 
     will          topic and message that the broker publishes when this side is lost
-    listen        by topic filter, what takes its messages
+    listen        by topic filter, the callback for its messages
     on_connected  called with True when messages for this side will reach it, with False when the connection is lost
     on_report     called with one line when the broker cannot be reached, once for each reason, and when it can again
 
-    A message whose callback raises is reported, counted in `dropped`, and ends nothing.
+    A message whose callback raises is reported and counted in `dropped`; the link continues.
     """
 
     def __init__(
@@ -81,25 +81,25 @@ class ControlLink:
         self._client.loop_start()
 
     def wait_connected(self, seconds: float) -> bool:
-        """Whether messages for this side will reach it, by then."""
+        """Wait until messages for this side will reach it; returns whether they do."""
         return self._listening.wait(seconds)
 
     def publish(self, topic: str, message: JsonObject) -> None:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
-        Without a connection nothing is sent and nothing queued: after a reconnection the present counts, not the past.
+        Without a connection nothing is sent or queued: after a reconnection only current values count.
         """
         if self._listening.is_set():
             self._send(topic, message)
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
-        """Disconnect; with messages to send before, as the last will would state them."""
+        """Disconnect, after sending final messages such as the last will would contain."""
         self._closing.set()
         for topic, message in goodbye if self._listening.is_set() else ():
-            with suppress(ValueError, RuntimeError):  # the connection is lost just now
+            with suppress(ValueError, RuntimeError):  # the connection has just been lost
                 self._send(topic, message).wait_for_publish(CLOSE_S / 2)
         self._client.disconnect()
-        ending = threading.Thread(target=self._client.loop_stop, daemon=True)  # waits without a limit
+        ending = threading.Thread(target=self._client.loop_stop, daemon=True)  # waits without a timeout
         ending.start()
         ending.join(CLOSE_S)
 
@@ -123,7 +123,7 @@ class ControlLink:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
             try:
                 function(MqttMessage(message.topic, bytes(message.payload), message.retain))
-            except ValueError as error:  # of the reader of a message: it is not what it should be
+            except ValueError as error:  # from the reader of a message: the message is invalid
                 self._drop(message, str(error))
             except Exception as error:
                 self._drop(message, f"{type(error).__name__}: {error}")
@@ -179,6 +179,6 @@ def _kept(topic: str) -> bool:
 
 def _settle(_client: object, _data: object, sock: Any) -> None:
     if isinstance(sock, socket.socket):
-        # Without this, small messages wait 20 ms for company (Nagle's algorithm).
+        # Without this, small messages are held back for 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)

@@ -25,24 +25,24 @@ from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
-OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # it is shown to people and logged
+OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # it is shown to operators and logged
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
-MAX_ROUND_TRIP_S = 0.5  # a longer round trip is no excuse for an old request: nobody can drive by it
+MAX_ROUND_TRIP_S = 0.5  # a longer round trip does not excuse an old request: it is too long for driving
 
 JsonObject = Mapping[str, Any]
 
 
 def topic(vehicle: str, *parts: str) -> str:
-    """A topic of a vehicle, or a filter where a part is +."""
+    """A topic of a vehicle, or a filter if a part is +."""
     return "/".join(("tod", vehicle, *parts))
 
 
 class MqttMessage(NamedTuple):
-    """A message as it came.
+    """A message as received.
 
-    retained  whether the broker had kept it
+    retained  whether the broker had stored it
     """
 
     topic: str
@@ -56,7 +56,7 @@ class MqttMessage(NamedTuple):
 
 
 def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, Any]:
-    """A mapping, from untrusted JSON.
+    """Parse a mapping from untrusted JSON.
 
     raises  ValueError with the problem
     """
@@ -101,9 +101,9 @@ class ParsedRequest(NamedTuple):
     """A request as received.
 
     document  the event without id and as_of, not yet checked
-    identity  its id; "": it has none
-    as_of     see `runner.vehicle.operators`; None where it need not say it
-    problem   why it is not a valid request; None: it is
+    identity  its id, "" for none
+    as_of     see `runner.vehicle.operators`; None if it is not needed
+    problem   why the request is invalid; None if it is valid
     """
 
     document: dict[str, Any]

@@ -1,1 +1,1 @@
-"""The operator's side while it drives."""
+"""The operator's side while driving."""

@@ -24,15 +24,15 @@ from runner.core.model import suggest
 from runner.errors import UserError
 from runner.plans import compile_plans
 
-CHECK_S = 0.25  # how often silent cameras are looked for
-STOP_S = 1.0  # how long the last look may take
+CHECK_S = 0.25  # how often cameras are checked for silence
+STOP_S = 1.0  # how long the last check may take
 
 
 class Frame(NamedTuple):
     """One decoded picture.
 
-    captured  s since 1970 by the vehicle's clock; None where the line does not carry it
-    image     uint8, height x width x 3, RGB; its size is the one the camera is sent in
+    captured  s since 1970 by the vehicle's clock; None if the transport does not carry it
+    image     uint8, height x width x 3, RGB; its size is that of the sent stream
     """
 
     camera: str
@@ -41,7 +41,7 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """The newest picture of each camera, each given once, in the order in which they came."""
+    """The newest picture of each camera, each returned once, in order of arrival."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Frame] = {}
@@ -60,7 +60,7 @@ class Frames:
             return self._newest.pop(next(iter(self._newest)))
 
     def put(self, camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
-        """A picture as it comes from the decoder, rows padded to whatever."""
+        """Add a picture from the decoder, whose rows may be padded."""
         rows = np.frombuffer(data, np.uint8).reshape(height, -1)[:, : width * 3]
         with self._changed:
             self._newest[camera] = Frame(camera, captured, rows.reshape(height, width, 3))
@@ -80,7 +80,7 @@ def live_frames(
     cameras: Sequence[str] | None = None,
     report: Callable[[str, str], None] = lambda camera, what: None,
 ) -> Iterator[Frames]:
-    """Receive and decode cameras of a vehicle that streams; lines that fail or fall silent are built anew.
+    """Receive and decode cameras of a streaming vehicle; pipelines that fail or fall silent are rebuilt.
 
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
@@ -103,7 +103,7 @@ def live_frames(
             while not stopped.wait(CHECK_S):
                 side.sample(wanted)
         finally:
-            frames.close()  # nobody waits for pictures of a side that has failed
+            frames.close()  # nothing waits for pictures of a side that has failed
 
     watcher = threading.Thread(target=watch, name="watch", daemon=True)
     watcher.start()

@@ -1,8 +1,8 @@
-"""An operator's side that runs: control link, receivers and log together. The verb `operator` runs it; so may yours.
+"""A running operator's side: control link, receivers and log together. The verb `operator` uses it; so may a program.
 
 with live_operator(["vehicle=delivery_robot"]) as operator:
     operator.station.listeners.append(mine)       # a runner.operator.station.Listener
-    operator.start()                              # receives and samples in threads of their own
+    operator.start()                              # receives and samples in separate threads
     operator.station.ask({"event": "mode_selected", "mode": "collective"}, print)
 """
 
@@ -35,7 +35,7 @@ class LiveOperator:
     """The parts of an operator's side.
 
     vehicle  as this side's configuration describes it
-    station  the end of the control link; its listeners are to be added before `start`
+    station  this end of the control link; its listeners must be added before `start`
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class LiveOperator:
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
 
     def start(self, on_unit: OnUnit | None = None, duration_s: float | None = None) -> None:
-        """Connect, receive, and sample, until stopped or for a time.
+        """Connect, receive, and sample, until stopped or for a given time.
 
         on_unit  called, from the camera's streaming thread, with each access unit that arrives
         """
@@ -61,9 +61,9 @@ class LiveOperator:
         self._thread.start()
 
     def runs(self, wait_s: float = 0.0) -> bool:
-        """Whether it still samples after a time; returns at once when it does not.
+        """Whether it still samples after a time; returns at once if it does not.
 
-        raises  RunError where it has ended by itself, before its time
+        raises  RunError if it has ended early because of an error
         """
         self._thread.join(wait_s)
         if self._failure:
@@ -75,7 +75,7 @@ class LiveOperator:
         self._stopped.set()
 
     def stop(self) -> None:
-        """End, with a goodbye to the vehicle."""
+        """Sign off from the vehicle, and end."""
         self.end()
         if self._thread.ident:
             self._thread.join(END_S)
@@ -85,7 +85,7 @@ class LiveOperator:
         self._log.close()
 
     def _run(self) -> None:
-        """In a thread of its own: a terminal that takes nothing (Ctrl-S) holds up nobody."""
+        """In its own thread, so that a stopped terminal (Ctrl-S) does not block it."""
         noted = ""
         assert self._side
         while not self._stopped.wait(SAMPLE_S) and time.monotonic() < self._until:
@@ -94,7 +94,7 @@ class LiveOperator:
             except RunError as error:  # GStreamer hangs; kept for the main thread
                 self._failure = error
                 return
-            except Exception as error:  # must not end the operator's view of a vehicle that moves
+            except Exception as error:  # must not end the operator's view of a moving vehicle
                 if noted != (noted := f"a sample failed: {type(error).__name__}: {error}"):
                     self.station.note(noted)
 
@@ -103,11 +103,11 @@ class LiveOperator:
 def live_operator(
     overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
 ) -> Iterator[LiveOperator]:
-    """Everything that an operator's side needs, stopped at the end with a goodbye to the vehicle.
+    """Everything that an operator's side needs; at the end it signs off from the vehicle and stops.
 
     overrides  Hydra overrides, as on the command line
     log        directory that the drive is recorded to
-    raises     ConfigError, RunError, UserError where the directory holds a drive already
+    raises     ConfigError, RunError, UserError if the directory already holds a drive
     """
     from runner import apply
 

@@ -1,4 +1,4 @@
-"""What the operator's side logs of a drive: what the vehicle publishes, and what arrives of each camera."""
+"""The operator's log of a drive: the vehicle's messages, and the reception of each camera."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class DriveLog(Listener):
 
 
 def _arrivals(arrivals: Iterable[tuple[float, float | None]], began: float) -> tuple[tuple[float, float | None], ...]:
-    """When each unit came, s since the beginning, and how long after its capture, ms."""
+    """Arrival time of each unit, s since the beginning, and its delay since capture, ms."""
     return tuple(
         (round(arrived - began, 4), None if captured is None else round(1000 * (arrived - captured), 2))
         for arrived, captured in arrivals

@@ -1,4 +1,4 @@
-"""From counters to what a person reads: rates over the last second, and a summary of a run. Pure."""
+"""Turns counters into figures for the operator: rates over the last second, and a summary of a run. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SETTLE_S = 1.5  # a window counts for the comparison only if the decision is old
 
 
 class StreamCounters(Protocol):
-    """Running counters of one camera as the receiver has them."""
+    """Running counters of one camera, from the receiver."""
 
     @property
     def frames(self) -> int: ...
@@ -48,7 +48,7 @@ class DecidedSetting(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredRates:
-    """Frames a second and kbit/s over the last second."""
+    """Frames per second and kbit/s over the last second."""
 
     fps: float = 0.0
     kbps: float = 0.0
@@ -56,7 +56,7 @@ class MeasuredRates:
 
 @dataclass
 class ReceptionMeter:
-    """Watches one camera: rates over a sliding window, and how well what comes follows what was decided.
+    """Watches one camera: rates over a sliding window, and how well reception follows the decisions.
 
     followed  kbit/s received over kbit/s allocated, one entry per settled window
     """
@@ -64,7 +64,7 @@ class ReceptionMeter:
     fps: float
     followed: list[float] = field(default_factory=list)
     latencies_ms: list[float] = field(default_factory=list)
-    sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that came, with their count
+    sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that were received, with counts
     short: int = 0  # settled windows with fewer frames than the camera's rate asks for
     windows: int = 0
     _past: deque[tuple[float, StreamCounters]] = field(default_factory=deque)
@@ -73,7 +73,7 @@ class ReceptionMeter:
     _counted: float = 0.0
 
     def add(self, t: float, counters: StreamCounters, decided: DecidedSetting | None) -> MeasuredRates:
-        """Take a sample of the counters at time t, s; a few of them a second."""
+        """Take a sample of the counters at time t, s; a few times a second."""
         settled_for = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
         if settled_for != self._decided:
             self._decided, self._since = settled_for, t
@@ -81,7 +81,7 @@ class ReceptionMeter:
         while len(self._past) > 2 and self._past[1][0] <= t - WINDOW_S:
             self._past.popleft()
         rates = self._rates()
-        # Windows that overlap would count the same frames again.
+        # Overlapping windows would count the same frames again.
         if decided and decided.sending and t - self._since >= SETTLE_S and t - self._counted >= WINDOW_S:
             self._counted = t
             self._compare(rates, counters, decided)
@@ -107,7 +107,7 @@ class ReceptionMeter:
 
 
 def percentile(values: Iterable[float], share: float) -> float | None:
-    """The value below which a share of all lie; None of none."""
+    """The value below which a share of all lie; None if there are none."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
 

@@ -22,13 +22,13 @@ CAUSES = {
 
 
 def decision_note(before: VehicleState, state: VehicleState) -> str | None:
-    """What a decision changes, and why.
+    """The changes made by a decision, and why.
 
         Prediction 900 kbit/s: rear 0.5 -> 0.25 (300 of 4000 kbit/s, range [0, 400) -> 0.25)
         Prediction 3000 kbit/s: front, rear 0.5 -> 0.25; mast off -> 0.125 (3 of 8 cameras, total 3000 kbit/s)
 
     before, state  as the vehicle publishes them
-    returns        None where neither mode nor what is sent of any camera changes
+    returns        None if neither the mode nor any camera's stream changes
     """
     cameras = state.cameras
     changes = {name: _change(before.cameras.get(name, now), now) for name, now in cameras.items()}
@@ -52,7 +52,7 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
 
 
 def _cause(described: str) -> str:
-    """The event's phrase; its own words where the vehicle knows events that this side does not."""
+    """The event's phrase; its unchanged text if this side does not know the event."""
     event, *words = described.split(" ")
     try:
         return CAUSES[event].format_map(dict(zip(words[::2], words[1::2], strict=False)))

@@ -28,26 +28,26 @@ from runner.operator.notes import decision_note
 from runner.records import CameraSample, CameraState, Note, Outcome, Sample, Telemetry, VehicleState
 from runner.system.clocks import Clocks
 
-SLACK_S = 0.5  # the vehicle's answer to a request that it carries out at the last moment is still waited for
-SILENT_S = 0.7  # a vehicle that sends nothing for so long is offline; it sends telemetry five times a second
-REPORT_EVERY_S = 1.0  # how often what arrives is reported to the vehicle
+SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
+SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
+REPORT_EVERY_S = 1.0  # how often reception is reported to the vehicle
 MOST_VEHICLES = 100  # whose names are remembered
-FOUND_S = 2.0  # a vehicle that the broker knows nothing of by then is probably misspelt
+FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
 
 OnReply = Callable[[Outcome], None]
 
 
 class Listener:
-    """Is called, from any thread, with what is new; a subclass overrides what it needs. Times are s since 1970."""
+    """Called, from any thread, with news; a subclass overrides the methods it needs. Times are s since 1970."""
 
     def on_state(self, state: VehicleState | None) -> None:
         """The vehicle's state; None: it is offline."""
 
     def on_sample(self, sample: Sample) -> None:
-        """What arrives, a few times a second."""
+        """The reception of all cameras, a few times a second."""
 
     def on_note(self, note: Note) -> None:
-        """What a person should know."""
+        """A message for the operator."""
 
 
 class CameraRow(NamedTuple):
@@ -66,12 +66,12 @@ class _PendingRequest(NamedTuple):
 
 
 class Station:
-    """One operator's end of the control link, and the measurements of what arrives.
+    """One operator's end of the control link, and the measurements of reception.
 
-    settings   what the vehicle's configuration must agree with, see `runner.configuration.agreement`
-    listeners  are to be added before `connect`
+    settings   those that the vehicle's configuration must agree with, see `runner.configuration.agreement`
+    listeners  must be added before `connect`
 
-    Requests go out by `ask`; samples of the cameras' counters come in by `take`.
+    Requests go out through `ask`; samples of the cameras' counters come in through `take`.
     """
 
     def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath) -> None:
@@ -82,9 +82,9 @@ class Station:
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self._telemetry: Telemetry | None = None
-        self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it came
+        self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it arrived
         self._last_message = 0.0
-        self._vehicles: dict[str, bool] = {}  # by name of those that the broker knows, whether they are online
+        self._vehicles: dict[str, bool] = {}  # by name, for those known to the broker: whether online
         self._connected_at: float | None = None
         self._differences: str | None = None
         self._pending: dict[str, _PendingRequest] = {}
@@ -110,13 +110,13 @@ class Station:
         self._link.connect()
 
     def close(self) -> None:
-        self.state = None  # a goodbye is no loss
+        self.state = None  # signing off is not a loss
         self._link.close((self._requests, OPERATOR_GONE))
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.
 
-        on_reply  called with what became of it: applied (read back from the elements), refused, expired or timed out
+        on_reply  called with its outcome: applied (read back from the elements), refused, expired or timed out
         """
         if self.state is None:
             if on_reply:
@@ -138,25 +138,25 @@ class Station:
             listener.on_note(note)
 
     def report(self, camera: str, what: str) -> None:
-        """What happened to a camera, as `OperatorSide` reports it."""
+        """An event of a camera, as `OperatorSide` reports it."""
         self.note(f"{camera}: {what}")
 
     def sending(self) -> dict[str, bool]:
-        """Which cameras should send, by the vehicle's word; empty while the vehicle is offline.
+        """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
 
-        One whose source is being replaced sends nothing, and its session stays.
+        One whose source is being replaced sends nothing, and its session is kept.
         """
         cameras = self.state.cameras if self.state else {}
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
-        """A sample of every camera's counters; to be called a few times a second, since time is judged here too."""
+        """A sample of every camera's counters; to be called a few times a second, since it also checks timeouts."""
         now = time.monotonic()
         if self.state and now - self._last_message > SILENT_S:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
         self._look_for_vehicle(now)
-        self.ask({"event": "operator_connected"})  # the sign of life
+        self.ask({"event": "operator_connected"})  # the heartbeat
         samples = self._with_known_ages(now, samples)
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, self._camera(name))
@@ -213,7 +213,7 @@ class Station:
         return self.state.cameras.get(name) if self.state else None
 
     def _on_any_state(self, message: MqttMessage) -> None:
-        """The state of any vehicle at the broker: of another one only its name is of use."""
+        """The state of any vehicle at the broker: of another one only the name is used."""
         name, state = message.topic.split("/")[1], read_state(message.payload)
         if len(self._vehicles) < MOST_VEHICLES or name in self._vehicles:
             self._vehicles[name] = state is not None
@@ -228,7 +228,7 @@ class Station:
             self._vehicle_lost("the vehicle is offline")
 
     def _vehicle_online(self) -> None:
-        """The vehicle is online, once state and telemetry have come."""
+        """The vehicle is online once state and telemetry have arrived."""
         before, state = self.state, self._published
         self._last_message = time.monotonic()
         if state is None or before is state or not self._telemetry:
@@ -246,7 +246,7 @@ class Station:
             listener.on_state(state)
 
     def _note_changes(self, before: VehicleState, state: VehicleState) -> None:
-        """One note of a decision, and one where the rules fail or are back."""
+        """One note of a decision, and one when the rules fail or work again."""
         if state.fault != before.fault:
             self.note(f"{state.fault}; the decision before stays in force" if state.fault else "the rules decide again")
         if text := decision_note(before, state):
@@ -254,21 +254,21 @@ class Station:
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
-        if message.retained:  # published before: not a sign of life, and not the vehicle's time now
+        if message.retained:  # published before: no heartbeat, and not the vehicle's current time
             return
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         self._vehicle_online()
 
     def _on_configuration(self, message: MqttMessage) -> None:
-        """Name what the vehicle's configuration and this side's differ in; what is decided there is shown here."""
+        """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""
         differences = agreement.differences(self._settings, read_settings(message.payload).settings)
         if differences and differences != self._differences:
             self.note(f"the vehicle has another configuration: {differences}")
         self._differences = differences
 
     def _look_for_vehicle(self, now: float) -> None:
-        """Say once which vehicles the broker knows, where this one is none of them."""
+        """Report once which vehicles the broker knows, if this one is not among them."""
         if self._connected_at is None or now - self._connected_at < FOUND_S:
             return
         self._connected_at = None

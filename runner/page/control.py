@@ -1,14 +1,14 @@
-"""Which of several pages may send requests. Pure: time is given."""
+"""Which of several pages may send requests. Pure: time is passed in."""
 
 from __future__ import annotations
 
-KEPT_S = 5.0  # a page that is loaded again within this time finds its control again
+KEPT_S = 5.0  # a page that is reloaded within this time keeps control
 
 
 class Control:
     """At most one page holds control; a page is known by its token, which survives a reload.
 
-    A page that opens takes control where nobody has it; any page may take it by asking, and the former holder watches.
+    A page that opens takes control if it is free; any page may take it on request, and the former holder then watches.
     """
 
     def __init__(self) -> None:

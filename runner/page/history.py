@@ -1,4 +1,4 @@
-"""The last minutes of a drive for the charts, so that a page opened late or again starts with them. Pure."""
+"""The last minutes of a drive for the charts, so that a page opened late or reloaded starts with them. Pure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class History:
             self._samples.append(sample)
 
     def columns(self) -> dict[str, Any]:
-        """By quantity a list over time; None where it was not known."""
+        """By quantity a list over time; None where unknown."""
         samples = list(self._samples)
         positions = [sample.position for sample in samples]
         names = samples[-1].cameras if samples else ()

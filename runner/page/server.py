@@ -1,4 +1,4 @@
-"""Serves the operator's page, its video and its requests, in an asyncio loop in a thread of its own."""
+"""Serves the operator's page, its video and its requests, in an asyncio loop in its own thread."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
 
 STATIC = Path(__file__).with_name("static")
-FROZEN_MS = 120  # a picture that stands for so long is marked within 150 ms
+FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # sent to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
-SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here and not megabytes later
-START_S = 10.0  # the port is known to be free: only a machine that stands still takes longer
+SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here, not megabytes later
+START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
 STOP_S = 0.5  # how long open connections may take to close
-REQUEST_S = 10.0  # a connection without a complete request for so long is closed
+REQUEST_S = 10.0  # a connection without a complete request for this long is closed
 PING_S = 0.5
-SILENT_S = 2.0  # a viewer that has not even answered a ping for so long is dropped, and connects again if it lives
+SILENT_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
 ENDS = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
-CLOSED_ABOVE_BYTES = 1_048_576  # a message as long as this is not even read
+CLOSED_ABOVE_BYTES = 1_048_576  # a longer message is not read
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
     "frame-ancestors 'none'"
@@ -51,9 +51,9 @@ POLICY = (
 class PageServer(Listener):
     """The page and its viewers.
 
-    A listener of the station; it and `show` may be called from any thread, everything else happens in the page's own.
+    A listener of the station; it and `show` may be called from any thread, everything else runs in the page's own.
 
-    raises  RunError where the port is in use or plotly is not installed
+    raises  RunError if the port is in use or plotly is not installed
     """
 
     def __init__(self, vehicle: Vehicle, station: Station) -> None:
@@ -96,7 +96,7 @@ class PageServer(Listener):
         self._loop.call_soon_threadsafe(self._add_note, {"time": note.t, "text": note.text})
 
     def show(self, camera: str, unit: AccessUnit) -> None:
-        """One access unit that has just come."""
+        """A newly received access unit."""
         self._loop.call_soon_threadsafe(self._show, self._index[camera], unit)
 
     # --- in the page's thread -----------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ class PageServer(Listener):
         self._server = await self._loop.create_server(self._connection, *self._address)
 
     def _logger(self) -> logging.Logger:
-        """What the server library complains of, without its tracebacks."""
+        """Reports the server library's warnings, without its tracebacks."""
         logger = logging.Logger("page")
         logger.addHandler(_FaultHandler(self._station.note))
         return logger
@@ -180,7 +180,7 @@ class PageServer(Listener):
             await self._listen(ws, viewer)
         except TimeoutError:
             if request.transport:
-                request.transport.abort()  # nobody answers a goodbye either
+                request.transport.abort()  # a close frame would not be answered either
         finally:
             for task in tasks:
                 task.cancel()
@@ -193,7 +193,7 @@ class PageServer(Listener):
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer) -> None:
         """The messages of a viewer, until it disconnects.
 
-        raises  TimeoutError for one that makes no progress: pings go the way of the video, and answers come back
+        raises  TimeoutError if it makes no progress: pings share the connection with the video, and must be answered
         """
         while (message := await ws.receive(SILENT_S)).type not in ENDS:
             if message.type is WSMsgType.PING:
@@ -213,7 +213,7 @@ class PageServer(Listener):
             viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
 
     def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
-        """One message of a page; whatever it holds, it is answered and nothing else suffers."""
+        """One message of a page; whatever it contains, it is answered and affects nothing else."""
         try:
             document = read_message(text.encode() if isinstance(text, str) else text)
         except ValueError as problem:
@@ -265,7 +265,7 @@ def _recent(camera: Camera) -> Recent:
 
 
 class _FaultHandler(logging.Handler):
-    """Notes each fault of this server once. What is not HTTP is its sender's fault, and answered with 400."""
+    """Notes each fault of this server once. Invalid HTTP is its sender's fault, and answered with 400."""
 
     def __init__(self, note: Callable[[str], None]) -> None:
         super().__init__(logging.WARNING)
@@ -280,7 +280,7 @@ class _FaultHandler(logging.Handler):
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
-    """Send what waits, as fast as the viewer takes it."""
+    """Send the queued messages, as fast as the viewer accepts them."""
     try:
         while True:
             message = await viewer.next()
@@ -293,7 +293,7 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
 
 
 async def _ping(ws: web.WebSocketResponse) -> None:
-    """Ask a viewer to say something now and then."""
+    """Ping a viewer regularly, so that it answers."""
     with suppress(ConnectionError):  # the reader of the socket ends it
         while True:
             await asyncio.sleep(PING_S)
@@ -301,7 +301,7 @@ async def _ping(ws: web.WebSocketResponse) -> None:
 
 
 def _introduction(vehicle: Vehicle) -> dict[str, Any]:
-    """What a page must know of the vehicle before anything else."""
+    """What a page must know about the vehicle first."""
     cameras = [
         {
             "name": camera.name,
@@ -322,7 +322,7 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
 
 @web.middleware
 async def _guard(request: web.Request, handler: Any) -> web.StreamResponse:
-    """Only pages of this server, by its own name: no other site in the same browser may look or ask."""
+    """Only pages of this server, by its own name: no other site in the same browser may read or send anything."""
     sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
     allowed = {f"{host}:{sockname[1]}" for host in ("127.0.0.1", "localhost")}
     origin = request.headers.get("Origin")
@@ -336,7 +336,7 @@ async def _guard(request: web.Request, handler: Any) -> web.StreamResponse:
 
 
 def _served(file: Path) -> Any:
-    """A handler for a small file, from memory: a page that opens asks for thirty at once."""
+    """A handler for a small file, from memory: a page that opens requests thirty at once."""
     body, kind = file.read_bytes(), mimetypes.guess_type(file.name)[0]
 
     async def serve(_request: web.Request) -> web.Response:

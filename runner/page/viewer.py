@@ -1,4 +1,4 @@
-"""One browser that looks on: what waits to be sent to it, bounded whatever it does. No network here."""
+"""One browser that views the page: the messages queued for it, always bounded. No network here."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from runner.h264.access_unit import AccessUnit
 
 HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
 KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but do not draw; reset the decoder first
-WAITING_UNITS = 30  # of one camera; a viewer that is further behind starts again from the last IDR
+WAITING_UNITS = 30  # of one camera; a viewer that is further behind restarts from the last IDR
 WAITING_TEXTS = 500
 
-Burst = Callable[[int], list[AccessUnit]]  # by camera index: what a decoder that starts now must get
+Burst = Callable[[int], list[AccessUnit]]  # by camera index: the units for a decoder that starts now
 
 
 class PageViewer:
     """Queues of one viewer. Used from one thread.
 
-    token  its identity: a random name that the browser keeps when the page is loaded again
-    burst  asked for what brings a late decoder up to date, when the viewer is ready to take it and not before
+    token  its identity: a random name that the browser keeps when the page is reloaded
+    burst  returns the units that bring a late decoder up to date; called only when the viewer is ready for them
     """
 
     def __init__(self, token: str, cameras: int, burst: Burst) -> None:
@@ -42,7 +42,7 @@ class PageViewer:
         self._filled.set()
 
     def show(self, camera: int, unit: AccessUnit) -> None:
-        """A unit that has just come."""
+        """A newly received unit."""
         self._filled.set()
         waiting = self._cameras[camera]
         if waiting.behind:
@@ -52,7 +52,7 @@ class PageViewer:
             self.restart(camera)
 
     def restart(self, camera: int) -> None:
-        """Forget what waits; the next that is sent of this camera is a burst."""
+        """Clear the queue; what is sent next for this camera is a burst."""
         self._cameras[camera] = _Waiting()
         self._filled.set()
 
@@ -96,7 +96,7 @@ class PageViewer:
 
 @dataclass
 class _Waiting:
-    """Of one camera: whether it starts with a burst, what is left of that, and what came since."""
+    """Of one camera: whether it starts with a burst, the rest of that burst, and the units received since."""
 
     behind: bool = True
     burst: deque[tuple[int, AccessUnit]] = field(default_factory=deque)

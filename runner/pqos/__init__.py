@@ -1,4 +1,4 @@
-"""Predictions of the bitrate (pQoS): sources of `BitratePredicted` in front of the pure core.
+"""Bitrate predictions (pQoS): sources of `BitratePredicted` in front of the pure core.
 
 The paper reads its predictions from a pre-recorded bandwidth map by GPS position (section V). No clock, no threads,
 no log here: time comes from the events, and a file is read only while a source is built. Rates are kbit/s.
@@ -18,8 +18,8 @@ from runner.pqos.bandwidth_map import BandwidthMap, Way, offset
 from runner.pqos.table import RATE, TIME, find_file, number, read_map, read_table
 
 SLOWEST_MPS = 1.0  # below this speed the direction of movement is mostly GPS noise
-BASELINE_S = 0.5  # movement is taken over at least this long, else a 20 Hz GPS gives noise again
-REACH_M = 10_000.0  # the map's plane fits the Earth about that far; an absurd speed ends here, too
+BASELINE_S = 0.5  # movement is measured over at least this long, otherwise a 20 Hz GPS gives noise again
+REACH_M = 10_000.0  # the map's plane fits the Earth about this far; also limits an absurd speed
 
 
 class Pqos(Protocol):
@@ -27,23 +27,23 @@ class Pqos(Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is suspicious about map or positions, for the caller to log; may appear while running."""
+        """Suspicious findings about map or positions, for the caller to log; may appear while running."""
 
     def observe(self, event: Event) -> BitratePredicted | None:
-        """What this event makes known, stamped with the event's own t; None: nothing new."""
+        """The prediction that follows from this event, stamped with the event's own t; None: nothing new."""
 
 
 class _Motion:
-    """Speed and heading, as reported or else from the movement between positions."""
+    """Speed and heading, as reported or otherwise from the movement between positions."""
 
     def __init__(self) -> None:
         self._last: PositionReported | None = None
-        self._speed = 0.0  # m/s, nothing is known to move before the second position
+        self._speed = 0.0  # m/s, taken as 0 before the second position
         self._course: float | None = None  # degrees, of the movement
         self._heading: float | None = None  # degrees, the one in force
 
     def way(self, event: PositionReported, look_ahead_s: float) -> Way:
-        """Path from here to where the vehicle will be; without any heading known it is the place alone."""
+        """Path from here to where the vehicle will be; just the position if no heading is known."""
         self._measure(event)
         speed = self._speed if event.speed_mps is None else event.speed_mps
         course = self._course if event.heading_deg is None else event.heading_deg
@@ -68,7 +68,7 @@ class _Motion:
 
 
 class MapPqos:
-    """Predicts, for each position, the lowest rate of the map around the path ahead; off the map a small stated one."""
+    """Predicts, for each position, the lowest rate of the map around the path ahead; off the map a small fixed one."""
 
     def __init__(self, points: BandwidthMap, look_ahead_s: float, off_map: Kbps, valid_s: float | None = None) -> None:
         self._points, self._look_ahead_s, self._off_map, self._valid_s = points, look_ahead_s, off_map, valid_s
@@ -85,7 +85,7 @@ class MapPqos:
         return BitratePredicted(t=event.t, kbps=kbps, valid_s=self._valid_s)
 
     def _swapped(self, event: PositionReported) -> tuple[str, ...]:
-        """A defect that looks like a dead spot: lon and lat exchanged in the map or in what reports the position."""
+        """A defect that looks like a dead spot: lon and lat swapped in the map or in the reported positions."""
         if abs(event.lon) > 90 or self._points.lowest(Way(event.lon, event.lat)) is None:
             return ()
         return (
@@ -95,7 +95,7 @@ class MapPqos:
 
 
 class TimedPqos:
-    """Predicts from the time alone: when the value changes, and again each `period_s` so that it does not go stale."""
+    """Predicts from the time alone: when the value changes, and again every `period_s` so that it does not go stale."""
 
     warnings: tuple[str, ...] = ()
 
@@ -124,7 +124,7 @@ class LivePqos:
 def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
     """Rate in force at a time: that of the last row not after it; `off_trace` before the first row and after the end.
 
-    path  CSV with t_s (never falling) and a rate; its last row lasts as long as the one before, then a loop restarts
+    path  CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop restarts
     """
     table = read_table(path, (TIME, RATE))
     if len(table) < 2:
@@ -145,7 +145,7 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
 
     settings  the composed section: kind and the keys of that kind (schemas/pqos.schema.json)
     bases     directories in which a relative file is looked up, first match wins
-    raises    ModelError with the key, what was found and what is right
+    raises    ModelError with the key, the value found and the rule
     """
     match kind := settings.get("kind"):
         case "map":

@@ -1,4 +1,4 @@
-"""Which points of a bandwidth map lie near a path."""
+"""Finds the points of a bandwidth map near a path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 
 def offset(lat0: float, lon0: float, lat: float, lon: float) -> tuple[float, float]:
-    """Metres east and north from one place to another: equirectangular projection, right for some km."""
+    """Metres east and north from one place to another: equirectangular projection, accurate for some km."""
     east = math.radians(math.remainder(lon - lon0, 360)) * math.cos(math.radians(lat0)) * EARTH_M
     return east, math.radians(lat - lat0) * EARTH_M
 
@@ -31,11 +31,11 @@ class Way(NamedTuple):
 
 
 class BandwidthMap:
-    """Rates by place, found through a grid that is searched in sorted order.
+    """Rates by position, looked up in a sorted grid.
 
     lat, lon, kbps  one value per point: degrees, degrees, kbit/s; radius_m: how far from a path a point still counts
 
-    The rows of the grid are bands of latitude, each divided into columns of its own, so that a cell measures the same
+    The rows of the grid are bands of latitude, each divided into its own columns, so that cells have the same size
     at every latitude. Points are sorted by cell, then by rate: a dense map answers from the first point of most cells.
     """
 
@@ -56,7 +56,7 @@ class BandwidthMap:
         first = self._first[cells]
         inside = self._inside(first, way)
         best = self._kbps[first[inside]].min(initial=np.inf)
-        # The first point of a cell is its lowest: only where it lies outside may a later one lie inside and be lower.
+        # The first point of a cell is its lowest: only if it lies outside may a later one lie inside and be lower.
         cells = cells[~inside & (self._kbps[first] < best)]
         rest = _spans(self._first[cells] + 1, self._first[cells + 1])
         rest = rest[self._kbps[rest] < best]
@@ -64,7 +64,7 @@ class BandwidthMap:
         return None if best == np.inf else float(best)
 
     def _key(self, row: Ints, lon: Floats) -> Ints:
-        """Number of the cell at a longitude of a row; rising with the longitude within a row."""
+        """Number of the cell at a longitude of a row; increasing with the longitude within a row."""
         parallel = np.maximum(np.cos((row + 0.5) * self._cell / EARTH_M), 0.0)
         column: Ints = np.floor(np.radians(lon + 180) * EARTH_M * parallel / self._cell).astype(np.int64)
         return row * COLUMNS + column

@@ -1,4 +1,4 @@
-"""The order in which to drive through the points of a bandwidth map, which may stand in its file in any order."""
+"""The order in which to drive through the points of a bandwidth map, whose file may list them in any order."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from runner.core.model import ModelError
 from runner.pqos.bandwidth_map import EARTH_M, Floats, Ints
 
-THIN_M = 4.0  # points closer than this make a route shake
-POINTS = 3000  # a map of more is thinned further before it is ordered, so that ordering stays below 1 s
-HOPS = 3.0  # times the usual distance of neighbours: what lies further is not the same road
-STRAIGHT = 2.0  # how many times its length a hop costs more when it turns off at right angles
+THIN_M = 4.0  # points closer than this make a route jitter
+POINTS = 3000  # a larger map is thinned further before it is ordered, so that ordering stays below 1 s
+HOPS = 3.0  # times the usual distance of neighbours: points further away are not on the same road
+STRAIGHT = 2.0  # extra cost of a hop that turns off at a right angle, in multiples of its length
 
 
 def route(points: Floats) -> Ints:
@@ -19,11 +19,11 @@ def route(points: Floats) -> Ints:
 
     points   rows of lon, lat in degrees
     returns  indices of rows; points closer than a few metres to others are left out
-    raises   ModelError for a map that is but one place
+    raises   ModelError for a map of only one place
 
-    A map whose points stand in driving order keeps that order, its direction and its first point. Through any other map
-    a closed route is found by driving: straight on as long as there are new points ahead, then along known ones to the
-    nearest new one, and in the end back to the first. So roads that cross or join do not make it jump.
+    A map whose points are in driving order keeps that order, its direction and its first point. Through any other map
+    a closed route is found by driving: straight on while there are new points ahead, then along known ones to the
+    nearest new one, and finally back to the first. Thus roads that cross or join do not make it jump.
     """
     x, y = _plane(points)
     near = _thin(x, y)
@@ -32,7 +32,7 @@ def route(points: Floats) -> Ints:
     distance = np.hypot(x[near, None] - x[near], y[near, None] - y[near])
     hop = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
     steps = np.hypot(np.diff(x), np.diff(y))
-    # The second condition is for big maps: thinned to long hops, they hide that the file leaps between nearby roads.
+    # The second condition is for big maps: thinned to long hops, they hide that the file jumps between nearby roads.
     if steps.mean() <= 2 * hop and np.median(np.diag(distance, 1)) <= 2 * hop:
         return _as_given(x, y, steps, HOPS * hop)
     return near[_drive(x[near], y[near], distance, HOPS * hop)]
@@ -45,7 +45,7 @@ def _plane(points: Floats) -> tuple[Floats, Floats]:
 
 
 def _thin(x: Floats, y: Floats) -> Ints:
-    """Indices, rising from 0, of points that are at least a few metres apart, and not too many."""
+    """Indices, increasing from 0, of points that are at least a few metres apart, and not too many."""
     index, step = np.arange(len(x)), THIN_M
     while True:
         cell = (np.floor(x[index] / step) * 2**26 + np.floor(y[index] / step)).astype(np.int64)
@@ -70,9 +70,9 @@ def _as_given(x: Floats, y: Floats, steps: Floats, reach: float) -> Ints:
 
 
 def _drive(x: Floats, y: Floats, distance: Floats, reach: float) -> Ints:
-    """Closed route through points in m; a hop is longer than `reach` only where no point lies between."""
+    """Closed route through points in m; a hop is longer than `reach` only if no point lies between."""
     new = np.ones(len(x), dtype=bool)
-    driven, east, north = [0], x[1] - x[0], y[1] - y[0]  # sets out the way the file does
+    driven, east, north = [0], x[1] - x[0], y[1] - y[0]  # starts in the direction of the file
     new[0] = False
     while new.any():
         here = driven[-1]

@@ -1,4 +1,4 @@
-"""Tables of numbers that a setting names: bandwidth maps, traces, GPS tracks; checked in full before use."""
+"""Tables of numbers named by a setting: bandwidth maps, traces, GPS tracks; checked in full before use."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LONGEST_HEADER = 10_000  # characters
 
 
 class Column(NamedTuple):
-    """A column of numbers: names its header may have, range, and whether it is a time that must not fall."""
+    """A column of numbers: names its header may have, range, and whether it is a time that must not decrease."""
 
     names: tuple[str, ...]
     least: float
@@ -45,11 +45,11 @@ SPEED = Column(("speed_mps",), 0, FINITE, "must be a finite number of m/s, 0 or 
 
 
 class _Text(NamedTuple):
-    """A table as it stands in a file.
+    """A table as read from a file.
 
     values  float64 (rows, columns); None: some cell is not a number
     names   name of each column in this file
-    rows    line number and cells of each row, read again when a mistake has to be named
+    rows    line number and cells of each row, read again to report a mistake
     """
 
     values: NDArray[np.float64] | None
@@ -58,7 +58,7 @@ class _Text(NamedTuple):
 
 
 def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
-    """The file that a setting names: absolute as it is, else in the first of the directories that has it.
+    """The file that a setting names: an absolute path as it is, otherwise in the first of the directories that has it.
 
     raises  ModelError
     """
@@ -87,7 +87,7 @@ def number(settings: Mapping[str, Any], key: str, *, positive: bool = False) -> 
 
 @contextmanager
 def within(section: str) -> Iterator[None]:
-    """Report the keys of what goes wrong inside as keys of a section of the settings."""
+    """Report the keys of errors raised inside as keys of a section of the settings."""
     try:
         yield
     except ModelError as error:
@@ -95,7 +95,7 @@ def within(section: str) -> Iterator[None]:
 
 
 def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
-    """The asked columns of a CSV file with a header, as float64 (rows, columns); other columns are ignored.
+    """The requested columns of a CSV file with a header, as float64 (rows, columns); other columns are ignored.
 
     raises  ModelError with file, line, cell and rule of the first mistake
     """
@@ -122,7 +122,7 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
     found = header(path)
     names = [next((name for name in column.names if name in found), "") for column in columns]
     if "" in names:
-        # What the file holds is not shown: it may be another than the one that was meant.
+        # The content of the file is not shown: it may not be the file that was meant.
         wanted = ", ".join(" or ".join(column.names) for column in columns)
         lacks = ", ".join(column.names[0] for column, name in zip(columns, names, strict=True) if not name)
         raise ModelError("file", f"{path}:1: no column {lacks}", f"must be a header with the columns {wanted}")
@@ -136,7 +136,7 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
                 yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in index]
 
     with path.open(encoding="utf-8-sig", errors="replace") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of an empty table, which `_checked` refuses
+        warnings.simplefilter("ignore", UserWarning)  # about an empty table, which `_checked` refuses
         try:
             values = np.loadtxt(file, delimiter=",", skiprows=1, usecols=index, comments=None, quotechar='"', ndmin=2)
         except ValueError:
@@ -145,9 +145,9 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
 
 
 def _matrix(path: Path) -> _Text:
-    """The matrix of rows x 3 numbers (lon, lat, kbit/s) in which the paper's own implementation keeps its map.
+    """The matrix of rows x 3 numbers (lon, lat, kbit/s) in which the paper's own implementation stores its map.
 
-    OpenCV's `%YAML:1.0` is no YAML that a YAML parser reads, so rows, cols and data are looked up in the text.
+    No YAML parser reads OpenCV's `%YAML:1.0`, so rows, cols and data are looked up in the text.
     """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     data = re.search(r"\bdata:\s*\[([^\]]*)\]", text)
@@ -176,7 +176,7 @@ def _matrix(path: Path) -> _Text:
 def _checked(path: Path, columns: Sequence[Column], text: _Text) -> NDArray[np.float64]:
     """The values of a table, each within the range of its column; raises ModelError for the first that is not.
 
-    Recorders write a row twice now and then: of rows with the same time the last one counts.
+    Recorders sometimes write a row twice: of rows with the same time, the last one counts.
     """
     values = text.values
     if values is None:

@@ -20,10 +20,10 @@ from runner.pqos.table import LAT, LON, SPEED, TIME, find_file, header, number, 
 class Track:
     """Position, speed and heading over time.
 
-    times     s, rising; the first one is the start of the drive
-    lat, lon  degrees, between the rows on a straight line
-    speed     m/s per row; None: the one that the movement has
-    loop      start again at the end, else stay there
+    times     s, increasing; the first one is the start of the drive
+    lat, lon  degrees, interpolated linearly between the rows
+    speed     m/s per row; None: computed from the movement
+    loop      restart at the end, otherwise stay there
     """
 
     def __init__(self, times: Floats, lat: Floats, lon: Floats, speed: Floats | None, loop: bool) -> None:
@@ -42,7 +42,7 @@ class Track:
         return float(self._times[-1])
 
     def at(self, t: float) -> PositionReported:
-        """Where the vehicle is `t` seconds after the start; while it stands, the last heading holds."""
+        """Position of the vehicle `t` seconds after the start; while it stands, the last heading holds."""
         now = t % self.duration_s if self._loop else min(max(t, 0.0), self.duration_s)
         row = min(int(np.searchsorted(self._times, now, "right")) - 1, len(self._pace) - 1)
         ended = not self._loop and t > self.duration_s
@@ -57,10 +57,10 @@ class Track:
 
 
 def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | None:
-    """The drive that `position` in the `pqos` section describes; None: positions come as events.
+    """The drive that `position` in the `pqos` section describes; None: positions arrive as events.
 
     settings  the composed section; bases: directories in which a relative file is looked up
-    raises    ModelError with the key, what was found and what is right
+    raises    ModelError with the key, the value found and the rule
     """
     position = settings.get("position") or {"kind": "live"}
     loop = bool(position.get("loop"))
@@ -80,7 +80,7 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
 
 
 def recorded(path: Path, loop: bool) -> Track:
-    """A recorded drive: CSV with t_s (never falling), lat, lon (degrees) and, where it was measured, speed_mps."""
+    """A recorded drive: CSV with t_s (never decreasing), lat, lon (degrees) and, if it was measured, speed_mps."""
     columns = (TIME, LAT, LON, SPEED) if SPEED.names[0] in header(path) else (TIME, LAT, LON)
     times, lat, lon, *speed = read_table(path, columns).T
     if len(times) < 2:
@@ -91,9 +91,9 @@ def recorded(path: Path, loop: bool) -> Track:
 def drive(points: Floats, speed_mps: float, loop: bool) -> Track:
     """A drive at one speed through the points (lon, lat in degrees, ...) of a map, in the order of `route`."""
     lon, lat = points[route(points), :2].T
-    if loop and (lon[0], lat[0]) != (lon[-1], lat[-1]):  # a road that does not close is driven there and back
+    if loop and (lon[0], lat[0]) != (lon[-1], lat[-1]):  # an open road is driven there and back
         lon, lat = np.append(lon, lon[-2::-1]), np.append(lat, lat[-2::-1])
     hops = np.array([math.hypot(*offset(*hop)) for hop in zip(lat[:-1], lon[:-1], lat[1:], lon[1:], strict=True)])
-    moved = np.append(True, hops > 0)  # time must rise from row to row
+    moved = np.append(True, hops > 0)  # time must increase from row to row
     times = np.append(0.0, np.cumsum(hops))[moved] / speed_mps
     return Track(times, lat[moved], lon[moved], None, loop)

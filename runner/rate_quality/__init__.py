@@ -2,5 +2,5 @@
 
     sequence -> plans -> sweep -> task (lanes, metrics) -> Point -> curves -> choice -> artefact, plots
 
-`measure.py` walks this line for each camera. `curves`, `plans`, `choice`, `lanes` and `compare` are pure.
+`measure.py` runs this chain for each camera. `curves`, `plans`, `choice`, `lanes` and `compare` are pure.
 """

@@ -1,4 +1,4 @@
-"""What a measurement leaves behind: the model file, the camera YAML that links to it, and how to read them back."""
+"""The output of a measurement: the model file, the camera YAML that links to it, and how to read them back."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from runner.rate_quality.sequence import Sequence as Clip
 
 VERSION = 1
 SCHEMA = "rate_quality"
-MARK = "Measured by `tod-runner model`"  # stands in each camera YAML that was written here
+MARK = "Measured by `tod-runner model`"  # in each camera YAML that was written here
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All that is known of one model.
+    """Everything known about one model.
 
     name      of the model and its files
     camera    as it is mounted, or the first one of a pool
-    clips     by camera, what was measured on
+    clips     by camera, the clip measured on
     masks     by camera, digest of its mask
-    encoder   the encoder's fragment of the live graph as text, and versions of what ran it
+    encoder   the encoder's fragment of the live graph as text, and versions of the software that ran it
     metrics   by name, identity
-    labels    by name, how an axis is called
-    plan      full or adaptive; encodings, how many it took
-    stride    every so many frames were scored
-    notes     on the sequences
+    labels    by name, label of an axis
+    plan      full or adaptive
+    stride    every stride-th frame was scored
+    notes     about the sequences
     """
 
     name: str
@@ -140,7 +140,7 @@ def read_model(path: Path) -> dict[str, Any]:
 
 
 def dumps(document: Mapping[str, Any]) -> bytes:
-    """JSON that a person can read: one point a line."""
+    """JSON for human readers: one point per line."""
     parts = []
     for key, value in document.items():
         rows = isinstance(value, list) and value and isinstance(value[0], dict)

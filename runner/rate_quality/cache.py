@@ -1,4 +1,4 @@
-"""Measured points, kept by content: the same sequence, settings and metric are never encoded twice."""
+"""Measured points, cached by content: the same sequence, settings and metric are never encoded twice."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runner.system.files import write_whole
 
 
 def digest(*parts: object) -> str:
-    """Digest of values that their text identifies."""
+    """Digest of values identified by their text."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
@@ -24,9 +24,9 @@ def file_digest(path: Path) -> str:
 
 
 class Cache:
-    """JSON documents by digest, one small file each, written at once or not at all.
+    """JSON documents by digest, one small file each, written atomically.
 
-    on_warning  called with a line on a file that cannot be used; it is made again
+    on_warning  called with a line about a file that cannot be used; it is made again
     """
 
     def __init__(self, directory: Path, on_warning: Callable[[str], None]) -> None:
@@ -47,7 +47,7 @@ class Cache:
         return document
 
     def store(self, key: str, document: Mapping[str, Any]) -> None:
-        """raises RunError where the disk does not take it"""
+        """raises RunError if it cannot be written"""
         write_whole(self._path(key), json.dumps(document).encode())
 
     def _path(self, key: str) -> Path:
@@ -55,7 +55,7 @@ class Cache:
 
 
 def point_to_json(point: Point, identities: Mapping[str, str]) -> dict[str, Any]:
-    """identities: by metric, what makes its scores what they are"""
+    """identities: by metric, everything that determines its scores"""
     return {
         "actual_kbps": point.actual_kbps,
         "encode_ms": point.encode_ms,

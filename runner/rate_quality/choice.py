@@ -1,4 +1,4 @@
-"""From the points of a camera to its rate-quality model: which factors, from which bitrates, up to which. Pure."""
+"""From the points of a camera to its rate-quality model: its factors, their bitrate bounds, b_full. Pure."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from runner.rate_quality.curves import (
     reaches,
 )
 
-FEW_FRAMES = 40  # scored ones, below which a mean is uncertain
+FEW_FRAMES = 40  # scored frames, below which a mean is uncertain
 
 
 @dataclass(frozen=True, slots=True)
 class ChoiceCriteria:
-    """What decides between points; see conf/study/paper.yaml.
+    """Criteria for the choice between points; see conf/study/paper.yaml.
 
-    metric  the one that chooses, sign -1 where lower is better
+    metric  the deciding one; sign: -1 if lower is better
     good    quality at which b_full is set
-    cores   most of a core that an encoder may need; None: no limit
+    cores   largest share of a core that an encoder may need; None: no limit
     fps     of the sequence
     """
 
@@ -47,13 +47,13 @@ class ChoiceCriteria:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A rate-quality model and what speaks for it.
+    """A rate-quality model and the evidence for it.
 
-    b_min      whole kbit/s, rising from 0
-    dropped    by factor, why it is not in
-    table      for each number of factors the best choice there is, and what it loses
-    cores      by factor, share of a core that its encoder needs, the most of all bitrates
-    warnings   what a person should know before using it
+    b_min      whole kbit/s, increasing from 0
+    dropped    by factor, why it was dropped
+    table      for each number of factors, the best choice and what it loses
+    cores      by factor, share of a core that its encoder needs, the maximum over all bitrates
+    warnings   caveats for the user
     """
 
     scaling: tuple[Fraction, ...]
@@ -70,7 +70,7 @@ class Choice:
 def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
     """Choose factors, bounds and b_full from points.
 
-    raises  ValueError where no factor is left
+    raises  ValueError if no factor is left
     """
     score = mean_score(criteria.metric, criteria.sign)
     cores = cores_needed(points, criteria.fps)
@@ -131,7 +131,7 @@ def cores_needed(points: Iterable[Point], fps: Fraction) -> dict[Fraction, float
 
 
 def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[int, list[str]]:
-    """The bitrate at which the quality is good enough; the largest measured one where it never is."""
+    """The bitrate at which the quality is good enough; the largest measured one if it never is."""
     reached = reaches(curves, ladder, criteria.sign * criteria.good)
     if reached is not None:
         return ceil(reached), []

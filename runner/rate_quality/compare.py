@@ -9,7 +9,7 @@ ModelDocument = Mapping[str, Any]  # of a model file
 
 
 def compare(a: ModelDocument, b: ModelDocument) -> Iterator[str]:
-    """Lines for a person: what they were measured on, then factors, bounds and b_full, then the points."""
+    """Lines of text: what they were measured on, then factors, bounds and b_full, then the points."""
     yield from _origins(a, b)
     if a["scaling"] == b["scaling"]:
         yield f"factors    {_list(a['scaling'])}, the same"
@@ -48,7 +48,7 @@ def _changes(before: str, after: str) -> Iterator[str]:
 
 
 def _certain(a: ModelDocument, b: ModelDocument, factor: float) -> str:
-    """Whether the ranges of confidence of a bound overlap."""
+    """Whether the confidence intervals of a bound overlap."""
     ranges = [(c["low"], c["high"]) for m in (a, b) for c in m["crossings"] if c["upper"] == factor]
     if len(ranges) < 2:
         return ""
@@ -57,7 +57,7 @@ def _certain(a: ModelDocument, b: ModelDocument, factor: float) -> str:
 
 
 def _points(a: ModelDocument, b: ModelDocument) -> Iterator[str]:
-    """Where both have encoded the same: how far their qualities are apart."""
+    """Differences in quality between encodings that both have."""
     both = sorted(set(a["metrics"]) & set(b["metrics"]))
     mine, theirs = ({(p["scaling"], p["target_kbps"]): p for p in model["points"]} for model in (a, b))
     common = sorted(mine.keys() & theirs.keys())

@@ -11,5 +11,5 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compile with numba; the code is kept on disk for the next run and leaves other threads running."""
+    """Compile with numba; the code is cached on disk for the next run and does not block other threads."""
     return cast(F, njit(cache=True, fastmath=True, nogil=True)(function))

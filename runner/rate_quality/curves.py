@@ -1,7 +1,7 @@
-"""From measured points to a ladder of scaling factors: curves over bitrate, crossings, what is worth keeping. Pure.
+"""From measured points to a ladder of scaling factors: curves over bitrate, crossings, factors worth keeping. Pure.
 
-Quality is turned so that higher is better. Bitrates are the targets that an encoder was given, since a target is what
-the allocation commands; an encoding that does not hold its target takes no part.
+Quality is signed so that higher is better. Bitrates are the targets that an encoder was given, since the allocation
+commands targets; an encoding that does not hold its target is excluded.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 
-GRID = 400  # bitrates that curves are compared at, log-spaced
+GRID = 400  # bitrates at which curves are compared, log-spaced
 HOLDS = 1.1  # actual over target bitrate, up to which an encoding holds its target
-SATURATED = 0.8  # below it the encoder has no use for more
+SATURATED = 0.8  # below it the encoder cannot use more
 RESAMPLED = 200  # bootstrap samples for the confidence of a crossing
 BLOCKS = 8  # time blocks that are resampled
 CONFIDENCE = (5, 95)  # percentiles
@@ -28,8 +28,8 @@ CONFIDENCE = (5, 95)  # percentiles
 class Point:
     """One encoding of a sequence.
 
-    actual_kbps  what came out of the encoder
-    encode_ms    processor time of the encoder for each frame
+    actual_kbps  output of the encoder
+    encode_ms    CPU time of the encoder for each frame
     scores       by metric, the quality of each sampled frame
     """
 
@@ -70,11 +70,11 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class Ladder:
-    """A choice of factors and the bitrates from which each is taken.
+    """A choice of factors and the bitrates from which each is used.
 
-    scaling      rising
-    bounds       kbit/s, one less: from bounds[i] on, scaling[i + 1] is taken
-    regret_max   most quality that is lost against the best of all factors
+    scaling      increasing
+    bounds       kbit/s, one less: from bounds[i] on, scaling[i + 1] is used
+    regret_max   largest loss of quality compared with the best of all factors
     regret_mean  the same on average over log bitrate
     width_min    narrowest range: its end over its beginning
     """
@@ -88,7 +88,7 @@ class Ladder:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """Where the larger of two factors begins to look better.
+    """The bitrate at which the larger of two factors begins to look better.
 
     low, high  its 5th and 95th percentile over resampled time blocks of the sequence
     """
@@ -101,14 +101,14 @@ class Crossing:
 
 
 def mean_score(metric: str, sign: int = 1) -> Score:
-    """Mean over the sampled frames; sign -1 where lower is better."""
+    """Mean over the sampled frames; sign -1 if lower is better."""
     return lambda point: sign * float(np.mean(point.scores[metric]))
 
 
 def draw_curves(points: Iterable[Point], score: Score) -> Curves:
     """Curves through the points: piecewise cubic in log bitrate, monotone where the points are (PCHIP).
 
-    raises  ValueError where no point holds its target
+    raises  ValueError if no point holds its target
     """
     held: dict[Fraction, list[Point]] = {}
     for point in sorted(points, key=lambda p: (p.scaling, p.target_kbps)):
@@ -136,7 +136,7 @@ def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
 
 
 def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
-    """The bitrate from which the larger factor looks better; None where one of the two wins throughout.
+    """The bitrate from which the larger factor looks better; None if one of the two wins throughout.
 
     Noisy curves may cross more than once: the bound is the one that loses least quality, summed over log bitrate.
     """
@@ -153,18 +153,18 @@ def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
 
 
 def _gain(upper: Values, lower: Values) -> Values:
-    """What the larger factor gains, finite: all or nothing where only one of them works."""
+    """Gain of the larger factor, finite: all or nothing if only one of them works."""
     return np.nan_to_num(upper - lower, nan=0.0, posinf=1e3, neginf=-1e3)
 
 
 def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Ladder, list[Ladder]]:
-    """The smallest choice of factors that loses nobody more than `tolerance`.
+    """The smallest choice of factors that loses no more than `tolerance` at any bitrate.
 
     tolerance  quality, see `Metric.tolerance`
     narrowest  a range must end at this many times its beginning, or its factor is not worth a switch
-    returns    the ladder, and for each number of factors the best there is, to show what fewer would lose
+    returns    the ladder, and for each number of factors the best one, to show what fewer would lose
 
-    Where no choice meets both, the one that loses least.
+    If no choice meets both, the one that loses least.
     """
     ladders = [ladder for chosen in _choices(curves) if (ladder := climb(curves, chosen)) is not None]
     wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
@@ -177,14 +177,14 @@ def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Lad
 
 
 def _choices(curves: Curves) -> Iterator[tuple[Fraction, ...]]:
-    """All choices among the factors that are the best anywhere."""
+    """All choices among the factors that are the best at any bitrate."""
     winners = sorted({factor for factor, y in curves.quality.items() if np.any((y >= curves.best) & np.isfinite(y))})
     for size in range(1, len(winners) + 1):
         yield from combinations(winners, size)
 
 
 def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
-    """These factors, each taken in its range; None where one of them would have none."""
+    """These factors, each used in its range; None if one of them would have none."""
     bounds = [cross(curves, lower, upper) for lower, upper in pairwise(scaling)]
     found = [bound for bound in bounds if bound is not None]
     if len(found) < len(bounds) or any(a >= b for a, b in pairwise(found)):
@@ -198,7 +198,7 @@ def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
 
 
 def along(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
-    """Quality on the grid when each factor is taken in its range."""
+    """Quality on the grid when each factor is used in its range."""
     taken = np.searchsorted(bounds, curves.kbps, side="right")
     return np.asarray(np.choose(taken, [curves.quality[factor] for factor in scaling]))
 
@@ -236,7 +236,7 @@ def _resampled(frames: int) -> Iterator[Values]:
 
 
 def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
-    """The smallest bitrate at which a ladder reaches a quality and keeps it; None where it does not."""
+    """The smallest bitrate at which a ladder reaches a quality and keeps it; None if it does not."""
     below = np.flatnonzero(along(curves, ladder.scaling, ladder.bounds) < quality)
     if not below.size:
         return float(curves.kbps[0])

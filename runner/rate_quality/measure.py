@@ -1,4 +1,4 @@
-"""Measure the rate-quality models of some cameras, one after the other, and write them down."""
+"""Measure the rate-quality models of some cameras, one after the other, and write them to files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def measure(
     """Measure and write models; yields a line for each.
 
     sequences  by camera, its clip
-    raises     UserError for what cannot be measured, RunError where a run fails; finished models stay
+    raises     UserError for input that cannot be measured, RunError if a run fails; finished models stay
     """
     metrics = tuple(_metric(study, name) for name in study.metrics)
     cache = Cache(cache_directory() / "points", on_note)
@@ -61,7 +61,7 @@ def measure(
 
 
 def _check_output(output: Path, models: Iterable[str]) -> None:
-    """Whether models may be written there, before hours of work: nobody else's camera is overwritten.
+    """Check before hours of work that models may be written there, and that no other camera file is overwritten.
 
     raises  UserError
     """
@@ -126,7 +126,7 @@ def _sweep(
 
 
 def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
-    """A picture of the camera's size; what is black in it does not count.
+    """A picture of the camera's size; its black pixels do not count.
 
     raises  UserError
     """
@@ -190,7 +190,7 @@ def _measure(
 def _points(
     study: Study, criteria: ChoiceCriteria, sweeps: Sequence[Sweep], on_progress: Callable[[float], None]
 ) -> list[Point]:
-    """Points of one model, round by round, until its plan wants no more."""
+    """Points of one model, round by round, until its plan requests no more."""
     groups: list[list[Point]] = [[] for _ in sweeps]
     done = expected = 0.0
     while lanes := _next(study, criteria, pooled(groups)):

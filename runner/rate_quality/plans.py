@@ -1,4 +1,4 @@
-"""Which encodings to make next, from those that are there. Pure: a plan is asked again until it wants no more."""
+"""Which encodings to make next, given the existing ones. Pure: a plan is called again until it requests no more."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from runner.lanes import Lane
 from runner.rate_quality.curves import Curves, Ladder, Point, Score, along, best_ladder, draw_curves
 
 FIRST_RATES = 4  # of the adaptive plan, for each factor
-CLOSE = 1.05  # a crossing is known when both factors were encoded so near to it
-SHARE = 3  # the adaptive plan makes at most one in so many encodings of the full one
+CLOSE = 1.05  # a crossing is known when both factors were encoded within this ratio of it
+SHARE = 3  # the adaptive plan makes at most one in this many encodings of the full one
 
 
 def full(scalings: Sequence[Fraction], rates: Sequence[int], points: Iterable[Point]) -> list[Lane]:
@@ -32,7 +32,7 @@ def adaptive(
 ) -> list[Lane]:
     """A few bitrates for each factor, then both neighbours of each crossing until it stays where it was predicted.
 
-    rates      of the full plan, rising; their ends are kept, and no more than a third of its encodings are made
+    rates      of the full plan, increasing; their ends are kept, and no more than a third of its encodings are made
     score, tolerance, narrowest  as `curves.best_ladder` takes them
     """
     first = _missing([Lane(factor, kbps) for factor in scalings for kbps in spread(rates, FIRST_RATES)], points)
@@ -51,7 +51,7 @@ def _crossings(ladder: Ladder) -> list[Lane]:
 
 
 def _near_best(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
-    """Factors that are left out and nearly as good, where they are most so, beside the one that is kept there."""
+    """Factors left out though nearly as good, at the bitrate where they come closest, with the kept factor there."""
     kept = along(curves, ladder.scaling, ladder.bounds)
     wanted: list[tuple[float, list[Lane]]] = []
     for factor, quality in curves.quality.items():
@@ -65,7 +65,7 @@ def _near_best(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
 
 
 def _unknown(lanes: Iterable[Lane], points: Sequence[Point]) -> list[Lane]:
-    """Those that nothing was encoded near enough to."""
+    """Lanes without an encoding near enough."""
     return [
         lane
         for lane in dict.fromkeys(lanes)
@@ -74,7 +74,7 @@ def _unknown(lanes: Iterable[Lane], points: Sequence[Point]) -> list[Lane]:
 
 
 def spread(rates: Sequence[int], count: int) -> list[int]:
-    """Some of the bitrates, both ends among them, as even in log bitrate as they come."""
+    """Some of the bitrates, including both ends, as evenly spaced in log bitrate as possible."""
     wanted = np.geomspace(rates[0], rates[-1], min(count, len(rates)))
     return sorted({min(rates, key=lambda rate: float(abs(np.log(rate / want)))) for want in wanted})
 

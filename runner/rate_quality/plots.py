@@ -31,7 +31,7 @@ DROPPED = "#b8b8b8"
 def plot(measured: Measured, path: Path) -> list[Path]:
     """Write the curves of a model.
 
-    path    without ending
+    path    without extension
     returns the files: PNG and PDF
     raises  RunError
     """
@@ -46,7 +46,7 @@ def plot(measured: Measured, path: Path) -> list[Path]:
 
 
 def _draw_curves(axes: Axes, measured: Measured, curves: Curves) -> dict[Fraction, str]:
-    """All curves with their points; those that were dropped stay grey."""
+    """All curves with their points; dropped ones are grey."""
     palette = mpl.colormaps["viridis"](np.linspace(0, 0.88, len(measured.choice.scaling)))
     colours = {f: mpl.colors.to_hex(colour) for f, colour in zip(measured.choice.scaling, palette, strict=True)}
     for factor, quality in curves.quality.items():
@@ -109,7 +109,7 @@ def _dress(axes: Axes, measured: Measured, curves: Curves) -> None:
 
 
 def _limits(measured: Measured, curves: Curves) -> tuple[float, float]:
-    """From the worst of what is kept to the best of all: a dropped factor may leave the picture at the bottom."""
+    """From the worst of the kept curves to the best of all: a dropped one may leave the plot at the bottom."""
     shown = [curves.quality[factor] for factor in measured.choice.scaling]
     finite = np.concatenate([values[np.isfinite(values)] for values in shown])
     low, high = sorted((measured.sign * float(finite.min()), measured.sign * float(finite.max())))
@@ -119,7 +119,7 @@ def _limits(measured: Measured, curves: Curves) -> tuple[float, float]:
 
 def _saved(figure: Figure, path: Path, form: str) -> Path:
     file, buffer = path.with_name(f"{path.name}.{form}"), io.BytesIO()
-    # Without a date in it the same model gives the same file.
+    # Without a date, the same model gives the same file.
     figure.savefig(buffer, format=form, dpi=160, metadata={"CreationDate": None} if form == "pdf" else None)
     write_whole(file, buffer.getvalue())
     return file

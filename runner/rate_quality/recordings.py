@@ -1,4 +1,4 @@
-"""The directory of a recording: one file per camera under its own name only when it is complete, and recording.json."""
+"""The directory of a recording: one file per camera, which gets its name only when complete, and recording.json."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from runner.redact import redacted
 from runner.system.files import unfinished
 
 INDEX = "recording.json"
-LEAST_S = 60  # a recording without an end needs space for so long at least
-MARGIN_BYTES = 64_000_000  # never filled; and what comes raw in the next seconds
+LEAST_S = 60  # a recording without an end needs space for at least this long
+MARGIN_BYTES = 64_000_000  # never filled; plus the raw frames of the next seconds
 MARGIN_S = 2
 
 
 def raw_rate(cameras: Iterable[Camera]) -> float:
-    """Bytes that the frames of some cameras take in a second, I420 of the sources' sizes."""
+    """Bytes per second of some cameras' raw frames, I420 of the sources' sizes."""
     return float(sum(c.source_size[0] * c.source_size[1] * c.fps * 3 / 2 for c in cameras))
 
 
@@ -31,9 +31,9 @@ def margin(cameras: Iterable[Camera]) -> float:
 
 
 def check_space(directory: Path, cameras: Iterable[Camera], recording: Recording, duration_s: float | None) -> None:
-    """Whether a recording has room, for its whole length or, where that is open, for a minute.
+    """Check that a recording has room, for its whole length or, if that is open, for a minute.
 
-    raises  RunError with what it needs and what there is
+    raises  RunError with the space needed and available
     """
     cameras = list(cameras)
     seconds = LEAST_S if duration_s is None else duration_s
@@ -52,7 +52,7 @@ def gigabytes(size: float) -> str:
 
 
 def make_directory(path: Path) -> None:
-    """raises UserError where no directory can be made"""
+    """raises UserError if the directory cannot be made"""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -63,7 +63,7 @@ def make_directory(path: Path) -> None:
 def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
     """By camera, the file that will be written; each is made, empty, so that no other recording writes it too.
 
-    raises  UserError where something would be overwritten, or nothing can be written
+    raises  UserError if something would be overwritten, or nothing can be written
     """
     cameras = list(cameras)
     wanted = [directory / INDEX, *(final(directory, name) for name in cameras)]
@@ -87,14 +87,14 @@ def final(directory: Path, camera: str) -> Path:
 
 
 def part(directory: Path, camera: str) -> Path:
-    """The file as long as it is incomplete."""
+    """The file while it is incomplete."""
     return directory / f".{camera}.mkv.part"
 
 
 def keep(directory: Path, camera: str) -> Path:
     """Give a complete file its name, once it is on the disk.
 
-    raises  RunError where that name was taken meanwhile, or the disk fails
+    raises  RunError if that name was taken meanwhile, or the disk fails
     """
     incomplete, path = part(directory, camera), final(directory, camera)
     try:
@@ -109,14 +109,14 @@ def keep(directory: Path, camera: str) -> Path:
 
 
 def remove_empty(paths: Iterable[Path]) -> None:
-    """Remove files into which nothing was written."""
+    """Remove empty files."""
     for path in paths:
         if path.exists() and not path.stat().st_size:
             path.unlink()
 
 
 def write_index(directory: Path, document: Mapping[str, Any]) -> None:
-    """Write recording.json, whole or not at all; passwords in addresses are left out.
+    """Write recording.json atomically; passwords in addresses are left out.
 
     raises  RunError
     """

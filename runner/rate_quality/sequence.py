@@ -1,4 +1,4 @@
-"""A recorded sequence of a camera, looked through once: how long it is, how hard."""
+"""A recorded sequence of a camera, analysed once: its length, its complexity."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ FEWEST_FRAMES = 25
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """A clip and what is known of it.
+    """A clip and its properties.
 
     sha256         of the file
     width, height  px
-    fps            frames a second
+    fps            frames per second
     lossless       whether its codec keeps every sample
-    si, ti         spatial and temporal information, the largest of all frames (ITU-T P.910); si_mean, ti_mean
+    si, ti         spatial and temporal information, the maximum over all frames (ITU-T P.910); si_mean, ti_mean: mean
     """
 
     path: str
@@ -49,12 +49,12 @@ class Sequence:
 
     @property
     def decode(self) -> str:
-        """The line that makes its frames."""
+        """The line that decodes its frames."""
         return decoding(self.path, self.fps)
 
 
 def decoding(path: str, fps: Fraction) -> str:
-    """I420 frames of a clip at a constant rate, as GStreamer parses it."""
+    """The line for GStreamer that decodes a clip to I420 frames at a constant rate."""
     quoted = path.replace("\\", "\\\\").replace('"', '\\"')
     rate = f"video/x-raw,framerate={fps.numerator}/{fps.denominator}"
     raw = "videoconvert ! video/x-raw,format=I420"
@@ -62,10 +62,10 @@ def decoding(path: str, fps: Fraction) -> str:
 
 
 def survey(path: Path, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
-    """Look a clip through.
+    """Analyse a clip.
 
-    on_note  called with a line: this takes a while
-    raises   UserError where it cannot be used
+    on_note  called with a line, since this takes a while
+    raises   UserError if it cannot be used
     """
     from runner.apply import discover
 
@@ -87,7 +87,7 @@ def survey(path: Path, cache: Cache, on_note: Callable[[str], None]) -> Sequence
 
 
 def _recorded(path: Path) -> bool:
-    """Whether `tod-runner record` made the clip, which loses nothing whatever the codec."""
+    """Whether `tod-runner record` made the clip, which is lossless with any codec."""
     try:
         cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]
         return path.name in {camera["file"] for camera in cameras.values()}
@@ -120,7 +120,7 @@ def _look_through(path: Path, fps: Fraction) -> dict[str, Any]:
 
 
 def as_filmed(camera: Camera, sequence: Sequence) -> tuple[Camera, str]:
-    """A camera at the size and rate of a sequence, and what that means for its bitrates, or ""."""
+    """A camera at the size and rate of a sequence, and a note on what that means for its bitrates, or ""."""
     size = (sequence.width, sequence.height)
     if size == camera.source_size:
         filmed = replace(camera, fps=sequence.fps)

@@ -15,7 +15,7 @@ from runner.rate_quality.metrics.interface import Luma
 class SiTi:
     """SI of each frame, and TI of each but the first.
 
-    P.910 speaks of the maximum over time; the mean tells more of a scene with a cut or a flash in it.
+    P.910 uses the maximum over time; the mean says more about a scene with a cut or a flash.
     """
 
     si: Sequence[float]
@@ -39,7 +39,7 @@ class SiTi:
 
 
 def measure(frames: Iterable[Luma]) -> SiTi:
-    """SI and TI of a clip, of which two frames are held at a time; 0 of what has too few frames."""
+    """SI and TI of a clip, of which two frames are held at a time; 0 if it has too few frames."""
     si: list[float] = []
     ti: list[float] = []
     before: Luma | None = None
@@ -61,7 +61,7 @@ def spatial(luma: Luma) -> float:
 
 
 def temporal(before: Luma, luma: Luma) -> float:
-    """Standard deviation over space of the difference to the frame before.
+    """Standard deviation over space of the difference from the frame before.
 
     TI = std_space(F_n - F_n-1)                                                         (ITU-T P.910, TI)
     """

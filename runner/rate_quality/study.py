@@ -1,4 +1,4 @@
-"""What is to be measured and how, valid once built."""
+"""What to measure and how, valid once built."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from runner.core.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain, suggest
 
-FEWEST_SCORED = 40  # frames; fewer make a mean that the next sequence does not confirm
+FEWEST_SCORED = 40  # frames; with fewer, the next sequence does not confirm the mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Study:
 
 
 def read_study(data: Mapping[str, Any]) -> Study:
-    """A study from what its schema has accepted.
+    """A study from data that its schema has accepted.
 
     raises  ModelError
     """
@@ -75,7 +75,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
 
 
 def check_cameras(study: Study, cameras: Sequence[str]) -> None:
-    """Whether the cameras that a study names are those that are measured.
+    """Check that the cameras that a study names are measured.
 
     raises  ModelError
     """
@@ -91,7 +91,7 @@ def check_cameras(study: Study, cameras: Sequence[str]) -> None:
 
 
 def check_size(study: Study, camera: Camera) -> None:
-    """Whether every factor leaves a picture that can be encoded.
+    """Check that every factor leaves a picture that can be encoded.
 
     raises  ModelError
     """
@@ -104,12 +104,12 @@ def check_size(study: Study, camera: Camera) -> None:
 
 
 def stride(study: Study, frames: int, key_interval: int) -> int:
-    """The metric sees every so many frames.
+    """Sampling interval of the metric, in frames.
 
     frames        of the sequence
-    key_interval  frames of a refresh wave, which the samples must not keep step with; 0: unknown
+    key_interval  frames of a refresh wave, with which the samples must not stay in step; 0: unknown
 
-    Fewer are left out of short sequences, so that at least 40 frames are scored where there are as many.
+    In short sequences fewer frames are skipped, so that at least 40 are scored if there are as many.
     """
     if study.plan == "full":
         return 1

@@ -1,4 +1,4 @@
-"""Measure the points that a plan asks for: tasks for an executor, results kept by content."""
+"""Measure the points that a plan requests: tasks for an executor, results cached by content."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runner.rate_quality.task import Cancelled, Task, run_task
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Mask, Metric
 
-LANES_VERSION = 2  # raise it with every change that changes scores
+LANES_VERSION = 2  # increment with every change that affects scores
 PIXELS_AT_ONCE = 16_000_000  # in the lanes of all tasks together, which keeps them below 2 GB
 
 
@@ -28,9 +28,9 @@ PIXELS_AT_ONCE = 16_000_000  # in the lanes of all tasks together, which keeps t
 class Sweep:
     """Measures points of one camera's sequence.
 
-    plan     the camera at the form of the sequence
+    plan     the camera at the size and rate of the sequence
     name     of the camera, for progress
-    encoder  versions of what encodes: part of what a point is kept by
+    encoder  versions of the encoding software: part of a point's cache key
     """
 
     name: str
@@ -50,10 +50,10 @@ class Sweep:
     _keys: dict[Lane, str] = field(default_factory=dict)
 
     def measure(self, lanes: Sequence[Lane], on_progress: Callable[[float], None]) -> list[Point]:
-        """Points of some lanes, from the cache or measured; each is kept as soon as its task is done.
+        """Points of some lanes, from the cache or measured; each is stored as soon as its task is done.
 
-        on_progress  called with the share of the work that is done, never falling
-        raises  RunError; what is finished by then stays in the cache
+        on_progress  called with the share of the work that is done, never decreasing
+        raises  RunError; points finished by then stay in the cache
         """
         points = [point for lane in lanes if (point := self._kept(lane))]
         self.found += len(points)
@@ -78,7 +78,7 @@ class Sweep:
             while waiting:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
-                    number = futures.pop(future)  # a cluster forgets what nobody holds, and need not find it again
+                    number = futures.pop(future)  # a cluster frees unreferenced results, and need not recover them
                     yield from future.result()
                     done.update(number, 1.0)
         finally:
@@ -113,7 +113,7 @@ class Sweep:
         compiled = compile_lanes(self.plan, self.clip.decode, self.plan.camera.full_roi, lanes)
         return Task(tuple(lanes), compiled, self.roi, self.clip.frames, self.stride, self.metrics, self.mask)
 
-    # --- what a point is kept by --------------------------------------------------------------------------------------
+    # --- cache keys ---------------------------------------------------------------------------------------------------
 
     def _key(self, lane: Lane) -> str:
         if lane not in self._keys:
@@ -137,7 +137,7 @@ class Sweep:
 
 
 class TaskProgress:
-    """The share of several tasks that is done; updated from any of their threads."""
+    """The share done of several tasks; updated from any of their threads."""
 
     def __init__(self, costs: Sequence[float], on_progress: Callable[[float], None]) -> None:
         self._costs, self._shares, self._on_progress = costs, [0.0] * len(costs), on_progress
@@ -145,7 +145,7 @@ class TaskProgress:
         self.cancelled = False
 
     def update(self, number: int, share: float) -> None:
-        """raises Cancelled where nobody waits for the task any more"""
+        """raises Cancelled if the task is no longer needed"""
         if self.cancelled:
             raise Cancelled
         with self._lock:

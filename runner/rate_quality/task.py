@@ -1,4 +1,4 @@
-"""The unit of work: some lanes of one camera, encoded, decoded and scored in whatever process this runs."""
+"""The unit of work: some lanes of one camera, encoded, decoded and scored in whichever process this runs."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from runner.rate_quality.curves import Point
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Metric, QualityMeter
 
-OVERHEAD = 0.1  # of an encoding at full size: what a lane costs whatever its size, decoding and looking at pictures
+OVERHEAD = 0.1  # of an encoding at full size: what a lane of any size costs, for decoding and scoring pictures
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """The unit of work: some lanes of one camera, decoded once. Travels to other processes and machines.
+    """The unit of work: some lanes of one camera, decoded once. Can be sent to other processes and machines.
 
     roi     part of the sequence's picture that is encoded
     frames  of the sequence
-    stride  the metrics look at every so many frames
+    stride  the metrics score every stride-th frame
     """
 
     lanes: tuple[Lane, ...]
@@ -37,8 +37,8 @@ class Task:
     mask: Mask | None
 
     def scored(self, frame: int) -> bool:
-        """Whether a frame is scored: from the middle of the first stride on, since the very first picture is no sample
-        of the others."""
+        """Whether a frame is scored: from the middle of the first stride on, since the very first picture does not
+        represent the others."""
         return frame % self.stride == self.stride // 2
 
     @property
@@ -48,13 +48,13 @@ class Task:
 
 
 class Cancelled(Exception):
-    """The person has had enough."""
+    """The user has cancelled."""
 
 
 def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: None) -> list[Point]:
     """Encode, decode and score all lanes of a task.
 
-    on_progress  called with the share that is done, a few times a second; an exception that it raises ends the task
+    on_progress  called with the share done, a few times a second; an exception that it raises ends the task
     raises  RunError
     """
     from runner.apply import run_lanes
@@ -91,7 +91,7 @@ def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: No
 
 
 class _References:
-    """Frames of the sequence that a lane may still have to be compared with."""
+    """Frames of the sequence that are still needed for comparison with a lane."""
 
     def __init__(self, task: Task) -> None:
         self._task = task
@@ -113,7 +113,7 @@ class _References:
             self._kept[frame] = (part, len(self._task.lanes))
 
     def take(self, frame: int) -> Luma:
-        """To be asked once by each lane."""
+        """To be called once by each lane."""
         with self._lock:
             luma, left = self._kept.pop(frame)
             if left > 1:
@@ -122,7 +122,7 @@ class _References:
 
 
 class _Scoring:
-    """Scores of one lane. A frame that the encoder left out shows what was there before, as it does on a screen."""
+    """Scores of one lane. A frame that the encoder left out shows the previous picture, as on a screen."""
 
     def __init__(self, task: Task, number: int) -> None:
         size = (task.roi.width, task.roi.height)
@@ -149,7 +149,7 @@ class _Scoring:
         return {name: tuple(scores[frame] for frame in sorted(scores)) for name, scores in found.items()}
 
     def _fill(self, end: int, references: _References) -> None:
-        """Score all frames before `end` with what is on the screen."""
+        """Score all frames before `end` with the picture on the screen."""
         for frame in range(self._next, end):
             if references.wanted(frame):
                 self._score(frame, references.take(frame))
@@ -169,7 +169,7 @@ def _enlarged(luma: Luma, size: tuple[int, int]) -> Luma:
     import cv2
     import numpy as np
 
-    cv2.setNumThreads(1)  # lanes run beside each other anyway
+    cv2.setNumThreads(1)  # lanes run in parallel anyway
     if luma.shape == size[::-1]:
         return np.ascontiguousarray(luma)
     enlarged: Luma = cv2.resize(luma, size, interpolation=cv2.INTER_CUBIC)  # type: ignore[assignment]

@@ -30,7 +30,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
     """Where tasks run.
 
     workers  threads or processes of this machine, or dask: a cluster
-    raises   RunError where Dask is not installed or its scheduler does not answer
+    raises   RunError if Dask is not installed or its scheduler does not answer
     """
     if workers == "dask":
         with _dask(scheduler, parallel) as executor:
@@ -41,7 +41,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
     if workers == "threads":
         pool = ThreadPoolExecutor(parallel)
     else:
-        # Idle workers would wait forever for a process that was killed.
+        # Idle workers would wait forever for a killed process.
         pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
     try:
         yield pool
@@ -51,7 +51,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
 
 @contextmanager
 def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
-    """An executor on a cluster: tasks of a worker that is lost are run by another."""
+    """An executor on a cluster: tasks of a lost worker are run by another."""
     try:
         from distributed import Client, LocalCluster
     except ImportError:
@@ -67,7 +67,7 @@ def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
 
 
 class _Cluster(Executor):
-    """A cluster whose tasks run without collection of cycles."""
+    """A cluster whose tasks run without cyclic garbage collection."""
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
@@ -77,7 +77,7 @@ class _Cluster(Executor):
 
 
 class _Collector:
-    """Python's collector of cycles, which several threads of a process may want still."""
+    """Keeps Python's cyclic garbage collector off while any thread of the process needs that."""
 
     def __init__(self) -> None:
         self._lock, self._users, self._was_on = threading.Lock(), 0, False
@@ -100,12 +100,12 @@ _collector = _Collector()
 
 
 def without_cycle_collection(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a function and leave cycles of garbage until the last such call of the process is over.
+    """Call a function without cyclic garbage collection, until the last such call of the process is over.
 
-    A Dask worker looks at the frames of its threads every few milliseconds. Where cycles are collected just then and a
-    thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them, wait
-    for themselves forever (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave
-    as few cycles, however many frames they see.
+    A Dask worker inspects the frames of its threads every few milliseconds. If cycles are collected at that moment and
+    a thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them,
+    deadlock (https://github.com/python/cpython/issues/106883). Tasks last seconds to minutes and leave few cycles,
+    however many frames they process.
     """
     with _collector:
         return function(*args, **kwargs)

@@ -1,6 +1,6 @@
 """The `synthetic` source: a procedural drive, rendered once into a cache as one clip per camera.
 
-The street repeats after one lap, so the last frame of a clip is followed by its first. This module shares the work out;
+The street repeats after one lap, so the last frame of a clip is followed by its first. This module divides the work;
 the street is in `world.py`, the picture in `picture.py`, the file in `gst/clip_writer.py`.
 """
 
@@ -23,7 +23,7 @@ from runner.clips import View, clip_path
 from runner.core.model import Progress
 
 SHORTEST_S = 4
-BYTES_PER_PIXEL = 0.15  # upper estimate of a clip's size, for the check of the disk
+BYTES_PER_PIXEL = 0.15  # upper estimate of a clip's size, for the check of disk space
 UNFINISHED = ".part"
 REPORT_EVERY_S = 0.25  # of drive
 
@@ -32,16 +32,16 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
     """Render the clips that the cache does not hold yet, one process per core.
 
     seconds   length of the drive, at least 4
-    progress  called with what is being done and the share of all pixels done, from 0 to 1 and never falling
+    progress  called with the current step and the share of all pixels done, from 0 to 1 and never decreasing
     raises    ValueError, RuntimeError (numba is missing, GStreamer or a worker failed), OSError (disk)
 
-    Unfinished files end in .part and go with the run, or with the next one if this one is killed.
+    Unfinished files end in .part and are removed by the run, or by the next one if this one is killed.
     """
     if seconds < SHORTEST_S:
         raise ValueError(f"seconds: {seconds:g}: must be at least {SHORTEST_S}")
     cache.mkdir(parents=True, exist_ok=True)
     with _only_renderer(cache, progress):
-        _remove_unfinished(cache)  # of a run that was killed
+        _remove_unfinished(cache)  # of a killed run
         missing = [view for view in dict.fromkeys(views) if not clip_path(view, seconds, cache).exists()]
         if missing:
             _need_numba()
@@ -55,7 +55,7 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
 
 @contextmanager
 def _only_renderer(cache: Path, progress: Progress) -> Iterator[None]:
-    """Hold the cache: a second run waits for the first and then finds its clips."""
+    """Lock the cache: a second run waits for the first and then finds its clips."""
     with (cache / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -80,7 +80,7 @@ def _pixels(view: View, seconds: float) -> int:
 
 
 def _need_space(views: Sequence[View], seconds: float, cache: Path) -> None:
-    """Refuse to start what would fill the disk."""
+    """Refuse to start if this would fill the disk."""
     from runner.synthetic.world import WORLD_BYTES
 
     need = BYTES_PER_PIXEL * sum(_pixels(view, seconds) for view in views) + WORLD_BYTES
@@ -102,7 +102,7 @@ def _render_missing(views: Sequence[View], seconds: float, cache: Path, progress
 
 
 def _share_out(views: Sequence[View], seconds: float, cache: Path, world: Path, progress: Progress) -> None:
-    """Hand views to workers and add up what they report; they are gone when this returns or raises."""
+    """Hand views to workers and add up their reports; the workers have ended when this returns or raises."""
     total = sum(_pixels(view, seconds) for view in views)
     waiting = list(views)
     done = clips = 0
@@ -151,7 +151,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
 
 
 def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
-    """A worker's life: views in, reports out; the parent handles Ctrl-C, then ends the worker."""
+    """A worker's main loop: views in, reports out; the parent handles Ctrl-C, then ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -169,7 +169,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
 
 
 def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: Callable[[int], None]) -> None:
-    """Render into a file beside the clip and rename it: a clip is there in full or not at all."""
+    """Render into a file beside the clip and rename it: a clip is complete or does not exist."""
     from runner.apply import write_clip
     from runner.synthetic.picture import pictures
 

@@ -1,9 +1,9 @@
-"""What a camera sees of the street: one ray per pixel, fixed to the vehicle, traced on two levels.
+"""A camera's view of the street: one ray per pixel, fixed to the vehicle, traced on two levels.
 
 Seen from above, every upright face covers a range of azimuths: per frame, `cover` sorts the nearest ones into a table
-of azimuths. A ray then walks through the faces at its azimuth; what it misses is the ground or the sky. Rays are traced
-for every second pixel of every second row; between four that hit the same surface the place in the texture is
-interpolated, at edges every pixel is traced.
+of azimuths. A ray then walks through the faces at its azimuth; if it misses them all, it hits the ground or the sky.
+Rays are traced for every second pixel of every second row; between four that hit the same surface the place in the
+texture is interpolated, at edges every pixel is traced.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from runner.synthetic.world import (
 )
 
 AZIMUTHS = 8192  # about a pixel of the sharpest usual view, 1920 over 90 degrees
-LAYERS = 20  # faces kept per azimuth; a farther one is not seen
+LAYERS = 20  # faces kept per azimuth; a farther one is not visible
 index = np.uintp  # tells the compiler that an index is not negative, i.e. does not count from the end
 OWN_BODY = (((-0.95, -0.96, 0.3), (3.65, 0.96, 1.0)), ((-0.85, -0.8, 1.0), (2.3, 0.8, 1.68)))  # m, two corners each
-GLOSS = 70  # light of the sky in its paint, of 256
+GLOSS = 70  # light of the sky reflected in its paint, of 256
 SOFT = 1.5  # levels per doubling of distance instead of 1: the lens resolves less far away, and nothing flickers there
 SKY_M = 12.0  # height of the clouds, in metres of their texture
 
@@ -70,7 +70,7 @@ class Texels(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What a ray can meet in one frame; see `cover`, `Faces` and `Atlas`."""
+    """Everything that a ray can hit in one frame; see `cover`, `Faces` and `Atlas`."""
 
     layers: Array
     planes: Array
@@ -109,7 +109,7 @@ def focal_px(view: View) -> float:
 
 
 def cast_rays(view: View, ground_per_m: float, sky_per_m: float) -> Rays:
-    """All that does not change from frame to frame; *_per_m are texels of level 0."""
+    """Everything that does not change from frame to frame; *_per_m are texels of level 0."""
     x, y, z = np.moveaxis(directions(view), -1, 0)
     own = hits_own_body(view.pose, x, y, z) if view.lens == "fisheye" else np.zeros(x.shape, bool)
     flat = np.maximum(np.hypot(x, y), 1e-5)
@@ -119,7 +119,7 @@ def cast_rays(view: View, ground_per_m: float, sky_per_m: float) -> Rays:
     texels = np.where(per_m > 0, ground_per_m, sky_per_m * SKY_M / view.pose.z_m) / np.abs(per_m)
     plane = np.stack([x * texels, y * texels])
     steps = [np.hypot(*np.gradient(plane, 2.0, axis=axis)) for axis in (1, 2)]
-    # Between the sides of a pixel's footprint: the longer one blurs the road ahead, the shorter one lets it flicker.
+    # Between the sides of a pixel's footprint: the longer one blurs the road ahead, the shorter one makes it flicker.
     size = np.maximum(*steps) ** 0.85 * np.minimum(*steps) ** 0.15
     level = np.clip(np.floor(SOFT * np.log2(np.maximum(size, 1e-3)) + 0.85), 0, LEVELS - 1).astype(np.int32)
     level = np.where(own, -1, level).astype(np.int32)
@@ -181,9 +181,9 @@ def cover(
 ) -> None:  # fmt: skip
     """For each azimuth the faces that it meets, nearest first, as face * 16 + mip level; -1 ends the list.
 
-    distance  room for the distances of the same faces
-    planes    out: [face, (nx, ny, tx, ty)]: a ray r meets the face at distance 1 / (n . r), and there the texture's
-              place is t . r times that distance
+    distance  buffer for the distances of the same faces
+    planes    out: [face, (nx, ny, tx, ty)]: a ray r meets the face at distance 1 / (n . r), and the place in the
+              texture is t . r times that distance
     pixel     radians that a pixel covers
     """
     layers[:] = -1
@@ -232,7 +232,7 @@ def cover(
 def draw(luma: Array, chroma_u: Array, chroma_v: Array, rays: Rays, scene: Scene) -> None:
     """Fill one picture, block by block of 2x2 pixels between four traced rays."""
     rows, columns = chroma_u.shape
-    hits = np.empty((2, 3, columns + 1), np.int32)  # above and below the row of blocks at hand, in turn
+    hits = np.empty((2, 3, columns + 1), np.int32)  # above and below the current row of blocks, in turn
     edges, single = np.empty(columns, np.int32), np.empty((3, 4 * columns), np.int32)
     slopes, tables = np.empty((3, 4 * columns), np.float32), np.empty((2, 4 * columns), np.int32)
     trace(rays.x[0], rays.y[0], rays.per_m[0], rays.azimuth[0], rays.level[0], scene, hits[0])
@@ -248,7 +248,7 @@ def draw(luma: Array, chroma_u: Array, chroma_v: Array, rays: Rays, scene: Scene
 
 @compiled
 def trace(x: Array, y: Array, per_m: Array, azimuth: Array, level: Array, scene: Scene, hits: Array) -> None:
-    """What each of a row of rays meets.
+    """What each ray of a row hits.
 
     level  for the ground and the sky
     hits   out: [surface, place along, place up][ray]; surface is (texture, mip level, light) in one number, the place
@@ -305,7 +305,7 @@ def trace(x: Array, y: Array, per_m: Array, azimuth: Array, level: Array, scene:
 def fill_blocks(
     hits: Array, top: int, atlas: Texels, luma: Array, chroma_u: Array, chroma_v: Array, edges: Array
 ) -> int:
-    """Fill the blocks whose four corners lie on one surface, and of the others what their own ray met.
+    """Fill the blocks whose four corners lie on one surface, and of the others only the chroma that their own ray hit.
 
     hits     of two rows, `top` is the index of the upper one
     luma     out: two rows of pixels
@@ -324,7 +324,7 @@ def fill_blocks(
         chroma_u[i] = 128 + (((texels_u[at] - 128) * shade) >> 8)
         chroma_v[i] = 128 + (((texels_v[at] - 128) * shade) >> 8)
         same = surface == hits[top, 0, i + 1] and surface == hits[low, 0, i] and surface == hits[low, 0, i + 1]
-        # Far apart on one surface: the texture starts again between them, or another piece of it stands in front.
+        # Far apart on one surface: the texture repeats between them, or another piece of it is in front.
         near = abs(u - hits[low, 1, i + 1]) + abs(hits[top, 1, i + 1] - hits[low, 1, i]) < 6144
         if not (same and near) or TREE <= texture <= RAILING:
             edges[count] = i
@@ -361,7 +361,7 @@ def cast_between(rays: Rays, j: int, edges: Array, slopes: Array, tables: Array)
 
 @compiled
 def fill_edges(edges: Array, hits: Array, atlas: Texels, luma: Array) -> None:
-    """Fill all four pixels of some blocks; at the rim of a cut-out the nearest texel counts alone."""
+    """Fill all four pixels of some blocks; at the rim of a cut-out only the nearest texel counts."""
     texels, bases, log2_width, log2_height = atlas.luma, atlas.base, atlas.log2_width, atlas.log2_height
     for n in range(len(edges)):
         for corner in range(4):

@@ -2,7 +2,7 @@
 
 The course is one lap of an endless street, each lap shifted by `period_m` in x: that closes the loop
 without the full turn of a ring road, where every camera would pan most of the time and a forward one would see nearly
-as much motion as one that looks aside.
+as much motion as one that looks sideways.
 Axes as in ROS REP 103: x along the street, y left, z up; d is the offset left of the centre line. Metres, radians.
 """
 
@@ -28,7 +28,7 @@ LANE_D = -1.2  # the vehicle keeps right
 PARKING_D, ROAD_D, PAVEMENT_D, WALL_D = 3.1, 5.1, 6.6, 7.7  # where parking begins (left only), and where each ends
 HEDGE_D, TREE_D = 6.8, 6.0
 TIGHTEST_M = 14.0  # bend radius of the centre line; above WALL_D, or the inner wall would fold
-VISIBLE_M = 140.0  # the street is repeated that far
+VISIBLE_M = 140.0  # the street is repeated this far
 SUN = np.array([0.5, -0.87])  # horizontal direction to the sun
 SUN_SLOPE = 1.8
 LEVELS = 8  # mip levels of each texture; its sides are at least 2**LEVELS texels
@@ -41,7 +41,7 @@ BOXES = ((VAN, 5.0, 1.9, 2.35), (RED, 4.3, 1.8, 1.55), (BLUE, 4.5, 1.8, 1.5))
 
 
 def compiled(function: F) -> F:
-    """Compile with numba; the machine code is kept on disk for the next run."""
+    """Compile with numba; the machine code is cached on disk for the next run."""
     return cast(F, njit(cache=True, fastmath=True, nogil=True)(function))
 
 
@@ -65,7 +65,7 @@ class Course:
         return float(self.x[-1])
 
     def at(self, share: float) -> tuple[float, float, float]:
-        """Position and heading of the vehicle when that share of the drive, in [0, 1], is done."""
+        """Position and heading of the vehicle after that share of the drive, in [0, 1]."""
         s = share * self.laps % 1 * self.length_m
         x, y, psi = (float(np.interp(s, self.s, values)) for values in (self.x, self.y, self.psi))
         return x - LANE_D * math.sin(psi), y + LANE_D * math.cos(psi), psi
@@ -110,7 +110,7 @@ class Atlas:
 
 
 def open_atlas(course: Course, file: Path, mode: Literal["r", "w+"]) -> Atlas:
-    """Map the file with the textures into memory, to read or anew."""
+    """Map the file with the textures into memory, for reading or as a new one."""
     sizes = np.array(LOG2_SIZE)
     sizes[GROUND, 0], sizes[WALL, 0] = course.log2_columns, course.log2_columns + 1
     areas = [1 << (w + h - 2 * level) for w, h in sizes for level in range(LEVELS)]
@@ -156,7 +156,7 @@ def build_world(seconds: float, file: Path) -> None:
         for texture in range(WALL, len(LOG2_SIZE)):
             shrink(atlas, texture)
 
-    with ThreadPoolExecutor() as pool:  # compiled code runs side by side
+    with ThreadPoolExecutor() as pool:  # compiled code runs in parallel
         for half in [pool.submit(ground), pool.submit(upright)]:
             half.result()
 
@@ -170,7 +170,7 @@ def shrink(atlas: Atlas, texture: int) -> None:
 
 @compiled
 def halve(picture: Array, smaller: Array) -> None:
-    """Mean of each 2x2 texels, of the opaque ones alone."""
+    """Mean of each 2x2 texels, of the opaque ones only."""
     for j in range(smaller.shape[0]):
         for i in range(smaller.shape[1]):
             total = opaque = 0
@@ -186,7 +186,7 @@ def halve(picture: Array, smaller: Array) -> None:
 
 
 def fractal_noise(size: int, finest: float = 2) -> Array:
-    """Tile of noise with as much contrast in each octave, as surfaces of stone and plants have; mean 0, deviation 1.
+    """Tile of noise with equal contrast in each octave, like surfaces of stone and plants; mean 0, deviation 1.
 
     finest  texels of the shortest wave in it
     """
@@ -200,7 +200,7 @@ def fractal_noise(size: int, finest: float = 2) -> Array:
 
 @compiled
 def chance(a: int, b: int) -> float:
-    """A number in [0, 1[ that depends on nothing but a and b."""
+    """A number in [0, 1[ that depends only on a and b."""
     h = (a * 374761393 + b * 668265263 + 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
@@ -389,7 +389,7 @@ def draw_things(atlas: Atlas, noise: Array, soft: Array) -> None:
     trunk = (np.abs(x - 3.5) < 0.16 - 0.02 * z) & (z < 4)
     leaves = 78 + 14 * noise[256:768, 256:768] + 6 * soft[256:768, 256:768] + 7 * (z - 3)
     luma[:] = np.where(crown, np.clip(leaves, 20, 200), np.where(trunk, 62 + 10 * noise[:512, 512:], 0))
-    green = (z > 2.2)[::2, ::2]  # also what is transparent: chroma is coarser than the rim of the leaves
+    green = (z > 2.2)[::2, ::2]  # also transparent texels: chroma is coarser than the rim of the leaves
     u[:], v[:] = np.where(green, 108, 124), np.where(green, 117, 134)
     luma, u, v = level_of(atlas, LAMP, 0)
     x, z = x[:, :256] - 1.75, z[:, :256]
@@ -441,8 +441,8 @@ class Faces:
     """Upright rectangles from a to b, standing on the ground; walls come first.
 
     ends     [face, (ax, ay, bx, by)]
-    along_m  where in its texture the face begins
-    shade    256 is the texture's own light
+    along_m  where the face begins in its texture
+    shade    256 is the texture's own brightness
     box      number of the box that the face belongs to, -1 for none
     """
 
@@ -483,7 +483,7 @@ FaceRow = tuple[float, ...]  # ax, ay, bx, by, along_m, height_m, texture, shade
 def face(
     a: tuple[float, float], b: tuple[float, float], along: float, height: float, texture: int, box: int
 ) -> FaceRow:
-    """One face, lit by the sun if its right-hand side (seen from a to b) is turned to it."""
+    """One face, lit by the sun if its right-hand side (seen from a to b) faces it."""
     direction = np.array([b[1] - a[1], a[0] - b[0]]) / max(math.dist(a, b), 1e-9)
     light = 256 * (0.86 + 0.16 * max(0.0, float(direction @ SUN)))
     return (*a, *b, along, height, texture, light, box)
@@ -531,7 +531,7 @@ def at_offset(course: Course, s: float, d: float) -> tuple[float, float, float]:
 
 
 def parked(course: Course, s: float, d: float, box: int, kind: tuple[int, float, float, float]) -> list[FaceRow]:
-    """The four sides of a box, anticlockwise, so that each one's right-hand side looks outward."""
+    """The four sides of a box, anticlockwise, so that each one's right-hand side faces outward."""
     texture, length, width, height = kind
     x, y, psi = at_offset(course, s, d)
     forward = np.array([math.cos(psi), math.sin(psi)])
@@ -552,7 +552,7 @@ def strip(course: Course, s: float, d: float, texture: int, height: float) -> li
 
 
 def upright(course: Course, s: float, d: float, texture: int, width: float, height: float) -> list[FaceRow]:
-    """Two crossed cut-outs, so that a tree is one from every side."""
+    """Two crossed cut-outs, so that a tree looks like one from every side."""
     x, y, psi = at_offset(course, s, d)
     rows: list[FaceRow] = []
     for turn in (0.6, 0.6 + math.pi / 2):

@@ -1,7 +1,7 @@
 """usage: python -I -S bound.py PARENT COMMAND [WORD ...]
 
-Runs a command that the kernel kills when the process PARENT ends, however that ends (prctl(2), PR_SET_PDEATHSIG).
-It is the thread that started this which must live on: the kernel looks at threads.
+Runs a command that the kernel kills when the process PARENT ends for any reason (prctl(2), PR_SET_PDEATHSIG).
+The thread that started this must stay alive: the kernel tracks threads, not processes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def die_with(parent: int) -> None:
-    """Have this process killed when its parent ends; at once where it has ended already."""
+    """Have this process killed when its parent ends; at once if it has already ended."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # it ended before the kernel knew
         os.kill(os.getpid(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Child processes that do not outlive this one, however it ends, and that are never waited for without a limit."""
+"""Child processes that do not outlive this one, however it ends, and that are never waited for without a timeout."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ KILLED_S = 1.0  # a killed process is gone by then, unless the kernel itself hol
 
 
 def bound(command: Sequence[str]) -> list[str]:
-    """A command of any program that the kernel kills when this process, or the thread that starts it, ends."""
+    """The command wrapped so that the kernel kills it when this process, or the thread that starts it, ends."""
     launcher = str(Path(__file__).with_name("bound.py"))
     return [sys.executable, "-I", "-S", launcher, str(os.getpid()), *command]
 
 
 def environment() -> dict[str, str]:
-    """This process's environment, in which `python -m runner` finds this package from any directory."""
+    """This process's environment, extended so that `python -m runner` finds this package from any directory."""
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def end(process: subprocess.Popen[bytes] | subprocess.Popen[str], within_s: float) -> bool:
-    """Wait for a process that was asked to end, and kill it after a time.
+    """Wait for a process that was asked to end, and kill it after a timeout.
 
     returns  whether it ended by itself
     """
@@ -54,14 +54,14 @@ def ending(status: int) -> str:
 
 
 class VerbProcess:
-    """A verb as a process with the same Python. It ends in an orderly way when it is asked to or this process ends.
+    """A verb as a child process. It shuts down in an orderly way when asked to, or when this process ends.
 
-    A pipe whose other end this process holds tells it both. Signals of the terminal reach this process alone, which
-    decides what ends first.
+    A pipe whose other end this process holds signals both. Terminal signals reach only this process, which decides
+    what ends first.
 
-    name    for people
-    before  comes before its command line
-    stderr  file that takes its standard error; None: it goes where this process's goes
+    name    for messages
+    before  prefix of its command line
+    stderr  file for its standard error; None: the same as this process's
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class VerbProcess:
         return self.process.poll()
 
     def check(self) -> None:
-        """raises RunError where it has ended, with its error output"""
+        """raises RunError if it has ended, with its error output"""
         status = self.poll()
         if status is None:
             return
@@ -96,7 +96,7 @@ class VerbProcess:
         raise RunError(f"{self.name} ended early ({ending(status)})" + (f":\n{text}" if text else ""))
 
     def ask(self) -> None:
-        """Ask it to end; more than once does no harm."""
+        """Ask it to end; asking again does no harm."""
         if self._lifeline >= 0:
             os.close(self._lifeline)
             self._lifeline = -1

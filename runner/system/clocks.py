@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-CLOCKS_APART_MS = -1.0  # an age below it shows that the vehicle's clock is ahead; above it, it is noise
-TRUSTED_AGAIN_S = 10.0  # for so long no age may be negative before ages are known again
+CLOCKS_APART_MS = -1.0  # an age below it shows that the vehicle's clock is ahead; a negative age above it is noise
+TRUSTED_AGAIN_S = 10.0  # time without a negative age before ages are known again
 CURRENT_S = 1.0  # an older picture has no current age
 
 
@@ -15,14 +15,14 @@ CURRENT_S = 1.0  # an older picture has no current age
 class Clocks:
     """Whether the ages of pictures are known: each is the difference of two machines' clocks.
 
-    A negative age shows that the vehicle's clock is ahead, by at least as much. All ages are too small then: unknown.
-    A clock that is behind makes them too large; this is not detectable.
+    A negative age shows that the vehicle's clock is ahead, by at least as much. All ages are then too small, and
+    treated as unknown. A clock that is behind makes them too large; this is not detectable.
 
     ahead_ms  by how much the vehicle's clock is ahead at least; None: not detected
     """
 
     ahead_ms: float | None = None
-    _negative: float = field(default=float("-inf"))  # when an age was negative last
+    _negative: float = field(default=float("-inf"))  # when an age was last negative
     _frames: dict[str, tuple[int, float]] = field(default_factory=dict)  # by camera, the count and when it last rose
 
     def checked(self, t: float, samples: Mapping[str, Any]) -> dict[str, Any]:

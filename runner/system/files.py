@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and one that another package brings."""
+"""Atomic writing of files, limited reading, and a file from another package."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runner.system.signals import urgent
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[Path]:
-    """Another name to write a file under; what is there at the end takes its place, what ends early is removed."""
+    """A temporary name to write `path` under; the finished file then replaces `path`, an unfinished one is removed."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
     with urgent(lambda: part.unlink(missing_ok=True)):
         try:
@@ -27,13 +27,13 @@ def unfinished(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(path: Path, argument: str = "output", *, partly: bool = False) -> Iterator[TextIO]:
-    """A text file for `argument` of the command line, there when it is whole.
+    """A text file for `argument` of the command line, written atomically.
 
-    What is there and no file, such as /dev/null, is written to as it is. What was there before stays where the writing
+    An existing path that is not a file, such as /dev/null, is written to directly. An existing file is kept if writing
     ends early.
 
-    partly  keep what was written before a mistake in the input, a UserError
-    raises  UserError where it cannot be opened, RunError where it cannot be written
+    partly  keep the output up to an error in the input, a UserError
+    raises  UserError if it cannot be opened, RunError if it cannot be written
     """
     mistake = None
     try:
@@ -61,7 +61,7 @@ def _opened(part: Path, path: Path, argument: str) -> TextIO:
 
 
 def file_problem(path: Path) -> str:
-    """The rule that a path breaks which names no regular file: a device, a pipe or a directory is none."""
+    """The rule broken by a path that names no regular file: a device, a pipe or a directory is not one."""
     return "must be a file" if path.exists() else "no such file"
 
 
@@ -83,7 +83,7 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """A file that is there wholly or not at all.
+    """Write a file atomically.
 
     raises  RunError
     """
@@ -96,9 +96,9 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def plotly_script(extra: str) -> Path:
-    """The script that plotly's wheel brings.
+    """The script in plotly's wheel.
 
-    extra   of this package, that installs it
+    extra   of this package, which installs it
     raises  RunError
     """
     spec = find_spec("plotly")

@@ -1,14 +1,14 @@
 """SIGINT and SIGTERM, the same for every verb.
 
-The first signal asks the verb to end. It raises KeyboardInterrupt in the main thread or, after `stopping`, sets what
-the verb looks at. A second signal ends the process at once, and so does an orderly end that takes longer than its
-limit; files are then still whole or not there, since `urgent` says what must be cleaned up.
+The first signal asks the verb to end. It raises KeyboardInterrupt in the main thread or, after `stopping`, sets a
+`Stop` that the verb checks. A second signal ends the process at once, and so does a shutdown that takes longer than its
+limit; files are then still complete or absent, since `urgent` registers what must be cleaned up.
 
 No handler does any of this. The interpreter writes the number of each signal to a pipe (signal.set_wakeup_fd), and a
-thread reads it there: nothing is entered again by a second signal, and a main thread that is busy in a C library
-delays nothing.
+thread reads it there: a second signal cannot interrupt the handling of the first, and a main thread that is busy in a C
+library delays nothing.
 
-A process with a lifeline (see `runner.system.children`) takes the end of its parent as SIGTERM.
+A process with a lifeline (see `runner.system.children`) treats the end of its parent as SIGTERM.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end the parent holds
-END_S = 2.0  # how long an orderly end may take
-URGENT_S = 0.5  # how long it may take to clean up where there is no orderly end
+END_S = 2.0  # how long an orderly shutdown may take
+URGENT_S = 0.5  # how long cleanup may take without an orderly shutdown
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 Action = Callable[[], object]
@@ -33,7 +33,7 @@ Action = Callable[[], object]
 class Stop:
     """Set when the verb is to end. May be used from any thread.
 
-    limit_s  how long the end may take from then on; None: as long as it takes
+    limit_s  how long the shutdown may take from then on; None: unlimited
     action   called once when it is set, from another thread
     """
 
@@ -46,7 +46,7 @@ class Stop:
 
     @property
     def status(self) -> int:
-        """Exit status of a verb whose ordinary end this is: 130 for Ctrl-C, 0 for SIGTERM and where nothing came."""
+        """Exit status of a verb that normally ends this way: 130 for Ctrl-C, 0 for SIGTERM or without a signal."""
         return 128 + signal.SIGINT if self.is_set() and _watch.number == signal.SIGINT else 0
 
     def set(self) -> None:
@@ -55,12 +55,12 @@ class Stop:
             self._action()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until it is set, for some time at most; returns whether it is."""
+        """Wait until it is set or the timeout has passed; returns whether it is set."""
         return self._event.wait(timeout_s)
 
 
 class _Watch:
-    """What came of signals so far in this process, and the thread that reads them."""
+    """The signals that this process has received so far, and the thread that reads them."""
 
     def __init__(self) -> None:
         self.number = 0  # of the first signal
@@ -72,7 +72,7 @@ class _Watch:
 
     @contextmanager
     def handled(self) -> Iterator[None]:
-        """Take the signals, and give them back at the end."""
+        """Handle the signals, and restore the previous handlers at the end."""
         self.number, self.stop, self._deadline = 0, Stop(), None
         self.delivered = self.interrupted = False
         read, write = os.pipe()
@@ -126,7 +126,7 @@ class _Watch:
         self.ask()
 
     def ask(self) -> None:
-        """Let the verb end: the time for it runs from now on. From any thread."""
+        """Ask the verb to end: its time limit starts now. From any thread."""
         stop = self.stop
         limit_s = stop.limit_s if stop else END_S
         self._deadline = None if limit_s is None else time.monotonic() + limit_s
@@ -136,19 +136,19 @@ class _Watch:
             stop.set()
 
     def _wake(self) -> None:
-        """Let the thread look at what has changed."""
-        with suppress(BlockingIOError):  # the pipe is full: it is about to look anyway
+        """Make the thread check what has changed."""
+        with suppress(BlockingIOError):  # the pipe is full: it is about to check anyway
             os.write(self._wakeup, b"\0")
 
     def _left_ms(self) -> float | None:
         return None if self._deadline is None else max(0.0, 1000 * (self._deadline - time.monotonic())) + 1
 
     def _end(self, why: str) -> None:
-        """End the process here and now: no thread is waited for and no library is asked."""
+        """End the process at once, without waiting for threads or calling libraries."""
         cleaning = threading.Thread(target=self._clean, daemon=True)
         cleaning.start()
         cleaning.join(URGENT_S)
-        if select.select([], [2], [], 0)[1]:  # nobody may read there
+        if select.select([], [2], [], 0)[1]:  # its reader may have stopped reading
             with suppress(OSError):
                 os.write(2, f"{why}\n".encode())
         os._exit(128 + self.number)
@@ -164,7 +164,7 @@ _watch = _Watch()
 
 @contextmanager
 def handled() -> Iterator[None]:
-    """Within, signals are taken, and interrupt what is `interruptible`. Outside the main thread this does nothing."""
+    """Within, signals are handled, and interrupt `interruptible` code. Outside the main thread this does nothing."""
     if threading.current_thread() is threading.main_thread():
         with _watch.handled():
             yield
@@ -174,9 +174,9 @@ def handled() -> Iterator[None]:
 
 @contextmanager
 def stopping(limit_s: float | None = END_S, action: Action = lambda: None) -> Iterator[Stop]:
-    """From here on a signal interrupts nothing but sets what this yields, and the verb ends in an orderly way.
+    """From here on a signal interrupts nothing but sets the yielded `Stop`, and the verb shuts down in an orderly way.
 
-    What comes behind the block is taken for a part of that end, unless it is `interruptible`.
+    Code after the block counts as part of that shutdown, unless it is `interruptible`.
 
     limit_s, action  see `Stop`
     """
@@ -193,9 +193,9 @@ def stopping(limit_s: float | None = END_S, action: Action = lambda: None) -> It
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Within, a signal raises KeyboardInterrupt; one that came before does so at once.
+    """Within, a signal raises KeyboardInterrupt; one that was received before does so at once.
 
-    Libraries in C make other errors of it; what they raise is taken for it.
+    C libraries may turn it into other exceptions, which are treated as a KeyboardInterrupt.
     """
     stop, _watch.stop = _watch.stop, None
     try:
@@ -214,7 +214,7 @@ def interruptible() -> Iterator[None]:
 def hold() -> None:
     """From here on a signal raises nothing before the next `check`.
 
-    For what comes before `stopping` and uses PyGObject, which crashes where an exception comes from inside it.
+    For code before `stopping` that uses PyGObject, which crashes if an exception is raised inside it.
     """
     _watch.stop = Stop()
     if _watch.number:
@@ -223,7 +223,7 @@ def hold() -> None:
 
 @contextmanager
 def urgent(action: Action) -> Iterator[None]:
-    """Within, what is to be done, quickly and from any thread, before the process ends without an orderly end."""
+    """Within, an action to run, quickly and from any thread, if the process ends without an orderly shutdown."""
     _watch.urgent.append(action)
     try:
         yield
@@ -234,18 +234,18 @@ def urgent(action: Action) -> Iterator[None]:
 def check() -> None:
     """For loops that wait while a signal interrupts nothing, after `hold` and `stopping`.
 
-    raises  KeyboardInterrupt, in the main thread alone, where the verb is to end
+    raises  KeyboardInterrupt, only in the main thread, if the verb is to end
     """
     if _watch.stop and _watch.stop.is_set() and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
 
 
 def received() -> int:
-    """The first signal that came, 0 for none."""
+    """The first signal received, 0 for none."""
     return _watch.number
 
 
 def _lifeline() -> int | None:
-    """The descriptor that the parent gave; not for children of this process."""
+    """The descriptor passed by the parent; not passed on to children of this process."""
     number = os.environ.pop(LIFELINE, "")
     return int(number) if number.isdecimal() else None

@@ -1,1 +1,1 @@
-"""The vehicle's side while it drives."""
+"""The vehicle's side while driving."""

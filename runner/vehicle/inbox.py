@@ -1,4 +1,4 @@
-"""What waits for the vehicle's loop: bounded, fair between senders, in order for each of them."""
+"""Requests queued for the vehicle's loop: bounded, fair between senders, in order for each of them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 from runner.records import Outcome
 
-WAITING = 64  # requests of one sender; further ones are refused
+WAITING = 64  # queued requests of one sender; further ones are refused
 ROUND_S = 0.1
-TAKEN = 32  # requests of one sender that are taken in a round: a flood leaves the processor to others
-SENDERS = 64  # senders with requests waiting; those of a further one are refused
+TAKEN = 32  # requests taken from one sender per round: a flood leaves CPU time to others
+SENDERS = 64  # senders with queued requests; requests of further senders are refused
 MODE_CHANGING = "mode_selected"
 MEASUREMENTS = ("position_reported", "bitrate_predicted", "link_measured")  # only the newest one counts
 
@@ -24,7 +24,7 @@ class Request(NamedTuple):
     """An event as JSON without `t`, and how to answer it.
 
     sender  operator's id from the topic; "" for this process
-    as_of   see `runner.vehicle.operators`; None for a sender that need not say it: this process
+    as_of   see `runner.vehicle.operators`; None for a sender that need not state it: this process
     """
 
     sender: str
@@ -34,7 +34,7 @@ class Request(NamedTuple):
 
     @property
     def measures(self) -> tuple[Any, Any] | None:
-        """What it measures, where a newer measurement makes it worthless."""
+        """The quantity it measures, if a newer measurement supersedes it."""
         name = self.document.get("event")
         return (name, self.document.get("camera")) if name in MEASUREMENTS else None
 
@@ -42,8 +42,8 @@ class Request(NamedTuple):
 class Inbox:
     """Requests of all senders, one of each in turn. May be used from any thread.
 
-    Requests are never merged or reordered, except that a measurement takes the place of an older one of the same
-    quantity, unless a request in between changes the mode.
+    Requests are never merged or reordered, except that a measurement replaces an older one of the same quantity,
+    unless a request in between changes the mode.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Inbox:
         self._round_ends = 0.0
 
     def put(self, request: Request) -> Request | None:
-        """Queue a request; returns the one that is refused for it: itself, an older measurement, or None."""
+        """Queue a request; returns the one that is refused as a result: itself, an older measurement, or None."""
         with self._filled:
             waiting = self._waiting.get(request.sender)
             if waiting is None:
@@ -72,7 +72,7 @@ class Inbox:
             return superseded
 
     def wake(self) -> None:
-        """Let `get` return though nothing has come."""
+        """Make `get` return although nothing has arrived."""
         with self._filled:
             self._woken = True
             self._filled.notify()
@@ -82,7 +82,7 @@ class Inbox:
         return len(self._waiting.get(sender, ())) >= WAITING
 
     def get(self, until: float) -> Request | None:
-        """The next request, as soon as there is one; None once woken or after a time of `time.monotonic()`."""
+        """The next request, as soon as there is one; None once woken or after `until`, by `time.monotonic()`."""
         with self._filled:
             while True:
                 now = time.monotonic()

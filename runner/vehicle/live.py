@@ -1,7 +1,7 @@
-"""A vehicle that streams: cameras, loop and control link together. The verb `vehicle` runs it; so may your program.
+"""A streaming vehicle: cameras, loop and control link together. The verb `vehicle` uses it; so may a program.
 
 with live_vehicle(["source=appsrc"]) as vehicle:
-    vehicle.start()                               # the loop runs in a thread of its own
+    vehicle.start()                               # the loop runs in its own thread
     while driving:
         vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
 """
@@ -33,16 +33,16 @@ from runner.vehicle.loop import ControlLoop
 if TYPE_CHECKING:
     from runner.apply import VehicleSide
 
-STUCK_S = 2.0  # a loop that finishes nothing for so long is stuck
-WATCH_S = 0.25  # how often that is looked at
-END_S = 5.0  # a loop that does not end within this is left behind
-NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none of this name came by then, the name is free
+STUCK_S = 2.0  # a loop that finishes nothing for this long is stuck
+WATCH_S = 0.25  # how often that is checked
+END_S = 5.0  # a loop that does not end within this is abandoned
+NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none has come by then, the name is free
 CONSOLE_LINES = 1000
 TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
 
 
 class LiveVehicle:
-    """The parts of a vehicle that streams.
+    """The parts of a streaming vehicle.
 
     side     the cameras
     loop     events in, commands out; `loop.post` takes events from any thread
@@ -57,14 +57,14 @@ class LiveVehicle:
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
     def start(self) -> None:
-        """Run the loop in a thread, until the vehicle is left."""
+        """Run the loop in a thread, until the vehicle is stopped."""
         self._thread = threading.Thread(target=self._run_in_thread, name="loop", daemon=True)
         self._thread.start()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Run the loop here, until `stop` or for a time.
+        """Run the loop here, until `stop` or for a given time.
 
-        raises  RunError where the vehicle had to end, as where another one has its name
+        raises  RunError if the vehicle had to end, for example because another one has its name
         """
         self._watchdog.start()
         try:
@@ -85,8 +85,8 @@ class LiveVehicle:
         """One frame of a camera whose source is `appsrc`, captured now.
 
         frame    I420 of the camera's (native) size: width * height * 3 / 2 bytes
-        returns  False where nobody watches, so that the frame went nowhere
-        raises   ValueError for a frame of another length or an unknown camera
+        returns  False if nobody is watching: the frame was discarded
+        raises   ValueError for a frame of the wrong length or an unknown camera
         """
         return self.side.push(camera, frame)
 
@@ -101,7 +101,7 @@ class LiveVehicle:
             self._thread.join(END_S)
 
     def _watch(self) -> None:
-        """Report a loop that hangs, as in a rule that never returns, and its return."""
+        """Report a loop that hangs, for example in a rule that never returns, and its recovery."""
         stuck = False
         while not self._ended.wait(WATCH_S):
             silent = time.monotonic() - self.loop.beat
@@ -112,7 +112,7 @@ class LiveVehicle:
 
 
 class _Console:
-    """Passes lines on in a thread of its own: a terminal that takes nothing (Ctrl-S) holds up nobody."""
+    """Passes lines on in its own thread, so that a stopped terminal (Ctrl-S) blocks nothing else."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -137,7 +137,7 @@ class _Console:
 class _VehicleControl:
     """The vehicle's end of the control link: requests in, replies, state, telemetry and configuration out.
 
-    Nothing is published before it is known that no other vehicle of this name is at the broker.
+    Nothing is published until it is known that no other vehicle of this name is at the broker.
     """
 
     def __init__(self, vehicle: Vehicle, document: Mapping[str, Any], on_report: Callable[[str], None]) -> None:
@@ -185,7 +185,7 @@ class _VehicleControl:
             return
         self._alone.set()
         self.publish(self._settings)
-        self._live.loop.publish_again()  # the broker may have published the last will, or forgotten everything
+        self._live.loop.publish_again()  # the broker may have published the last will, or lost everything
 
     def _on_request(self, message: MqttMessage) -> None:
         if self._live.loop.overrun(message.sender):
@@ -203,13 +203,13 @@ class _VehicleControl:
             self._live.loop.take(request)
 
     def _on_telemetry(self, message: MqttMessage) -> None:
-        """Before anything was published, telemetry that comes now is another vehicle's."""
+        """Before this vehicle has published anything, live telemetry is another vehicle's."""
         if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
             rule = "choose another `name`, or stop the other vehicle"
             self._live.fail(RunError(f"a vehicle named {self._name} is at the broker already; {rule}"))
 
     def _on_state(self, message: MqttMessage) -> None:
-        """A last will that the broker publishes late, when the vehicle is back already."""
+        """A last will that the broker publishes late, when the vehicle is already back."""
         if self._alone.is_set() and read_state(message.payload) is None:
             self._live.loop.publish_again()
 
@@ -233,8 +233,8 @@ def live_vehicle(
     """Everything that the vehicle's side needs, stopped and disconnected at the end.
 
     log       directory that the drive is recorded to
-    say       called, from a thread of its own, with one line on what happens
-    progress  called with how far the rendering of a synthetic drive is
+    say       called, from a separate thread, with one line for each event
+    progress  called with the progress of rendering a synthetic drive
     raises    ConfigError, RunError
     """
     from runner import apply

@@ -1,4 +1,4 @@
-"""The live loop of the vehicle: take an event, step, apply, log, publish. It stays dull, and it survives."""
+"""The live loop of the vehicle: take an event, step, apply, log, publish. Kept simple, and survives exceptions."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from runner.vehicle.inbox import WAITING, Answer, Inbox, Request
 from runner.vehicle.operators import SILENT_S, Operators
 
 TICK_S = 0.1  # time between clock_advanced events
-TELEMETRY_TICKS = 2  # also the vehicle's sign of life
+TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 REPEAT_S = 10.0  # the same fault is reported no more often than this
-REFUSALS = 10  # refusals that a sender is answered between two ticks; beyond, they are counted only
+REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
 
 
 class Applier(Protocol):
-    """What the loop asks of the side that streams."""
+    """What the loop needs from the streaming side."""
 
     def turn(self, commands: Iterable[Command]) -> None: ...
     def applied(self) -> Mapping[str, KnobValues]: ...
@@ -54,7 +54,7 @@ class Applier(Protocol):
 
 
 class _PendingReply(NamedTuple):
-    """A request that was accepted and is not answered before its commands are read back as applied."""
+    """An accepted request, which is answered once its commands are read back as applied."""
 
     answer: Answer
     knobs: Sequence[tuple[str, str]]  # camera, knob
@@ -63,10 +63,10 @@ class _PendingReply(NamedTuple):
 
 @dataclass
 class ControlLoop:
-    """Events in, commands out, in one thread. Other threads `post` what they have.
+    """Events in, commands out, in one thread. Other threads `post` their events.
 
     publish    called with the state (decided and applied) whenever it changed, and telemetry a few times a second
-    on_report  called with one line on what happened and what came of it
+    on_report  called with one line on what happened and its result
 
     An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
     something (time.monotonic), `busy_with` what it is doing.
@@ -101,12 +101,12 @@ class ControlLoop:
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
         """An event as JSON without `t`, from this process, from any thread.
 
-        answer  called with what became of it: applied, refused, expired or timed out
+        answer  called with its outcome: applied, refused, expired or timed out
         """
         self.take(Request("", document, answer))
 
     def take(self, request: Request) -> None:
-        """A request, from any thread. A sender whose requests wait already is refused further ones."""
+        """A request, from any thread. Once a sender's queue is full, its further requests are refused."""
         dropped = self._inbox.put(request)
         if dropped is request:
             self.refuse(request, f"too many: {WAITING} requests of this sender are waiting")
@@ -114,7 +114,7 @@ class ControlLoop:
             self.refuse(dropped, "superseded by a newer measurement")
 
     def overrun(self, sender: str) -> bool:
-        """Whether a sender floods the vehicle, so that its message is counted and not even read. From any thread."""
+        """Whether a sender floods the vehicle, so that its message is only counted and not read. From any thread."""
         answers = self._refusals.get(sender, 0)
         if answers < REFUSALS or not self._inbox.full(sender):
             return False
@@ -122,18 +122,18 @@ class ControlLoop:
         return True
 
     def refuse(self, request: Request, problem: str) -> None:
-        """Count and answer what is not even queued, from any thread; only so many answers between two ticks."""
+        """Count and answer a request that is not queued, from any thread; answers between two ticks are limited."""
         self.refused += 1
         answers = self._refusals[request.sender] = self._refusals.get(request.sender, 0) + 1
         if request.answer and answers <= REFUSALS:
             request.answer(Outcome(self._now(), "refused", problem))
 
     def wake(self) -> None:
-        """Knobs were turned: look what is applied now. From any thread."""
+        """Knobs were turned: check what is applied now. From any thread."""
         self._inbox.wake()
 
     def publish_again(self) -> None:
-        """Publish the state though nothing changed, since the broker may have lost it. From any thread."""
+        """Publish the state even if nothing changed, since the broker may have lost it. From any thread."""
         self._publish_again = True
         self._inbox.wake()
 
@@ -143,9 +143,9 @@ class ControlLoop:
         self._inbox.wake()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Work until stopped, or for a time.
+        """Work until stopped, or for a given time.
 
-        raises  RuleFailed where the first decision cannot be made
+        raises  RuleFailed if the first decision cannot be made
         """
         self._began = self.beat = time.monotonic()
         self.log.begin()
@@ -163,7 +163,7 @@ class ControlLoop:
             self._guarded("state", self._publish_state)
 
     def _guarded(self, what: str, work: Callable[[], None]) -> None:
-        """Do a piece of work; an exception in it must not end the streams of a vehicle that moves."""
+        """Do a piece of work; an exception in it must not end the streams of a moving vehicle."""
         self.busy_with = what
         try:
             work()
@@ -173,7 +173,7 @@ class ControlLoop:
         self.busy_with, self.beat = "", time.monotonic()
 
     def _report_once(self, text: str) -> None:
-        """Report what went wrong, but the same no more often than every REPEAT_S."""
+        """Report a fault; the same one at most every REPEAT_S."""
         now = self._now()
         if now - self._reported.get(text, -REPEAT_S) >= REPEAT_S:
             self._reported = {t: at for t, at in self._reported.items() if now - at < REPEAT_S} | {text: now}
@@ -183,7 +183,7 @@ class ControlLoop:
         return round(time.monotonic() - self._began, 6)
 
     def _tick(self) -> None:
-        """Time passes: where the drive comes from a track, the position with it."""
+        """Advance the time and, if the drive comes from a track, the position."""
         t = self._now()
         self._refusals = {}
         if self.track is not None:
@@ -218,12 +218,12 @@ class ControlLoop:
             self.refused += 1
             self._answer(request.answer, Outcome(t, "expired", late))
         elif isinstance(event, OperatorConnected | OperatorDisconnected):
-            self._answer(request.answer, Outcome(t, "applied", ""))  # presence has been looked at
+            self._answer(request.answer, Outcome(t, "applied", ""))  # presence is already updated
         else:
             self._take(event, request.answer)
 
     def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
-        """Any message of an operator shows its presence. The core sees the first that comes and the last that goes."""
+        """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
             self._operators.connected(sender, t)
@@ -300,7 +300,7 @@ class ControlLoop:
                 self.on_report(f"{self._cause} -> {name}: {now.reason}")
 
     def _publish_state(self) -> None:
-        """Publish what is decided and what is applied, where either changed; answer requests that are applied now."""
+        """Publish the decided and the applied values if either changed; answer requests that are applied now."""
         applied = self.applier.applied()
         state = self._state(applied)
         if state != self._published or self._publish_again:
@@ -319,7 +319,7 @@ class ControlLoop:
         return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
-        """Answer a request, if all that it made of knobs is applied, or time is up."""
+        """Answer a request if all its knob values are applied, or it has timed out."""
         now, commanded = self._now(), self._run.commanded
         watched = [(name, knob) for name, knob in pending.knobs if applied[name]]
         waiting = [f"{name} {knob}" for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
@@ -334,7 +334,7 @@ class ControlLoop:
         return True
 
     def _publish_measured(self, t: float) -> None:
-        """What was read back from the elements, and what the encoders have put out so far."""
+        """Publish what was read back from the elements, and what the encoders have output so far."""
         sent = self.applier.sent()
         cameras = {
             name: CameraTelemetry(applied_to_json(name, knobs), *sent[name])

@@ -1,8 +1,8 @@
-"""Which operators are present, and whether a request is too old to be carried out. Pure: time is given.
+"""Which operators are present, and whether a request is too old to be carried out. Pure: time is passed in.
 
-An operator is a client that sends requests under an id of its own, which is part of the topic. It is present from its
-`operator_connected` on. It leaves by its own silence or its own `operator_disconnected`; any later message of its own
-brings it back.
+An operator is a client that sends requests under its own id, which is part of the topic. It is present from its
+`operator_connected` on. It leaves by its silence or its `operator_disconnected`; any later message from it brings it
+back.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
 
-SILENT_S = 1.0  # an operator that sends nothing for so long is offline; a present one sends four messages a second
-AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks that drift apart
+SILENT_S = 1.0  # an operator that sends nothing for this long is offline; a present one sends four messages a second
+AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks drift apart
 DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
 MOST = 64  # operators remembered; the one that has been silent longest is forgotten for a new one
 
@@ -28,7 +28,7 @@ class _Operator:
 
 
 class Operators:
-    """All operators that the vehicle has heard of.
+    """All operators known to the vehicle.
 
     expires_s  age from which a request is dropped, beyond the measured round trip
     """
@@ -43,18 +43,18 @@ class Operators:
 
     @property
     def in_control(self) -> str:
-        """The operator that has been present longest without a break, "" for none."""
+        """The operator that has been present longest without interruption, "" for none."""
         present = {name: operator.since for name, operator in self._known.items() if operator.present}
         return min(present, key=lambda name: present[name], default="")
 
     def connected(self, name: str, t: float) -> bool:
-        """An operator announces itself, or does so again as its sign of life; returns whether it was away."""
+        """An operator announces itself, or does so again as its heartbeat; returns whether it was absent."""
         operator = self._operator(name, t)
         operator.announced = True
         return self.message_received(name, t)
 
     def message_received(self, name: str, t: float) -> bool:
-        """Any message of an operator at time t, s; returns whether it brings a present operator back."""
+        """Any message of an operator at time t, s; returns whether it brings the operator back."""
         operator = self._operator(name, t)
         operator.last_message = t
         returns = operator.announced and not operator.present
@@ -63,7 +63,7 @@ class Operators:
         return returns
 
     def disconnected(self, name: str) -> bool:
-        """An operator disconnects, itself or by its last will; returns whether it was present."""
+        """An operator disconnects, by itself or through its last will; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
@@ -81,7 +81,7 @@ class Operators:
         """Why a request is too old to be carried out at time t; None if it is not.
 
         as_of  the vehicle's time in the newest telemetry that the sender had, plus the time since by the sender's
-               clock. So `t - as_of` is one round trip for a request that nothing held up; no clocks are compared.
+               clock. So `t - as_of` is one round trip for a request that was not delayed; no clocks are compared.
         """
         delay = t - as_of
         if delay < -AHEAD_S:

@@ -1,4 +1,4 @@
-"""The verbs of the command line, one module each, imported only when asked for."""
+"""The verbs of the command line, one module each, imported on demand."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
 
 
 class Verb(NamedTuple):
-    """A verb: what it does in a few words, where it lives, which arguments it takes.
+    """A verb: a short description, its module, its arguments.
 
-    takes  what words without = are, which come in any number; "": there are none
+    takes  meaning of words without =, any number of them; "": none are accepted
     """
 
     summary: str
@@ -46,7 +46,7 @@ VERBS = {
 }
 
 
-# By extra of this package, the Python modules that it brings.
+# By extra of this package, the Python modules that it provides.
 EXTRAS = {
     "live": ("paho", "rich"),
     "page": ("aiohttp", "plotly"),
@@ -60,7 +60,7 @@ EXTRAS = {
 
 
 def extra_of(module: str) -> str | None:
-    """The extra that brings a Python module; None: no extra does."""
+    """The extra that provides a Python module; None: no extra does."""
     return next((extra for extra, modules in EXTRAS.items() if module in modules), None)
 
 
@@ -68,7 +68,7 @@ def extra_of(module: str) -> str | None:
 class Arguments:
     """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra.
 
-    words  those without =, where the verb takes any
+    words  those without =, if the verb takes any
     """
 
     verb: str
@@ -79,9 +79,9 @@ class Arguments:
 
     @staticmethod
     def parse(verb: str, words: Sequence[str]) -> Arguments:
-        """Split the words. A path given to an argument may hold any character, since Hydra never sees it.
+        """Split the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag, which no verb has, and for a name that only another verb takes or nothing has
+        raises  UserError for a flag, which no verb has, and for a name that only another verb or none takes
         """
         own = (*VERBS[verb].arguments, "conf")
         values: dict[str, str] = {}
@@ -92,7 +92,7 @@ class Arguments:
                 values[key] = value
             elif word.startswith("-"):
                 raise UserError("command line", "", word, "flags are not supported; write NAME=VALUE, or --help")
-            elif VERBS[verb].takes == DRIVE and (not equals or "/" in key):  # a path may hold a = of its own
+            elif VERBS[verb].takes == DRIVE and (not equals or "/" in key):  # a path may contain a =
                 plain.append(word)
             elif not equals and not word.startswith("~"):
                 if not VERBS[verb].takes:
@@ -105,14 +105,14 @@ class Arguments:
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain))
 
     def choice(self, key: str, options: Sequence[str]) -> str:
-        """One of some words; the first where it is not given."""
+        """One of some words; the first if not given."""
         value = self.values.get(key, options[0])
         if value not in options:
             raise UserError("command line", key, repr(value), f"must be one of {', '.join(options)}")
         return value
 
     def number(self, key: str) -> float | None:
-        """A number from 0; None where it is not given."""
+        """A number from 0; None if not given."""
         text = self.values.get(key)
         if text is None:
             return None
@@ -129,9 +129,9 @@ class Arguments:
 
 
 def _check_name(verb: str, key: str) -> None:
-    """Refuse what is surely no override: an argument of another verb, or a misspelt word.
+    """Refuse words that cannot be overrides: an argument of another verb, or a misspelt name.
 
-    raises  UserError; names that nothing comes near to are left to the schema of the configuration
+    raises  UserError; names unlike any known one are left to the schema of the configuration
     """
     if VERBS[verb].takes == DRIVE:  # these verbs read no configuration
         return
@@ -139,7 +139,7 @@ def _check_name(verb: str, key: str) -> None:
     own = (*VERBS[verb].arguments, "conf")
     configured = [*GROUPS, *schema_document("composed")["properties"]]
     if verb in ("model", "doctor"):
-        configured += schema_document("study")["properties"]  # these stand alone there
+        configured += schema_document("study")["properties"]  # keys of the study may be given alone there
     if name in configured:
         return
     takers = [other for other, its in VERBS.items() if name in its.arguments]
@@ -152,6 +152,6 @@ def _check_name(verb: str, key: str) -> None:
 
 
 def study_word(word: str) -> str:
-    """An override of the verb `model`, where a key of conf/study/ stands alone: metric=psnr is study.metric=psnr."""
+    """An override of the verb `model`, where keys of conf/study/ may stand alone: metric=psnr is study.metric=psnr."""
     key = word.replace(".", "=").partition("=")[0]
     return f"study.{word}" if key in schema_document("study")["properties"] else word

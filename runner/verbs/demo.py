@@ -5,10 +5,10 @@ through a bandwidth map in mode A. Open the page that it names, http://127.0.0.1
 terminal shows the same. Every camera runs at 5 Hz for each core, which carries eight full HD cameras, both sides and a
 browser without a GPU; give fps_max=40, or null for the cameras' own rates.
 
-With log=DIR both sides write what they do and see to DIR. With output=OUT a report is made at the end, as by the verb
-report (models= goes there); the drive then lies in OUT/drive, unless log= names another directory. An experiment
+With log=DIR both sides write their logs to DIR. With output=OUT a report is made at the end, as by the verb report
+(models= is passed to it); the drive is then stored in OUT/drive, unless log= names another directory. An experiment
 defines the drives; one with several runs makes several drives and compares them. With link= a link of limited rate
-joins both sides.
+connects both sides.
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
@@ -48,18 +48,18 @@ from runner.verbs import Arguments
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
 
-FPS_PER_CORE = 5  # Hz; what is encoded, sent, decoded and shown eight times without falling behind
+FPS_PER_CORE = 5  # Hz; eight cameras are encoded, sent, decoded and shown at this rate without falling behind
 LOOK_S = 0.05  # how soon after a side's end the other is stopped
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
-DRIVE = "drive"  # where a drive lies below output=
+DRIVE = "drive"  # where a drive is stored below output=
 
 
 class _Run(NamedTuple):
-    """One of the drives that are made.
+    """One of the drives.
 
     arguments  with the overrides of this one
-    directory  where it is logged; None: nowhere
+    directory  where it is logged; None: not logged
     document   its composed configuration
     """
 
@@ -102,7 +102,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _check_empty(output: Path) -> None:
-    """Whether all that will lie in the directory comes from this demo.
+    """Check that everything in the directory will come from this demo.
 
     raises  UserError
     """
@@ -123,7 +123,7 @@ def _prepared(
     link: LinkSettings | None,
     apply: ModuleType,
 ) -> _Run:
-    """All that a drive needs, checked before the first begins; `config` and `link` are those of a run without words."""
+    """What a drive needs, checked before the first one begins; `config` and `link` are those of a run without words."""
     own = replace(arguments, overrides=[*arguments.overrides, *words])
     directory = _directory(arguments, name)
     if words:
@@ -140,7 +140,7 @@ def _prepared(
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
-    """With a frame rate that this machine carries, where neither the user nor an experiment names one."""
+    """Add a frame rate that this machine can handle, if neither the user nor an experiment gives one."""
     config = configuration(arguments.overrides, arguments.conf, runnable=False)
     named = any(word.lstrip("+~").startswith("fps_max") for word in arguments.overrides)
     if named or config.document.get("fps_max") is not None:
@@ -151,9 +151,9 @@ def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
 
 
 def _directory(arguments: Arguments, run: str) -> Path | None:
-    """Where a drive is logged; None: nowhere.
+    """Where a drive is logged; None: not logged.
 
-    raises  UserError where one lies there already
+    raises  UserError if there is one already
     """
     output, log = arguments.path("output"), arguments.path("log")
     if log is None and output is None:
@@ -167,9 +167,9 @@ def _directory(arguments: Arguments, run: str) -> Path | None:
 
 
 def _drive(run: _Run, duration_s: float) -> None:
-    """One drive of both sides.
+    """Run one drive of both sides.
 
-    raises  RunError where a part of it ends early, KeyboardInterrupt where a signal came
+    raises  RunError if a part of it ends early, KeyboardInterrupt after a signal
     """
     own = [*run.arguments.overrides, *([f"conf={run.arguments.conf}"] if run.arguments.conf else [])]
     own += [f"log={run.directory}"] if run.directory else []
@@ -194,7 +194,7 @@ def _drive(run: _Run, duration_s: float) -> None:
 
 @contextmanager
 def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) -> Iterator[tuple[VerbProcess, ...]]:
-    """Both sides as processes, vehicle and operator. The vehicle's error output is shown only where it failed."""
+    """Both sides as processes, vehicle and operator. The vehicle's error output is shown only if it failed."""
     to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
     with tempfile.TemporaryFile("w+") as stderr, ExitStack() as stack:
         before = link.vehicle_command if link else ()
@@ -215,7 +215,7 @@ def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) ->
 
 
 def _end(sides: Iterable[VerbProcess]) -> None:
-    """Ask both sides to end, and kill what does not."""
+    """Ask both sides to end, and kill those that do not."""
     until = time.monotonic() + SIDE_END_S
     for side in sides:
         side.ask()
@@ -226,7 +226,7 @@ def _end(sides: Iterable[VerbProcess]) -> None:
 
 @contextmanager
 def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
-    """The limited link between the sides, where there is one, and its log."""
+    """The limited link between the sides, if there is one, and its log."""
     settings = run.link
     if settings is None:
         yield None, Log(None, "link", {}, {}, say)
@@ -241,7 +241,7 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
 
 
 def _began(directory: Path) -> float | None:
-    """When the vehicle's side began to drive, s since 1970; None: it has not yet."""
+    """When the vehicle's side began to drive, s since 1970; None: not yet."""
     try:
         with (directory / FILES["vehicle"]).open(encoding="utf-8") as file:
             return float(json.loads(file.readline())["time"])

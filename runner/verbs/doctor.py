@@ -1,8 +1,8 @@
 """usage: tod-runner doctor [VERB] [OVERRIDE ...]
 
-What this machine lacks for a verb with this configuration, and what brings it: Python packages, GStreamer and its
-bindings, elements, broker, free ports, cores. Without a verb it is `demo`, which takes what both sides take. Ends with
-status 1 where something is missing.
+What this machine lacks for a verb with this configuration, and how to get it: Python packages, GStreamer and its
+bindings, elements, broker, free ports, cores. The default verb is `demo`, which needs everything that both sides need.
+Ends with status 1 if something is missing.
 
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
@@ -24,9 +24,9 @@ from runner.plans import compile_plans
 from runner.system.ports import check_port_free
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
-CORE_MPX_S = 180  # what one core crops, scales and encodes in a second at factor 0.5, measured with h264_rtsp
+CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
 STREAMING = ("vehicle", "operator", "demo", "record", "model")  # verbs that need GStreamer
-NEEDED = {  # extras of this package that a verb needs whatever the configuration says
+NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
     "demo": ("live",),
@@ -38,7 +38,7 @@ NEEDED = {  # extras of this package that a verb needs whatever the configuratio
 
 
 class Diagnosis(NamedTuple):
-    """One thing looked at."""
+    """The result of one check."""
 
     fine: bool
     what: str
@@ -145,7 +145,7 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
 
 
 def _cores(vehicle: Vehicle) -> Diagnosis:
-    """Whether the cores carry all cameras at full rate, as an estimate; never called missing."""
+    """Whether the cores can handle all cameras at full rate, as an estimate; never reported as missing."""
     load_mpx = sum(float(camera.fps) * camera.width * camera.height for camera in vehicle.cameras.values()) / 1e6
     cores = os.cpu_count() or 1
     need = load_mpx / CORE_MPX_S

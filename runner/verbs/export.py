@@ -1,7 +1,7 @@
 """usage: tod-runner export DRIVE [output=FILE.mcap]
 
-A drive as MCAP, for Foxglove and every other reader of MCAP. DRIVE is a directory that log=DIR wrote; whatever of it is
-there, vehicle's, operator's or link's log, is exported, to DRIVE/drive.mcap unless output= names another file.
+Export a drive as MCAP, for Foxglove and any other reader of MCAP. DRIVE is a directory that log=DIR wrote; all of its
+logs (vehicle, operator, link) are exported to DRIVE/drive.mcap unless output= names another file.
 
   /position               foxglove.LocationFix
   /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)
@@ -65,7 +65,7 @@ def _nothing(_path: Path) -> Iterator[Any]:
 
 @contextmanager
 def _new(path: Path) -> Iterator[BinaryIO]:
-    """A new file, there when it is whole."""
+    """A new file, which exists only when it is complete."""
     try:
         with unfinished(path) as part, _opened(part, path) as file:
             yield file
@@ -82,7 +82,7 @@ def _opened(part: Path, path: Path) -> BinaryIO:
 
 @contextmanager
 def _later(what: str) -> Iterator[Callable[[float], None]]:
-    """Progress of long work, from when it proves to be long."""
+    """Progress of long work, shown once it has lasted `QUIET_S`."""
     began = time.monotonic()
     with progress_bar() as tell:
 

@@ -1,9 +1,9 @@
 """usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10]
 
-A bandwidth map from drives, for pqos=map: per square of the ground, a percentile of what came through, in kbit/s of
-video. Only samples in which the link was really the limit count: over the second before, packets were lost, or half of
-the frames of a camera came 50 ms later than its fastest. Everything else says how much was sent, not what the link
-carries. The operator's log is needed (demo and operator with log=DIR).
+Make a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
+of video. Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of
+the frames of a camera arrived 50 ms later than its fastest. All others show how much was sent, not what the link can
+carry. The operator's log is needed (demo and operator with log=DIR).
 
   tod-runner map drives/monday drives/tuesday output=maps/route.csv
   tod-runner map drive output=route.csv percentile=5 cell_m=25

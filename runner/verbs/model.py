@@ -6,12 +6,12 @@ Measures rate-quality models: each recorded sequence is scaled, encoded by the l
 bitrates, decoded, scaled up again and compared with the original. Writes for each camera DIR/CAMERA.yaml, ready for
 conf/cameras/, DIR/CAMERA.model.json with every point, and the curves as .png and .pdf.
 
-camera= is a camera of the vehicle, else a kind in conf/cameras/; without it all cameras of the vehicle are measured,
-and sequence= is a directory with one clip for each, named after it. Without sequence= the source's own clips are taken.
-How it is measured stands in conf/study/paper.yaml; its keys may be given alone: metric= plan= scalings= bitrates_kbps=
+camera= is a camera of the vehicle, or a kind in conf/cameras/; without it all cameras of the vehicle are measured,
+and sequence= is a directory with one clip for each, named after it. Without sequence= the source's own clips are used.
+The method is defined in conf/study/paper.yaml; its keys may be given alone: metric= plan= scalings= bitrates_kbps=
 b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
 
-What was measured is kept by content in the user's cache: a run that is interrupted goes on where it stopped.
+Measurements are cached by content in the user's cache: an interrupted run resumes where it stopped.
 
   tod-runner model camera=front_center sequence=drive.mp4 output=models
   tod-runner model camera=front_center sequence=drive.mp4 output=models metric=[mssim,psnr] plan=full
@@ -38,7 +38,7 @@ from runner.verbs.screen import progress_bar, say, streaming
 if TYPE_CHECKING:
     from runner.rate_quality.study import Study
 
-NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # what else may be named after a camera
+NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # other files that may be named after a camera
 
 
 def run(arguments: Arguments) -> int:
@@ -80,7 +80,7 @@ def _need_libraries() -> None:
 
 
 def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
-    """The vehicle, how to measure, and which of its cameras; a camera of another kind is mounted for it."""
+    """The vehicle, the study, and the cameras to measure; a camera of another kind is mounted for it."""
     from runner.apply import check_plan
     from runner.rate_quality.study import check_cameras
 

@@ -1,10 +1,10 @@
 """usage: tod-runner operator [OVERRIDE ...] [duration_s=N] [log=DIR]
 
-The operator's side: receives every camera by the operator graph of the configuration and decodes it. A browser on this
+The operator's side: receives and decodes every camera with the operator graph of the configuration. A browser on this
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
-bitrates and factors, charts, the drive, and why each decision was made. The terminal shows a table of the same. Ends
-with Ctrl-C or after duration_s, with a summary of how well what came followed what was decided. With log=DIR all that
-comes is written to DIR/operator.jsonl, for `report` and `export`.
+bitrates and factors, charts, the drive, and why each decision was made. The terminal shows the same as a table. Ends
+with Ctrl-C or after duration_s, with a summary of how well the received video followed the decisions. With log=DIR all
+that is received is written to DIR/operator.jsonl, for `report` and `export`.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
         station.listeners.append(table)
         with _served(operator) as page:
             operator.start(page.show if page else None, duration)
-            gc.freeze()  # what is loaded by now stays: collecting it again and again would hold up frames
+            gc.freeze()  # objects loaded by now stay: collecting them again and again would delay frames
             with stopping(action=operator.end) as stop:
                 runs = True
                 while runs:  # once more after the end: the last notes are shown too

@@ -1,9 +1,9 @@
 """usage: tod-runner print [OVERRIDE ...] [total_kbps=N] [format=text|json]
 
-Dry run: for each camera the pipeline of the vehicle and of the operator, and what the rules decide for a total of
-N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: where the live system has an
-RTSP server and its client, the lines state a UDP sink and the matching source, since gst-launch has neither. Passwords
-in addresses are left out: put them back to run such a line.
+Dry run: for each camera the pipeline of the vehicle and of the operator, and the rules' decision for a total of
+N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: in place of the live system's
+RTSP server and client, the lines have a UDP sink and the matching source, since gst-launch has neither. Passwords in
+addresses are left out: put them back to run such a line.
 
   tod-runner print total_kbps=3000                              the paper's vehicle at 3 Mbit/s
   tod-runner print vehicle=delivery_robot mode=collective       another vehicle
@@ -47,7 +47,7 @@ def run(arguments: Arguments) -> int:
 
 
 def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
-    """What the rules decide at the start, or for a total in kbit/s; mode single takes what automatic would."""
+    """The rules' decision at the start, or for a total in kbit/s; mode single uses what automatic would."""
     events: Sequence[Event] = ()
     if total is not None and vehicle.mode is Mode.COLLECTIVE:
         events = (TotalSet(t=0, kbps=total),)

@@ -1,14 +1,14 @@
 """usage: tod-runner record [OVERRIDE ...] output=DIR [duration_s=N]
 
 Record each camera without loss: the frames as its source delivers them, in native size, before crop and scale, into
-DIR/CAMERA.mkv, and what was recorded into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with
-Ctrl-C; either way the files are complete. A file has its name only when it is complete; until then, and where its
-camera fails, it is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing, since the encoder or the disk was
-too slow, are counted and reported. recording=NAME chooses the encoder, a file of conf/recording/.
+DIR/CAMERA.mkv, and a description into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with Ctrl-C;
+either way the files are complete. A file gets its name only when it is complete; until then, or if its camera fails, it
+is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing because the encoder or the disk was too slow are
+counted and reported. recording=NAME chooses the encoder, a file of conf/recording/.
 
 Before the start the disk must have room for the raw frames (width x height x 1.5 bytes x fps) times of_raw of
-conf/recording/, for duration_s or else for 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
-comes down to the margin ends, with status 1.
+conf/recording/, for duration_s or otherwise 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
+reaches the margin ends, with status 1.
 
   tod-runner record vehicle=tum_q7 source=v4l2 output=recordings/monday duration_s=60
   tod-runner record vehicle=delivery_robot source=synthetic output=/tmp/rec duration_s=10
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from runner.apply import Recorded, RecordingSide
 
 SAMPLE_S = 0.25
-SHOW_S = 1.0  # between two lines of figures, where no bar shows how far it is
+SHOW_S = 1.0  # between two lines of figures, if no bar shows the progress
 Show = Callable[[Mapping[str, "Recorded"]], None]
 
 
@@ -72,19 +72,19 @@ def run(arguments: Arguments) -> int:
 
 
 class _Session:
-    """One recording from start to end: names files when they are complete, and knows why it ends."""
+    """One recording from start to end: names files when they are complete, and records why it ends."""
 
     def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None, stop: Stop) -> None:
         self._vehicle, self._directory, self._duration_s, self._stop = vehicle, directory, duration_s, stop
         self._ended: dict[str, Recorded] = {}
-        self._finishing = False  # before the time that was asked for
+        self._finishing = False  # before the requested time
         self._kept: set[str] = set()  # cameras whose files are complete and have their names
         self._problems: list[str] = []
         self._losing: set[str] = set()
         self._margin = recordings.margin(vehicle.cameras.values())
 
     def watch(self, side: RecordingSide, show: Show) -> None:
-        """Until every camera has ended."""
+        """Run until every camera has ended."""
         while len(self._ended) < len(self._vehicle.cameras):
             if self._finishing:
                 time.sleep(SAMPLE_S)
@@ -112,14 +112,14 @@ class _Session:
             return
         try:
             recordings.keep(self._directory, name)
-        except RunError as error:  # the other cameras go on
+        except RunError as error:  # the other cameras continue
             self._fail(f"{name}: {error}")
             return
         self._kept.add(name)
         self._check_length(name, recorded)
 
     def _check_length(self, name: str, recorded: Recorded) -> None:
-        """Whether a camera was recorded for as long as was asked for."""
+        """Check that a camera was recorded for the requested time."""
         asked = self._duration_s
         if asked is not None and not self._finishing and recorded.seconds < asked - SAMPLE_S:
             self._fail(f"{name}: its source ended after {recorded.seconds:.1f} of {asked:g} s")
@@ -137,7 +137,7 @@ class _Session:
         say(what)
 
     def conclude(self, configuration: Mapping[str, Any]) -> None:
-        """Tell what there is now, and write it down next to the files."""
+        """Report the results and write them to a file next to the videos."""
         cameras = {name: self._entry(self._vehicle.cameras[name], self._ended[name]) for name in self._vehicle.cameras}
         if self._kept:
             document = {
@@ -210,7 +210,7 @@ def _directory(arguments: Arguments) -> Path:
 
 
 def _check_sources(vehicle: Vehicle) -> None:
-    """Whether every source makes its frames by itself.
+    """Check that every source produces its frames by itself.
 
     raises  UserError
     """
@@ -222,7 +222,7 @@ def _check_sources(vehicle: Vehicle) -> None:
 
 @contextmanager
 def _shown(vehicle: Vehicle, files: Mapping[str, Path], duration_s: float | None) -> Iterator[Show]:
-    """How far the recording is: bars where its length is known, else figures once a second."""
+    """Progress of the recording: bars if its length is known, otherwise figures once a second."""
     if duration_s is not None:
         with progress_bar() as progress:
 

@@ -3,11 +3,11 @@
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
 events. An invalid line ends the run with its number; earlier output stays. An event that cannot be
-accepted is answered with "accepted": false and the reason, and the run goes on.
+accepted is answered with "accepted": false and the reason, and the run continues.
 
-A drive (the directory that log= wrote, or its drive.jsonl) is replayed with the configuration that it was driven with:
-the decisions are those of the drive. Overrides change that configuration and so answer "what if"; with log= the answer
-is written as a drive of its own, for `report`, and to output= only where that is given.
+A drive (the directory that log= wrote, or its drive.jsonl) is replayed with its own configuration: the decisions are
+those of the drive. Overrides change that configuration and so answer "what if"; with log= the result is written as a
+new drive, for `report`, and to output= only if that is given.
 
 Predictions are those of the input. With a pqos= on the command line they are dropped and that source predicts instead,
 from the positions and times of the input; its events are marked "source": "pqos".
@@ -47,7 +47,7 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.pqos import Pqos
 
-InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and as what it is
+InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
 
 _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
@@ -66,7 +66,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]:
-    """All lines again, and the beginning of the drive that they are; None: they are but events."""
+    """All lines again, and the first line of their drive; None: they are only events."""
     lines = iter(text)
     first = list(islice(lines, 1))
     line, problem = read_line(first[0]) if first else ({}, "")
@@ -81,13 +81,13 @@ def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]
 
 
 def _base(name: str, began: Began | None) -> Base | None:
-    """The configuration that a drive was driven with."""
+    """The configuration of a drive."""
     return (dict(began.config), f"{name}: line 1: config") if began else None
 
 
 @contextmanager
 def _log(arguments: Arguments, config: Mapping[str, Any], began: Began | None) -> Iterator[Log | None]:
-    """The answer as a drive, there only when it is whole; None where nobody asks for it."""
+    """The result as a drive, which exists only when it is complete; None if not requested."""
     directory = arguments.path("log")
     if directory is None:
         yield None
@@ -108,7 +108,7 @@ def replay(
     """One line of JSON per event, in order.
 
     pqos  predicts in place of the events' own predictions
-    log   written as the vehicle would have
+    log   written as the vehicle would have written it
     """
     now, answers = start(vehicle), _Answers()
     for document, event in inputs if pqos is None else _predicted(inputs, pqos):
@@ -129,11 +129,11 @@ def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]
 
 
 class _Answers:
-    """The lines that answer events: what was heard, what is in force, what was commanded."""
+    """The lines that answer events: the event, the decision in force, the commands."""
 
     def __init__(self) -> None:
         self._decision: Decision | None = None
-        self._text = ""  # of that decision, once an event changes nothing, as most do
+        self._text = ""  # of that decision, set once an event changes nothing, as most do
 
     def line(self, document: dict[str, Any], now: Run) -> str:
         heard = _heard(document, now)
@@ -193,22 +193,22 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
 
 
 def _keep(path: Path, output: Path | None) -> None:
-    """raises UserError where what is read would be written over"""
+    """raises UserError if the input would be overwritten"""
     if output and output.is_file() and path.exists() and output.samefile(path):
         raise UserError("command line", "output", repr(str(output)), "is the input, choose another file")
 
 
 @contextmanager
 def _output(arguments: Arguments) -> Iterator[TextIO]:
-    """Standard output line by line, or a file that is there only when the run has ended.
+    """Standard output line by line, or a file that exists only when the run has ended.
 
-    With log= the answer is a drive: decisions are in there, and in another file only where one is named.
+    With log= the result is a drive: it contains the decisions; another file does so only if it is named.
     """
     path = arguments.path("output")
     if path is None and arguments.path("log"):
         path = Path(os.devnull)
     if path is None:
-        # Whoever writes the events may wait for each answer before sending the next one.
+        # The sender of the events may wait for each answer before sending the next one.
         sys.stdout.reconfigure(encoding="utf-8", line_buffering=arguments.path("input") is None)  # type: ignore[union-attr]
         yield sys.stdout
         return

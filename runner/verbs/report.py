@@ -1,13 +1,13 @@
 """usage: tod-runner report DRIVE [DRIVE ...] output=DIR [models=DIR] [conf=DIR]
 
-The figures of the paper's driving test from drives that were logged (log= of vehicle, operator and demo): a DRIVE is a
+The figures of the paper's driving test from logged drives (log= of vehicle, operator and demo): a DRIVE is a
 directory with drive.jsonl, operator.jsonl or both. Several drives are compared, on the same axes.
 
-Writes DIR/index.html, one page that needs nothing else and no network; each figure as .png and .pdf in a column's
-width; and DIR/report.json with all statistics (schemas/report.schema.json), for a CI.
+Writes DIR/index.html, one self-contained page that needs no network; each figure as .png and .pdf at column width;
+and DIR/report.json with all statistics (schemas/report.schema.json), for CI.
 
 models= is a directory with CAMERA.model.json, as `tod-runner model` writes them: quality is then estimated. Without it
-the models are taken that the drive's configuration names, where they are beside conf/cameras/.
+the models named by the drive's configuration are used, if they are beside conf/cameras/.
 
   tod-runner demo log=drive duration_s=100; tod-runner report drive output=report
   tod-runner report drives/adaptive drives/static output=compared models=models
@@ -46,7 +46,7 @@ def report(
     models: Path | None = None,
     bases: Sequence[Path] = (),
 ) -> Path:
-    """Read, measure, draw, write; show the table of the cameras. What a drive's experiment claims is held against it.
+    """Read, measure, draw, write; show the table of the cameras. The claims of a drive's experiment are checked.
 
     returns  the page
     raises   UserError for a drive or model that cannot be read, RunError for a file that cannot be written
@@ -74,9 +74,9 @@ def report(
 
 
 def check_report(output: Path, models: Path | None) -> None:
-    """Whether a report can be made once there are drives.
+    """Check that a report can be made once there are drives.
 
-    raises  UserError where the directories are none, RunError where a library is missing
+    raises  UserError if the directories are not usable, RunError if a library is missing
     """
     above = next((path for path in (output, *output.parents) if path.exists()), Path())
     if not above.is_dir():
@@ -138,7 +138,7 @@ def _measured(
 
 
 def labels(drives: Sequence[Drive]) -> list[str]:
-    """Short names that distinguish drives: the directory's, more of its path where two are called the same."""
+    """Short names that distinguish drives: the directory's, with more of its path if two have the same name."""
     paths = [drive.path.resolve() for drive in drives]
     found: list[str] = []
     for number, path in enumerate(paths):

@@ -18,7 +18,7 @@ from runner.drive.tables import VERDICTS, camera_rows, drive_rows
 def show(
     drives: Sequence[DriveStatistics], checks: Mapping[str, Sequence[ClaimCheck]], left_out: Sequence[str]
 ) -> None:
-    """The cameras of each drive, the drives beside each other, claims, and what to know of them."""
+    """The cameras of each drive, the drives compared, claims, and notes."""
     console = Console(width=None if sys.stdout.isatty() else 190)
     for drive in drives:
         console.print(_table(drive.series.label, *camera_rows(drive)))

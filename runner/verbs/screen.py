@@ -1,4 +1,4 @@
-"""What the live verbs share: a progress bar, lines on standard error, and the way to GStreamer."""
+"""Shared by the live verbs: a progress bar, lines on standard error, and access to GStreamer."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from runner.errors import MissingBindings, RunError
 from runner.redact import redacted
 from runner.system import signals
 
-SWITCH_S = 0.0005  # a thread with a frame or a message to pass on waits no longer than this for one that computes
+SWITCH_S = 0.0005  # a thread with a frame or a message to pass on waits no longer than this for a computing one
 
 
 def streaming() -> ModuleType:
     """The module `runner.apply`. From here on signals are held, see `runner.system.signals.hold`.
 
-    raises  RunError where GStreamer's Python bindings are missing
+    raises  RunError if GStreamer's Python bindings are missing
     """
     signals.hold()
     try:
@@ -39,9 +39,9 @@ def say(what: str) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Shows how far long work is; nothing where there is none. Off a terminal, a line for each tenth.
+    """Shows the progress of long work, if there is any. Without a terminal, a line for each tenth.
 
-    What reports its progress from the main thread is interrupted there by a signal.
+    Work that reports its progress from the main thread is interrupted there by a signal.
     """
     if not sys.stderr.isatty():
         yield _progress_lines()

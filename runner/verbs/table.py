@@ -49,7 +49,7 @@ class LiveTable(Listener):
         self._stack.__exit__(kind, error, at)
 
     def on_note(self, note: Note) -> None:
-        """From any thread: one line below the table, when it is shown next."""
+        """From any thread: add one line below the table, shown with its next update."""
         self._news.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {note.text}")
 
     def show(self, rows: Sequence[CameraRow], headline: str) -> None:
@@ -66,7 +66,7 @@ class LiveTable(Listener):
 
 
 def _show_cursor() -> None:
-    """Undo what the live table does to the terminal, unless that takes nothing."""
+    """Undo the live table's changes to the terminal, unless it accepts no output."""
     if select.select([], [sys.stdout], [], 0)[1]:
         os.write(sys.stdout.fileno(), b"\x1b[?25h\n")
 
@@ -97,14 +97,14 @@ def _table(rows: Sequence[CameraRow], headline: str) -> RichTable:
 
 
 def _size_style(row: CameraRow) -> str:
-    """Marks a picture that has not the size that was decided (yet)."""
+    """Marks a picture that does not have the decided size (yet)."""
     decided, received = row.state, row.received
     wrong = decided and decided.sending and (decided.width, decided.height) != (received.width, received.height)
     return "bold yellow" if wrong else ""
 
 
 def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, Any]) -> None:
-    """What came against what was decided, over the whole run."""
+    """Reception compared with the decisions, over the whole run."""
     table = RichTable(title="received", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("camera")
     headings = ["frames", "Hz", "seconds short\nof frames", "kbit/s of\nallocated", "seconds at the\ndecided size"]

@@ -1,17 +1,18 @@
 """usage: tod-runner validate [OVERRIDE ...] [FILE ...] [conf=DIR] [all=true]
 
-Check the files of your directory against their schemas, then what they compose to: each file once with the choices of
-the command line, else the defaults; each vehicle also with each graph and source of yours. Without a directory the
-packaged files are checked, and the one configuration that the command line names. With all=true every vehicle meets
-every graph and source, every other file is composed once, and a file that refers to another group, or chooses of it,
-meets each file of that group. Packaged experiments, with all their runs, and links are composed as they are.
+Check the files of your directory against their schemas, then the configurations composed from them: each file once with
+the choices of the command line, otherwise the defaults; each vehicle also with each of your graphs and sources. Without
+a directory the packaged files are checked, and the one configuration that the command line names. With all=true every
+vehicle is combined with every graph and source, every other file is composed once, and a file that refers to another
+group, or chooses from it, is combined with each file of that group. Packaged experiments, with all their runs, and
+links are composed as they are.
 
 FILE, a word that ends in .yaml or .yml, limits the check to that file and the files that build on it. Its directory is
-conf=DIR, else the nearest one above it that has folders of groups.
+conf=DIR, otherwise the nearest one above it that has folders of groups.
 
-Where GStreamer is installed, also against its registry: elements, properties, types, ranges, and whether what a knob
-turns may change while playing. Maps, traces and tracks of pqos files are read. Ends with status 2 and all problems at
-once.
+If GStreamer is installed, also against its registry: elements, properties, types, ranges, and whether the properties
+that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends with status 2 and reports
+all problems at once.
 
   tod-runner validate conf=my_vehicles                       your files, the step for your CI
   tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit
@@ -44,11 +45,11 @@ from runner.errors import ConfigError, MissingBindings, Problem, UserError
 from runner.graph import Plan
 from runner.verbs import Arguments
 
-DATA = ("maps", "traces")  # folders for what pqos files name; a bandwidth map may be YAML
-CROSSED = ("vehicle", "graph", "source")  # groups whose files meet each other
-STANDING_ALONE = ("experiment", "link")  # packaged, never meet a choice of the command line
+DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
+CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
+STANDING_ALONE = ("experiment", "link")  # packaged ones are never combined with choices of the command line
 ConfigReader = Callable[[Configuration], object]
-READERS: dict[str, ConfigReader] = {  # by group, what reads its part of the configuration, if not the vehicle
+READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
     "study": Configuration.study,
     "link": Configuration.experiment,
@@ -57,14 +58,14 @@ ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
 
 class ExperimentRun(NamedTuple):
-    """One of the runs of an experiment: where it stands, and the overrides that it adds."""
+    """One of the runs of an experiment: its location, and the overrides that it adds."""
 
     file: str
     path: str
     words: tuple[str, ...]
 
     def attributed(self, problem: Problem) -> Problem:
-        """A problem of the command line, attributed to the run if that has the word."""
+        """A problem of the command line, attributed to the run if the word is from there."""
         word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
         if problem.file != COMMAND_LINE or word is None:
             return problem
@@ -72,7 +73,7 @@ class ExperimentRun(NamedTuple):
 
 
 class ValidationTask(NamedTuple):
-    """A configuration to check: overrides, files that are chosen on top, and the run of an experiment among those."""
+    """A configuration to check: overrides, files chosen on top, and the run of an experiment among those."""
 
     overrides: tuple[str, ...]
     choices: ChosenFiles = ()
@@ -84,7 +85,7 @@ class ValidationTask(NamedTuple):
 
     @property
     def readers(self) -> Sequence[ConfigReader]:
-        """What is asked of the configuration."""
+        """The readers to apply to the configuration."""
         if not self.choices or "experiment" in dict(self.choices):
             return Configuration.pqos, Configuration.experiment
         return [READERS.get(group, Configuration.vehicle) for group, _ in self.choices]
@@ -146,7 +147,7 @@ def _has_groups(directory: Path) -> bool:
 
 
 def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> tuple[list[Problem], int]:
-    """The YAML files of some directories, or some of them, against the schemas of their groups; and how many."""
+    """Check the YAML files of directories, or some of them, against the schemas of their groups; and count them."""
     problems: list[Problem] = []
     count = 0
     for directory in directories:
@@ -159,7 +160,7 @@ def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> 
 
 
 def _yaml_files(directory: Path) -> Iterator[Path]:
-    """Files with an ending of YAML or JSON; those of data and of hidden folders aside."""
+    """YAML files, except those in data folders and hidden folders."""
     for folder, folders, names in os.walk(directory):
         top = Path(folder) == directory
         folders[:] = sorted(name for name in folders if name[0] != "." and not (top and name in DATA))
@@ -204,13 +205,13 @@ def _misplaced(group: str, relative: Path) -> str | None:
     return None
 
 
-# --- what they compose to ---------------------------------------------------------------------------------------------
+# --- composed configurations ------------------------------------------------------------------------------------------
 
 
 class _Tasks:
-    """What to compose.
+    """The configurations to compose.
 
-    named  what must take part in a configuration for it to be checked; None: anything
+    named  only configurations that use one of these files are checked; None: all
     """
 
     def __init__(
@@ -233,7 +234,7 @@ class _Tasks:
         return list(dict.fromkeys(choice for task in self._tasks for choice in task.choices))
 
     def _all(self) -> Iterator[ValidationTask]:
-        """Single files before those that they meet; the same may come twice."""
+        """Single files before combinations; the same task may occur twice."""
         yield ValidationTask(self._overrides)
         for group, names in self._files.items():
             for name in names:
@@ -258,10 +259,10 @@ class _Tasks:
             yield from (task._replace(run=run) for run in _runs(name, task.words, self._user))
 
     def _reached(self) -> Iterator[ValidationTask]:
-        """Files that refer to other groups or choose of them, with every choice of those."""
+        """Files that refer to other groups or choose from them, with every choice of those."""
         for group, names in self._files.items():
             for name in names if group not in STANDING_ALONE else ():
-                with suppress(ConfigError):  # reported of the file alone
+                with suppress(ConfigError):  # reported for the file alone
                     for other in reaches(find_file(self._directories, group, name)):
                         for choice in self._files.get(other, ()):
                             yield ValidationTask(self._overrides, ((group, name), (other, choice)))
@@ -279,7 +280,7 @@ class _Tasks:
 
 
 def _settled(words: Iterable[str]) -> set[str]:
-    """Groups that the command line chooses of, or changes values of; such a value is meant for what is in force."""
+    """Groups from which the command line chooses, or whose values it changes; such a value is for the file in force."""
     keys = {word.lstrip("+~").partition("=")[0].partition("@")[0].partition(".")[0].lstrip("/") for word in words}
     return keys | ({"vehicle"} if "cameras" in keys else set())
 
@@ -288,7 +289,7 @@ _composed = lru_cache(maxsize=32)(compose)  # experiments are composed to see th
 
 
 def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[ExperimentRun]:
-    """The runs of an experiment; none where it cannot be composed, which another task reports."""
+    """The runs of an experiment; none if it cannot be composed, which another task reports."""
     try:
         section = _composed(overrides, user).document.get("experiment")
     except ConfigError:
@@ -304,7 +305,7 @@ def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Ite
 class _Checker:
     """Checks configurations one after the other.
 
-    broken  files that cannot be composed or are wrong: what they meet is not checked
+    broken  files that cannot be composed or are wrong: combinations with them are not checked
     fine    sections that the schemas accept, by key and identity
     """
 
@@ -323,7 +324,7 @@ class _Checker:
             self._check_composed(task)
 
     def _is_fine_assembled(self, task: ValidationTask) -> bool:
-        """Whether there is nothing wrong with a configuration made of sections; what is wrong is looked at composed."""
+        """Whether a configuration assembled from sections is valid; an invalid one is checked again composed."""
         if task.run or task.overrides != self.combinations.overrides:
             return False
         assembled = self.combinations.assembled(dict(task.choices))
@@ -360,7 +361,7 @@ def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Pr
 
 
 def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
-    """The check against GStreamer's registry; what it could not look at goes to the notes."""
+    """The check against GStreamer's registry; anything it could not check goes to the notes."""
     try:
         from runner.apply import check_plan, missing_plugins, missing_recorders
     except MissingBindings as error:

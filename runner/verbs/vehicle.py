@@ -1,8 +1,8 @@
 """usage: tod-runner vehicle [OVERRIDE ...] [log=DIR] [duration_s=N]
 
 The vehicle's side: an RTSP server with one stream per camera at rtsp://HOST:8554/CAMERA, the rules that set bitrate and
-size of each, the source of predictions, and the control link. Needs an MQTT broker at control.host. Ends with Ctrl-C or
-after duration_s. With log=DIR events, decisions and telemetry are written to DIR/drive.jsonl, which must not be there.
+size of each, the prediction source, and the control link. Needs an MQTT broker at control.host. Ends with Ctrl-C or
+after duration_s. With log=DIR events, decisions and telemetry are written to DIR/drive.jsonl, which must not exist.
 
   tod-runner vehicle                                        the paper's vehicle with a synthetic drive
   tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link

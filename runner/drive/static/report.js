@@ -1,4 +1,4 @@
-/** Draws the charts of a report from the data in the page. Nothing is loaded from anywhere. */
+/** Draws the charts of a report from the data in the page. It loads nothing from elsewhere. */
 "use strict";
 
 /** An element of the page; the page has every element that is looked up. */
@@ -18,23 +18,23 @@ const by = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const data = JSON.parse(by("data").textContent ?? "");
 const KEY = "tod-report-theme";
 const DASHES = ["solid", "6px,2px", "2px,2px", "7px,2px,2px,2px"];
-const SEEN = 0.004; // of the axis: the least width of a freeze that is seen
+const SEEN = 0.004; // of the axis: the smallest visible width of a freeze
 const VIRIDIS = ["#440154", "#482878", "#3e4a89", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
 
 const root = document.documentElement;
 const isDay = () => root.dataset.theme === "day";
 const themed = (name) => getComputedStyle(root).getPropertyValue(`--${name}`).trim();
-// Texts of the drive are shown in plotly's labels, which know a little HTML.
+// Texts of the drive are shown in plotly's labels, which interpret some HTML.
 const plain = (text) => String(text).replace(/[&<>]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[c] ?? c).replaceAll("\n", "<br>");
 
-/** A camera's place in the palette, or a name of the style sheet. */
+/** Colour of a camera's index in the palette, or of a name in the style sheet. */
 function colourOf(colour) {
   if (typeof colour === "string") return themed(colour);
   const colours = isDay() ? data.day : data.night;
   return colours[colour % colours.length];
 }
 
-/** What is not seen on the ground is left out: the lightest by day, the darkest by night. */
+/** Colours that the background would hide are left out: the lightest by day, the darkest by night. */
 function viridis() {
   const shown = isDay() ? VIRIDIS.slice(0, -1) : VIRIDIS.slice(2);
   return shown.map((colour, i) => [i / (shown.length - 1), colour]);
@@ -70,7 +70,7 @@ function freezes({ label, colour, spans }, x, unit_s) {
   };
 }
 
-/** The way, the bitrate on it, arrows, its ends, and where one points at. @param {Track} track */
+/** The way, the bitrate on it, arrows, its ends, and the position pointed at. @param {Track} track */
 function mapped({ way: [x, y], t, east, north, kbps, low, high, title, arrows }) {
   const bar = { title: { text: title, side: "right", font: { size: 13 } }, thickness: 12, outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
   const markers = { type: "scatter", mode: "markers", hoverinfo: "skip" };
@@ -100,7 +100,7 @@ function axisOf({ title, low, high, marks, log, percent }) {
   };
 }
 
-/** Freezes have rows of their own below the curves. @param {Chart} chart */
+/** Freezes have their own rows below the curves. @param {Chart} chart */
 function stripOf({ strip, x, y }) {
   if (!strip) return {};
   const rows = strip.bars.length;
@@ -114,9 +114,9 @@ function stripOf({ strip, x, y }) {
   };
 }
 
-// --- when they draw ---------------------------------------------------------------------------------------------------
+// --- drawing ----------------------------------------------------------------------------------------------------------
 
-/** @type {any[]} what plotly draws into, in the order of the data */
+/** @type {any[]} elements that plotly draws into, in the order of the data */
 const charts = [...document.querySelectorAll(".chart")];
 const config = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
 
@@ -144,7 +144,7 @@ function draw(element) {
   if (overTime) element.on("plotly_hover", ({ points }) => point(chart, points[0].x));
 }
 
-/** Marks on the map where the vehicle was at a time of a chart. */
+/** Marks the vehicle's position on the map at a time of a chart. */
 function point({ drive, unit_s }, at) {
   const index = data.charts.findIndex((each) => each.track && each.drive === drive);
   const track = data.charts[index]?.track;
@@ -155,7 +155,7 @@ function point({ drive, unit_s }, at) {
   Plotly.restyle(map, { x: [[track.east[now]]], y: [[track.north[now]]] }, [map.data.length - 1]);
 }
 
-/** One after the other, so that the page is never stuck. */
+/** One after the other, so that the page is never blocked. */
 function drawAll() {
   for (const [i, element] of charts.entries()) setTimeout(draw, i * 5, element);
 }
@@ -165,7 +165,7 @@ function drawAll() {
 const light = matchMedia("(prefers-color-scheme: light)");
 const button = by("theme");
 
-/** A file's page may have no storage. */
+/** A page opened from a file may have no storage. */
 function kept(value) {
   try {
     if (value) localStorage.setItem(KEY, value);

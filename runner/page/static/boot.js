@@ -1,12 +1,12 @@
 /**
- * Starts the worker before anything else: it connects and decodes while the rest of the page is still loading. No module,
- * since those wait for the whole document.
+ * Starts the worker before anything else: it connects and decodes while the rest of the page is loading. Not a module,
+ * since modules wait for the whole document.
  */
 "use strict";
 
 const canShowVideo =
   typeof VideoDecoder !== "undefined" && typeof HTMLCanvasElement.prototype.transferControlToOffscreen === "function";
-const early = []; // what the worker tells until somebody listens
+const early = []; // the worker's messages before there is a listener
 const worker = new Worker("/static/video.js", { type: "module" });
 globalThis.boot = { canShowVideo, early, worker };
 
@@ -26,8 +26,8 @@ function liveUrl() {
 }
 
 /**
- * A random name of this viewer, the same after a reload. It lies in the tab's storage only from one document to the next,
- * since a tab that is duplicated takes the storage with it and must not take control as well.
+ * A random name of this viewer, the same after a reload. It is in the tab's storage only from one document to the next,
+ * since a duplicated tab copies the storage and must not take control as well.
  */
 function token() {
   const key = "tod-viewer";

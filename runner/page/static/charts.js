@@ -1,4 +1,4 @@
-/** Charts of the last five minutes and the map. Plotly is large: it comes after the first pictures, and draws when seen. */
+/** Charts of the last five minutes and the map. Plotly is large: it loads after the first pictures. */
 
 import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
@@ -7,7 +7,7 @@ import { by, make, spoken } from "./format.js";
 const SHOWN_S = 300;
 const SETTLE_MS = 1500; // from the first picture to loading the charts
 const AT_LATEST_MS = 4000; // without any picture
-const BETWEEN_MS = 60; // from one chart to the next: no long task
+const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
 
 const visible = new Set();

@@ -6,8 +6,8 @@ const KEPT = 20; // echoes; one a second
 export const now = () => performance.timeOrigin + performance.now();
 
 /**
- * Offset between the station's clock and the page's. An echo bounds it to half its delay to either side; the bounds of
- * the fastest recent echo are kept to, so that slow echoes of a busy start do not move the clock.
+ * Offset between the station's clock and the page's. An echo bounds it to within half its delay; the bounds of the
+ * fastest recent echo apply, so that slow echoes of a busy start do not move the clock.
  */
 export class Clock {
   echoes = [];
@@ -22,7 +22,7 @@ export class Clock {
     this.offset = Math.min(Math.max(this.offset, best.offset - best.delay / 2), best.offset + best.delay / 2);
   }
 
-  /** A time of the page on the station's clock. */
+  /** A page time converted to the station's clock. */
   server(page) {
     return page + this.offset;
   }

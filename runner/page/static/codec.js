@@ -1,4 +1,4 @@
-/** The little of H.264 and H.265 (Annex B) that a page has to know: the codec string that WebCodecs asks for. */
+/** The part of H.264 and H.265 (Annex B) that a page needs: the codec string for WebCodecs. */
 
 const HEADERS = { h264: 1, h265: 2 }; // bytes of a NAL unit's header
 const TYPES = { h264: (byte) => byte & 0x1f, h265: (byte) => (byte >> 1) & 0x3f };
@@ -9,10 +9,10 @@ export const nameOf = (codec) => NAMES[codec] ?? "video that is neither H.264 no
 export const isKnown = (codec) => codec in NAMES;
 
 /**
- * The sequence parameter set of a key unit, without its header; another one is another stream, for a decoder set up anew.
+ * The sequence parameter set of a key unit, without its header; if it differs, so does the stream: a new decoder is needed.
  * @param {Uint8Array} unit one access unit, Annex B
  * @param {"h264"|"h265"} codec
- * @returns {Uint8Array|null} null where the unit holds none
+ * @returns {Uint8Array|null} null if the unit holds none
  */
 export function spsOf(unit, codec) {
   const starts = [];
@@ -47,5 +47,5 @@ function hev1(sps) {
   return `hev1.${parts.join(".")}`.toUpperCase().replace("HEV1", "hev1");
 }
 
-/** Without the bytes that keep start codes from appearing (7.4.1.1). */
+/** Without the emulation prevention bytes (7.4.1.1). */
 const withoutEmulation = (data) => data.filter((byte, i) => !(byte === 3 && i > 1 && data[i - 1] === 0 && data[i - 2] === 0));

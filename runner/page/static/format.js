@@ -1,11 +1,11 @@
-/** Numbers and small pieces of the page. */
+/** Formatting of numbers, and small helpers for the page's elements. */
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0, useGrouping: false });
 
 /** A whole number, "–" where unknown. */
 export const whole = (value) => (Number.isFinite(value) ? WHOLE.format(value) : "–");
 
-/** A factor as short as it is exact: 0.25, 0.125. */
+/** A factor in its shortest exact form: 0.25, 0.125. */
 export const factor = (value) => (Number.isFinite(value) ? String(Math.round(value * 1e4) / 1e4) : "–");
 
 export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
@@ -20,7 +20,7 @@ export const clockTime = (seconds) => new Date(seconds * 1000).toTimeString().sl
 export const spoken = (name) => name.replaceAll("_", " ");
 
 /**
- * The element that the page's document gives an id.
+ * The page's element with an id.
  * @template {HTMLElement} [E=HTMLElement]
  * @param {string} id
  * @param {new () => E} [kind]
@@ -51,12 +51,12 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Write a text only where it differs: the page is written four times a second, and mostly the same. */
+/** Write a text only if it differs: the page is updated four times a second, mostly with the same values. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Set or take away an attribute, only where it differs. */
+/** Set or remove an attribute, only if it differs. */
 export function mark(element, name, value) {
   const text = value === false || value === null || value === undefined ? null : String(value);
   if (element.getAttribute(name) === text) return;

@@ -5,7 +5,7 @@ import { pending, request, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
 import { by, mark, whole, write } from "./format.js";
 
-const START_MS = 800; // no alarm while the page is just opening
+const START_MS = 800; // no alarm while the page is opening
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 
 const buttons = [...by("modes").querySelectorAll("button")];

@@ -1,10 +1,10 @@
-/** Where the tiles go: rows as the vehicle file places them, pictures in the aspect of the full image. */
+/** Layout of the tiles: rows as placed in the vehicle file, pictures in the aspect ratio of the full image. */
 
 const GAP = 8;
-const EVEN = 1.25; // a row is at most this much higher than the highest row that the width limits
+const EVEN = 1.25; // a row is at most this much higher than the highest row limited by the width
 
 /**
- * Rows of tiles. Cameras without a place follow in rows of their own, as long as the longest row that has places.
+ * Rows of tiles. Cameras without a place follow in separate rows, as long as the longest row with places.
  * @returns {{camera: object, column: number}[][]}
  */
 export function rowsOf(cameras) {
@@ -24,7 +24,7 @@ export function rowsOf(cameras) {
 /**
  * Height of the pictures in each row: rows share the height, none is wider than the area.
  * @param {{camera: {width, height}}[][]} rows  @param {number} width  @param {number} height of the area
- * @param {number} chrome height of what is not picture in a tile
+ * @param {number} chrome height of a tile without its picture
  */
 export function heightsOf(rows, width, height, chrome) {
   const available = height - rows.length * chrome - (rows.length - 1) * GAP;

@@ -1,4 +1,4 @@
-/** The page's end of the worker: messages of the station come in here, requests and canvases go out. */
+/** The page's end of the worker: messages from the station come in here, requests and canvases go out. */
 
 import { publish, store, take } from "./store.js";
 
@@ -29,7 +29,7 @@ const heard = {
   },
 };
 
-/** Hand on what the worker tells, from its first message on. */
+/** Pass on the worker's messages, from its first one on. */
 export function start() {
   for (const data of early) heard[data.kind](data);
   worker.onmessage = ({ data }) => heard[data.kind](data);
@@ -43,7 +43,7 @@ export function giveCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
-/** How large a canvas is on the screen, in CSS pixels. */
+/** Report the size of a canvas on the screen, in CSS pixels. */
 export const tellSize = (name, width, height) =>
   worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio });
 

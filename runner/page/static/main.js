@@ -1,4 +1,4 @@
-/** Wires the page: one module for each part of it, all fed by what the worker hands on from the station. */
+/** Wires the page: one module for each part, all fed by the messages that the worker passes on from the station. */
 
 import { ask, send, start } from "./link.js";
 import { listen, store } from "./store.js";

@@ -1,4 +1,4 @@
-/** News, newest first, and toasts for what needs a look now. */
+/** News, newest first, and toasts for what needs immediate attention. */
 
 import { listen, store } from "./store.js";
 import { by, clockTime, make, write } from "./format.js";
@@ -30,7 +30,7 @@ function toast({ text, level }) {
   setTimeout(() => element.remove(), TOAST_MS[level]);
 }
 
-/** Where there is room, the whole list stands below the tiles; else its newest line does, and the list has a tab. */
+/** If there is room, the whole list is below the tiles; otherwise only its newest line, and the list has a tab. */
 function place() {
   const strip = by("strip");
   if (roomy.matches) strip.replaceChildren(list);

@@ -1,6 +1,6 @@
 /**
- * Alarms, drawn by the worker into the picture itself: they come even when the page's main thread is busy.
- * Colour, word and shape say the same: LOST a cross, FROZEN a hatch, LATE a dashed frame.
+ * Alarms, drawn by the worker into the picture itself: they appear even when the page's main thread is busy.
+ * Colour, word and shape agree: LOST a cross, FROZEN a hatch, LATE a dashed frame.
  */
 
 const RED = "#e01b24";
@@ -29,7 +29,7 @@ function drawLate(context, width, height, side, text) {
   plate(context, width / 2, height - side * 0.15, side * 0.13, text, AMBER, "#000");
 }
 
-/** Take colour and light from the last picture: it must not be taken for a live one. */
+/** Desaturate and darken the last picture, so that it is not mistaken for a live one. */
 function dim(context, width, height, dark) {
   context.globalCompositeOperation = "saturation";
   context.fillStyle = "#000";

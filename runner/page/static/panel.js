@@ -146,7 +146,7 @@ function refreshSettings(about, now) {
   write(weightNote, whyNot() ?? (mode() === "single" ? "acts in A and C, not in S" : "share of the total"));
 }
 
-/** A number shows what is in force, except while it is being changed or asked for. */
+/** A number shows the value in force, except while it is being edited or requested. */
 function fill(input, value, why, asked) {
   input.disabled = Boolean(why);
   input.title = why ?? "";
@@ -175,7 +175,7 @@ function refreshComparison(now) {
   const applied = now?.applied ?? {};
   const yes = (value) => (value === undefined ? "–" : value ? "yes" : "no");
   const differs = now ? unapplied(now) : [];
-  // An encoder that gets no frames keeps its last setting: that is no bitrate that is sent.
+  // An encoder that gets no frames keeps its last setting: that is not the sent bitrate.
   const kept = (value) => (applied.sending === false && value !== "–" ? `– (keeps ${value})` : value);
   const values = {
     sending: [yes(now?.sending), yes(applied.sending)],
@@ -191,7 +191,7 @@ function refreshComparison(now) {
   write(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
 }
 
-/** Where the region lies in the full image: solid what is seen, dashed what is asked for. */
+/** Position of the region in the full image: solid as shown, dashed as requested. */
 function refreshDiagram(about) {
   diagram.box.style.aspectRatio = `${about.width} / ${about.height}`;
   const place = (element, roi) => {

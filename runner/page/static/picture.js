@@ -1,7 +1,7 @@
 /**
  * A decoded picture that can be painted, in one of two ways. With a GPU the VideoFrame itself is drawn. Without one,
  * Chromium's drawImage(VideoFrame) in a worker waits for the page's main thread, so that a busy page would stop all
- * video and its alarms: there the planes are copied out of the frame and turned into pixels here, which waits for nobody.
+ * video and its alarms: then the planes are copied out of the frame and converted to pixels here, without waiting.
  */
 
 import { toRgba } from "./yuv.js";
@@ -14,9 +14,9 @@ const ASK_MS = 3000;
 
 /** @typedef {{bytes: Uint8Array, image: ImageData}} Memory */
 /** @type {Memory[]} */
-const spare = []; // memory of pictures that are closed
+const spare = []; // memory of closed pictures
 
-/** A frame, as it is; closed when the next one is shown. */
+/** A frame, unchanged; closed when the next one is shown. */
 class FramePicture {
   /** @param {VideoFrame} frame */
   constructor(frame) {
@@ -42,7 +42,7 @@ class FramePicture {
   }
 }
 
-/** The planes of a frame; turned into pixels when first painted, since not every decoded picture is. */
+/** The planes of a frame; converted to pixels when first painted, since not every decoded picture is. */
 class PlanePicture {
   converted = false;
 
@@ -82,7 +82,7 @@ class PlanePicture {
   }
 }
 
-/** Whether this browser draws with a GPU. Asking takes a while, so the first pictures are drawn without knowing. */
+/** Whether this browser draws with a GPU. The check takes a while: the first pictures are drawn without it. */
 export let hasGpu = false;
 setTimeout(() => (hasGpu = askForGpu()), ASK_MS);
 
@@ -101,14 +101,14 @@ function memoryFor(width, height, size) {
   return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
 }
 
-/** Square pixels in a known format: what can be turned into pixels here. */
+/** Whether a frame has square pixels in a known format, and can be converted to pixels here. */
 function isPlain({ displayWidth, displayHeight, visibleRect, format }) {
   return FORMATS.includes(format) && visibleRect.width === displayWidth && visibleRect.height === displayHeight;
 }
 
 /**
- * The picture of a frame, which is closed here or with the picture. Where the screen shows less than half of its pixels
- * and they are turned into colours here, every fourth is enough.
+ * The picture of a frame, which is closed here or with the picture. If it is shown at half its width or less and
+ * converted to pixels here, every fourth pixel is enough.
  * @param {VideoFrame} frame  @param {number} shown width on the screen, px
  * @typedef {FramePicture|PlanePicture} Picture
  * @returns {Promise<Picture>}
@@ -117,7 +117,7 @@ export async function pictureOf(frame, shown) {
   if (hasGpu || !isPlain(frame)) return new FramePicture(frame);
   try {
     const { colorSpace, displayWidth: width, displayHeight: height } = frame;
-    const format = /** @type {Format} */ (frame.format); // else it is not plain
+    const format = /** @type {Format} */ (frame.format); // isPlain has checked it
     const step = shown > 0 && 2 * shown <= width ? 2 : 1;
     const memory = memoryFor(width / step, height / step, frame.allocationSize());
     const planes = await frame.copyTo(memory.bytes);

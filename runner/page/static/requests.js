@@ -19,9 +19,9 @@ let count = 0;
 
 /**
  * Send an event.
- * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it takes the place of an older
+ * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it replaces an older one
  * @param {object} event without id
- * @param {string} words what is asked for, for the news where it fails
+ * @param {string} words what is requested, for the news if it fails
  */
 export function request(control, event, words) {
   if (!inControl()) return complain(whyNoControl());
@@ -43,7 +43,7 @@ export function whyNoControl() {
   return "take control first (t)";
 }
 
-/** Say that something did not go, in a toast and in the news. */
+/** Report a problem in a toast. */
 export function complain(text) {
   publish("toast", { text, level: "problem" });
 }

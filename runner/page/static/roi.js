@@ -4,11 +4,11 @@ import { camera, decided, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { make, sameRegion } from "./format.js";
 
-const START_PX = 6; // a hand that clicks trembles less than this
+const START_PX = 6; // the pointer moves less than this in a click
 export const SMALLEST = 16;
-const views = new Map(); // by camera: shows the region that is waited for
+const views = new Map(); // by camera: shows the region that is pending
 
-/** What is on the picture: the region that was read back, else the one decided. */
+/** The region on the picture: the one read back, otherwise the one decided. */
 export const seenRegion = (name) => {
   const now = decided(name);
   return now?.applied.roi ?? now?.roi ?? null;
@@ -32,7 +32,7 @@ export function regionOf(box, roi, full, a, b) {
   return { x, y, width, height };
 }
 
-/** Whole numbers between the bounds of what is seen; never smaller than the smallest, never outside the image. */
+/** Whole numbers within the visible bounds; never smaller than the smallest, never outside the image. */
 function snap(sides, low, high, end) {
   const [from, to] = sides;
   const start = Math.round(Math.max(low, Math.min(from, high - 1)));
@@ -58,7 +58,7 @@ export function whyNoRegion() {
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
-/** Let a box with a picture be dragged on. */
+/** Let the operator drag a region on a box with a picture. */
 export function dragRegion(name, box) {
   const rectangle = make("div", { class: "roi-drag", hidden: true });
   box.append(rectangle);
@@ -120,7 +120,7 @@ export function dragRegion(name, box) {
 
 listen("requests state", () => views.forEach((refresh) => refresh()));
 
-/** The region that was asked for, or decided, and is not yet the one on the picture. */
+/** The region that was requested or decided, and is not yet the one on the picture. */
 export function waiting(name) {
   const asked = pending(`roi:${name}`)?.event;
   if (asked) return asked;

@@ -1,9 +1,9 @@
 /** Arithmetic of a slider for bitrates. */
 
 export const STEPS = 1000;
-const SPAN = 200; // the right end over the left end; rates below are set by number
+const SPAN = 200; // ratio of the right end to the left end; lower rates are set by number
 
-// Even steps are even ratios: a little matters much at low rates, and no key press goes from plenty to nothing.
+// Equal steps are equal ratios: small changes matter at low rates, and no key press goes from a high rate to none.
 
 /** The bitrate at a step of a slider that ends at `max`, kbit/s. */
 export const toKbps = (step, max) => Math.max(1, Math.round(max * SPAN ** (step / STEPS - 1)));

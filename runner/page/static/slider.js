@@ -1,6 +1,6 @@
 /**
- * A slider and a number for one value in kbit/s. The thumb follows the hand; the value in force stands beside it as a
- * mark and a number; after the vehicle's answer the thumb goes to the value in force.
+ * A slider and a number for one value in kbit/s. The thumb follows the hand; the value in force is shown beside it as a
+ * mark and a number; after the vehicle's answer the thumb moves to the value in force.
  */
 
 import { pending } from "./requests.js";

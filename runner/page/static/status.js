@@ -1,7 +1,7 @@
-/** What a tile has to say about its stream: judged from times alone, so that it can be reasoned about without video. */
+/** The status of a tile's stream: judged from times alone, so that it can be tested without video. */
 
 const LOST_MS = 1000;
-const INTERVALS = 1.3; // this many frame intervals without a picture are no jitter any more
+const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
  * @typedef {object} Times what is known of a stream
@@ -9,8 +9,8 @@ const INTERVALS = 1.3; // this many frame intervals without a picture are no jit
  * @property {boolean} online
  * @property {boolean|null} on
  * @property {boolean|null} sending
- * @property {string} refused why there is no decoder, "" where there is one
- * @property {boolean} drawn a picture since the stream was last started
+ * @property {string} refused why there is no decoder, "" if there is one
+ * @property {boolean} drawn whether a picture was drawn since the stream last started
  * @property {number} arrived page time of the newest unit, or of the start of the stream
  * @property {number} decoded likewise
  * @property {number} late_until page time

@@ -77,7 +77,7 @@ export const store = {
   connected: false,
   notes: [],
   series: emptySeries([]),
-  status: {}, // by camera, as the worker judges
+  status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
   ages: {}, // by camera, capture to drawing
   selected: null,
@@ -93,7 +93,7 @@ export function publish(kind, payload) {
   for (const listener of listeners.get(kind) ?? []) listener(payload);
 }
 
-/** Take a text message of the station into the store. */
+/** Store a text message from the station. */
 export function take(message) {
   const { kind } = message;
   if (kind === "hello") hello(message);
@@ -115,7 +115,7 @@ function hello(message) {
 }
 
 /**
- * One line of news, newest first; lines of the page itself come by this way too.
+ * One line of news, newest first; lines from the page itself are added here too.
  * @param {{time?: number, text: string, level?: string}} note
  */
 export function note({ time = Date.now() / 1000, text, level = "note" }) {

@@ -10,12 +10,12 @@ export const KEY = 1;
 export const CATCH_UP = 2;
 export const RESTART = 4;
 
-const QUEUE = 40; // units waiting in the decoder: beyond this, starting again from a burst is quicker
-const LAG_MS = 2000; // older than usual by this much: as long as the burst that would come instead
-const RESYNC_EVERY_MS = 2000; // doubled each time that it did not help: a burst costs more than what it repairs
+const QUEUE = 40; // units waiting in the decoder: beyond this, restarting from a burst is faster
+const LAG_MS = 2000; // delay beyond the usual one: as long as the burst that would come instead
+const RESYNC_EVERY_MS = 2000; // doubled each time it did not help: a burst costs more than the fault it repairs
 const RESYNC_SELDOM_MS = 16000;
 const SETTLE_MS = 2000; // after a restart the decoder may take this long for the burst
-const LATE_HOLD_MS = 500; // one late picture is seen as long as this
+const LATE_HOLD_MS = 500; // how long one late picture is indicated
 const STAGES = 1200;
 
 /** @typedef {import("./picture.js").Picture} Picture */
@@ -28,8 +28,8 @@ export class Stream {
   late_until = 0;
 
   /**
-   * @param {object} camera as hello tells
-   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), wake() asks for a drawing
+   * @param {object} camera as in hello
+   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), wake() requests a redraw
    */
   constructor(camera, station) {
     this.camera = camera;
@@ -47,7 +47,7 @@ export class Stream {
     this.waiting = null; // newest decoded picture, not drawn yet
     /** @type {Shown|null} */
     this.shown = null; // picture last drawn, kept for alarms and for tests
-    this.meta = new Map(); // by timestamp: what is known of a unit in the decoder
+    this.meta = new Map(); // by timestamp: metadata of a unit in the decoder
     this.timestamp = 0;
     this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // of the decoder, the last one
@@ -62,11 +62,11 @@ export class Stream {
     this.status = this.reported = "synchronising";
     /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
-    this.late_age = NaN; // of the last picture that was late
+    this.late_age = NaN; // of the last late picture
     this.started();
   }
 
-  /** The stream begins, or begins again: silence counts from now. */
+  /** The stream starts or restarts: silence counts from now. */
   started() {
     this.arrived = this.decoded = now();
     this.drawn = false;
@@ -110,7 +110,7 @@ export class Stream {
     this.restarted = now();
   }
 
-  /** A key unit sets the decoder up, anew where its parameters are others. */
+  /** A key unit sets the decoder up, and again if its parameters change. */
   configure(data) {
     const sps = spsOf(data, this.camera.codec);
     if (!sps || (this.decoder && String(sps) === this.sps)) return;
@@ -126,14 +126,14 @@ export class Stream {
     decoder.configure({ codec, optimizeForLatency: true });
   }
 
-  /** Why the browser does not decode this stream, "" where it can. Browsers name the error differently. */
+  /** Why the browser does not decode this stream, "" if it can. Browsers name the error differently. */
   async refusal(codec) {
     const { supported } = await VideoDecoder.isConfigSupported({ codec }).catch(() => ({ supported: false }));
     const name = nameOf(this.camera.codec);
     return supported ? "" : `This browser has no decoder for ${name} (${codec}). Choose a graph of H.264, or a browser that has one.`;
   }
 
-  /** Another stream may be of a profile that the browser decodes. */
+  /** A different stream may have a profile that the browser decodes. */
   reconsider(data) {
     const sps = spsOf(data, this.camera.codec);
     if (sps && String(sps) !== this.sps) this.refused = "";
@@ -146,7 +146,7 @@ export class Stream {
     try {
       this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
     } catch (error) {
-      this.failed(error); // a delta where the decoder wants a key
+      this.failed(error); // a delta unit when the decoder expects a key unit
     }
   }
 
@@ -159,7 +159,7 @@ export class Stream {
     return transit > this.transit + LAG_MS;
   }
 
-  /** The decoder is still busy with the burst that came first. */
+  /** Whether the decoder is still busy with the initial burst. */
   settling() {
     return !this.drawn && now() - this.restarted < SETTLE_MS;
   }
@@ -203,7 +203,7 @@ export class Stream {
     for (const key of this.meta.keys()) if (key <= frame.timestamp) this.meta.delete(key);
     this.counts.decoded++;
     this.decoded = now();
-    const behind = this.settling() && this.queued() > 1; // there is a newer one already
+    const behind = this.settling() && this.queued() > 1; // there is already a newer one
     if (!meta || meta.flags & CATCH_UP || behind) return frame.close();
     this.wait(frame, { ...meta, decoded: this.decoded }, this.decoder);
   }
@@ -251,7 +251,7 @@ export class Stream {
     return { connected, online, on, sending, refused, drawn, arrived, decoded, late_until, fps: this.camera.fps };
   }
 
-  /** Judge the status; returns whether it is another one. Called by a timer. */
+  /** Judge the status; returns whether it has changed. Called by a timer. */
   watch() {
     const time = now();
     this.status = judge(this.times(), this.station.limits, time);
@@ -280,8 +280,8 @@ export class Stream {
   }
 
   /**
-   * The canvas has the picture's size. For an alarm that stands it is a whole multiple of it, near to what the screen
-   * shows, so that words are sharp while the aspect, and with it the page's layout, stays.
+   * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
+   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
    */
   size(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
@@ -308,7 +308,7 @@ export class Stream {
     };
   }
 
-  /** The picture last drawn, as it was decoded: its luma, and when it was captured. */
+  /** The picture last drawn, as decoded: its luma and its capture time. */
   async picture() {
     return this.shown && described(await this.shown.picture.decoded(), this.shown.meta);
   }

@@ -1,4 +1,4 @@
-/** The tabs of the side panel, where there is no room for everything at once. */
+/** The tabs of the side panel, for when there is no room for everything at once. */
 
 import { publish } from "./store.js";
 import { by, mark } from "./format.js";

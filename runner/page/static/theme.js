@@ -1,4 +1,4 @@
-/** Day or night: the operator's choice is kept, else the system's is followed. */
+/** Day or night: the operator's choice is kept, otherwise the system's is used. */
 
 import { publish } from "./store.js";
 import { by } from "./format.js";

@@ -1,4 +1,4 @@
-/** The tiles: one per camera, with its status, its picture and what is known of its stream. */
+/** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
 import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
 import { giveCanvas, tellSize } from "./link.js";
@@ -21,7 +21,7 @@ const scene = by("scene");
 const tiles = new Map();
 let rows = [];
 let described = "";
-let hinted = false; // how to come back from an enlarged picture
+let hinted = false; // whether the way back from an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
   for (const { target } of entries) tellSize(target.getAttribute("data-name"), target.clientWidth, target.clientHeight);
@@ -163,14 +163,14 @@ function refreshCaption(name, { rates, form, reason }) {
   write(reason, now?.reason ?? "");
 }
 
-/** One line of a caption; marked where what is decided was not yet read back. */
+/** One line of a caption; marked if a decided value was not yet read back. */
 function caption(element, differs, text, title) {
   write(element, differs ? `◌ ${text}` : text);
   mark(element, "data-differs", differs ? "" : null);
   mark(element, "title", differs ? `pending: decided, not yet read back; ${title}` : title);
 }
 
-/** What is decided and was not yet read back from the elements. */
+/** The decided values that were not yet read back from the elements. */
 export function unapplied({ on, sending, roi, width, height, kbps, applied }) {
   const found = [];
   if (applied.sending !== undefined && applied.sending !== sending) found.push("sending");

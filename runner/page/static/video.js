@@ -1,12 +1,12 @@
 /**
  * The worker: it holds the WebSocket and all video, so that neither charts nor dialogs of the page delay a picture.
- * Text messages of the station go on to the page as they are; pictures go to the canvases the page has handed over.
+ * Text messages from the station are passed to the page unchanged; pictures go to the canvases that it has transferred.
  */
 
 import { Clock, now } from "./clock.js";
 import { hasGpu } from "./picture.js";
 import { Stream } from "./stream.js";
-// Named here, though used further down, so that all modules are fetched at once.
+// Imported here, though used only by other modules, so that all modules are fetched at once.
 import "./codec.js";
 import "./overlay.js";
 import "./status.js";
@@ -24,16 +24,16 @@ const station = {
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
   online: true,
-  clock_ahead: false, // the vehicle's: ages of pictures are unknown then
+  clock_ahead: false, // the vehicle's: the ages of pictures are then unknown
   video: true,
   resync: (name) => send({ resync: name }),
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
 let socket = null; // null between two attempts
-let moved = 0; // when it was heard last
-let attempts = 0; // at connecting again
-let streams = []; // in the order of hello, which the binary messages count in
+let moved = 0; // when it last received anything
+let attempts = 0; // to reconnect
+let streams = []; // in the order of hello, by which the binary messages are indexed
 let described = "";
 let asleep = true;
 let watched = now();
@@ -57,7 +57,7 @@ function connect() {
   own.onclose = drop;
 }
 
-/** Give up a connection, or an attempt at one, and soon try again. */
+/** Give up a connection, or an attempt at one, and retry soon. */
 function drop() {
   socket.onopen = socket.onmessage = socket.onclose = null;
   socket.close();
@@ -67,8 +67,8 @@ function drop() {
 }
 
 /**
- * Connect once the station answers at all: browsers delay the WebSockets of a page, by seconds, whose attempts have
- * failed many times, and this would go on when the station is back.
+ * Connect once the station answers HTTP: after many failed attempts browsers delay a page's WebSockets by seconds,
+ * and this would continue when the station is back.
  */
 async function reconnect() {
   const answer = await fetch("/static/video.js", { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(CONNECT_MS) }).catch(() => null);
@@ -148,7 +148,7 @@ function wake() {
 function watch() {
   const late = now() - watched > 3 * WATCH_MS;
   watched = now();
-  // After a stall the units that came meanwhile are still in the queue: let them in before judging, at the next tick.
+  // After a stall the units that arrived meanwhile are still queued: take them in first, and judge at the next tick.
   if (late) return;
   supervise();
   judgeAll();
@@ -163,7 +163,7 @@ function judgeAll() {
   }
 }
 
-/** What the page shows of the drawing: the median age of the last pictures. */
+/** Report the ages that the page shows: the median age of the last pictures drawn. */
 function tellAges() {
   const ages = {};
   for (const { name, stages, status } of streams) {

@@ -1,13 +1,13 @@
-/** Pixels of a frame (I420 or NV12, as decoders give them) to RGBA, without asking anything of the browser. */
+/** Converts pixels of a frame (I420 or NV12, as decoders output them) to RGBA, without any browser function. */
 
 const SHIFT = 14;
-const BELOW = 512; // how far a sum may leave 0..255 on either side
+const BELOW = 512; // how far a sum may exceed 0..255 on either side
 const OPAQUE = 0xff << 24;
 const CLAMP = Uint8Array.from({ length: 256 + 2 * BELOW }, (_, i) => Math.min(255, Math.max(0, i - BELOW)));
 const LUMA = { bt709: [0.2126, 0.0722], smpte170m: [0.299, 0.114], bt470bg: [0.299, 0.114] }; // weights of red and blue
 const tables = new Map();
 
-/** Look-up tables of a colour space: one addition for each part of a pixel. */
+/** Look-up tables of a colour space: one addition for each component of a pixel. */
 function tablesOf({ matrix, fullRange }) {
   const key = `${matrix} ${fullRange}`;
   if (!tables.has(key)) tables.set(key, makeTables(LUMA[matrix] ?? LUMA.smpte170m, fullRange));
@@ -29,9 +29,9 @@ function makeTables([red, blue], full) {
 }
 
 /**
- * @param {Uint8Array} bytes of all planes  @param {{offset, stride}[]} planes as VideoFrame.copyTo tells
+ * @param {Uint8Array} bytes of all planes  @param {{offset, stride}[]} planes as returned by VideoFrame.copyTo
  * @param {"I420"|"NV12"} format  @param {{matrix, fullRange}} space
- * @param {ImageData} image written to, of the frame's size, or of half of it each way
+ * @param {ImageData} image output, of the frame's size, or half of it in each direction
  * @param {number} width of the frame
  */
 export function toRgba(bytes, planes, format, space, image, width) {
@@ -49,7 +49,7 @@ export function toRgba(bytes, planes, format, space, image, width) {
   }
 }
 
-/** One row of pixels; two of them share their colour. */
+/** One row of pixels; two neighbours share their chroma. */
 function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
   let { y: ys, u: us, v: vs } = from;
   const end = to + width;
@@ -68,7 +68,7 @@ function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
   }
 }
 
-/** One row of pixels, each the mean of four, which have one colour anyway. */
+/** One row of pixels, each the mean of four that share their chroma anyway. */
 function halfRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
   let { y: ys, u: us, v: vs } = from;
   let low = ys + from.below;

@@ -1,6 +1,6 @@
-"""Picture quality: the metric of a name. The four are described in the modules of their names.
+"""Picture quality: metrics by name. Each of the four is described in the module of its name.
 
-Their modules are imported only when asked for: each needs libraries or tools of its own.
+The modules are imported on demand: each needs its own libraries or tools.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def find_metric(
     brisque_range: Path | None = None,
     vmaf_model: str = VMAF_MODEL,
 ) -> Metric:
-    """The metric of a name.
+    """The metric with this name.
 
     brisque_model, brisque_range  files of the regression and of the feature ranges, see `svr.py`; brisque needs both
-    vmaf_model                    one that libvmaf has built in
+    vmaf_model                    one that is built into libvmaf
     raises  UserError for an unknown name or model, a file that is missing or cannot be read;
-            RunError where no ffmpeg has libvmaf
+            RunError if no ffmpeg has libvmaf
     """
     match name:
         case "psnr":

@@ -1,7 +1,7 @@
 """BRISQUE of luma (A. Mittal, A. K. Moorthy, A. C. Bovik, "No-reference image quality assessment in the spatial
-domain", IEEE Trans. Image Processing 21(12), 2012): 36 features of natural scenes, and a regression of the user's.
+domain", IEEE Trans. Image Processing 21(12), 2012): 36 features of natural scenes, and a regression from the user.
 
-Statistics of natural pictures, so a picture is judged by itself, with no reference; scores need not rise with the
+Statistics of natural pictures, so a picture is judged by itself, without a reference; scores need not rise with the
 bitrate. Equation numbers are those of the paper.
 """
 
@@ -28,13 +28,13 @@ SCALES = 2
 SIDE, SIGMA = 7, 7 / 6  # of the window, px
 FEATURES = 36
 SMALLEST_PX = 2 * SIDE
-NOISE = 1e-4  # a coefficient below it is rounding in a flat window, and has no sign
-SHAPES = np.linspace(0.2, 10, 9801)  # where the shape of a distribution is looked for
+NOISE = 1e-4  # a coefficient below it is rounding noise in a flat window, and has no sign
+SHAPES = np.linspace(0.2, 10, 9801)  # candidates for the shape of a distribution
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows down, columns right (Eq. 7 to 10)
 
 
 def metric(model: Path | None, ranges: Path | None) -> Metric:
-    """BRISQUE with the user's regression, see `svr.py`. Raises UserError for a file that is missing or bad."""
+    """BRISQUE with the user's regression, see `svr.py`. Raises UserError for a missing or invalid file."""
     for key, path, what in (
         ("brisque_model", model, "the regression as libsvm's text or OpenCV's brisque_model_live.yml"),
         ("brisque_range", ranges, "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"),
@@ -63,14 +63,14 @@ def meter(regression: Regression, size: PictureSize, fps: Fraction, stride: int,
 
 
 def score(picture: Luma, regression: Regression) -> float:
-    """0 best to 100 worst; what the regression gives beyond is cut."""
+    """0 best to 100 worst; values of the regression beyond are clipped."""
     return min(100.0, max(0.0, regression(features(picture))))
 
 
 def features(picture: Luma) -> NDArray[np.float64]:
     """The 36 features: at full and at half size the two of a GGD, and four each of an AGGD for four neighbours.
 
-    Half size is OpenCV's bicubic without a low pass before, as in the authors' C++ release: models are trained on it.
+    Half size is OpenCV's bicubic without a low-pass before, as in the authors' C++ release: models are trained on it.
     """
     plane = picture.astype(np.float32)
     height, width = plane.shape
@@ -90,7 +90,7 @@ def normalise(plane: Plane) -> Plane:
 
         (I - mu) / (sigma + 1),  mu and sigma under a 7x7 Gaussian of sigma 7/6           (Eq. 1 to 3, C = 1)
 
-    The picture's border is repeated outward, which the paper leaves open.
+    The picture's border is replicated outward, which the paper leaves open.
     """
     centred = plane - 128  # squares stay small, and float32 exact enough
     mean = _blur(centred)
@@ -115,7 +115,7 @@ def fit_ggd(values: Plane) -> tuple[float, float]:
 
 
 class ProductSums(NamedTuple):
-    """Of a set of values: how many there are in all, below 0 and above; sums of squares and of absolute values."""
+    """Of a set of values: their number in all, below 0 and above; sums of squares and of absolute values."""
 
     total: int
     below: int
@@ -157,7 +157,7 @@ def fit_aggd(seen: ProductSums) -> tuple[float, float, float, float]:
         mean = (right - left) sqrt(Gamma(1/a) / Gamma(3/a)) * Gamma(2/a) / Gamma(1/a)
 
     (N.-E. Lasmar, Y. Stitou, Y. Berthoumieu, "Multiscale skewed heavy tailed model for texture analysis", ICIP 2009.)
-    Of values that are all 0 the shape is the highest, all else 0.
+    For values that are all 0, the shape is the highest, everything else 0.
     """
     left, right = (
         math.sqrt(squares / count) if count else 0.0
@@ -179,5 +179,5 @@ def shape(numerator: float, denominator: float) -> float:
 
 @cache
 def _ratios() -> NDArray[np.float64]:
-    """r(a) of all shapes; it rises."""
+    """r(a) of all shapes; increasing."""
     return np.array([math.exp(2 * math.lgamma(2 / a) - math.lgamma(1 / a) - math.lgamma(3 / a)) for a in SHAPES])

@@ -1,4 +1,4 @@
-"""What a metric of picture quality is, and the meter that scores the pictures of a lane."""
+"""The interface of picture quality metrics, and of meters that score the pictures of a lane."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ PictureSize = tuple[int, int]  # width, height in px
 
 
 class QualityMeter(Protocol):
-    """Scores the pictures of one lane, given in order of frames, from one thread."""
+    """Scores the pictures of one lane, given in frame order, from one thread."""
 
     def add(self, frame: int, reference: Luma, picture: Luma) -> None:
-        """Take one picture and what it should look like, both of the meter's size; nothing is kept of them.
+        """Take one picture and its reference, both of the meter's size; neither is kept.
 
-        raises  ValueError where shape or type differ, RunError where a tool fails
+        raises  ValueError if shape or type differ, RunError if a tool fails
         """
 
     def close(self) -> dict[int, float]:
-        """The score of each frame; ends the meter and frees what it holds. Further calls return the same.
+        """The score of each frame; ends the meter and frees its resources. Further calls return the same.
 
-        returns  score by frame; after a failed `add` nothing
-        raises   RunError where a tool fails, once
+        returns  score by frame; empty after a failed `add`
+        raises   RunError if a tool fails, once
         """
 
 
@@ -41,11 +41,11 @@ class Metric:
     name         psnr, mssim, vmaf or brisque
     label        for an axis of a chart
     identity     everything that changes a score (definition, model, library version): part of cache keys
-    bounds       lowest and highest score there is
+    bounds       lowest and highest possible score
     tolerance    a loss below it is not worth a scaling factor
-    good         quality that b_full is chosen for by default
+    good         quality for which b_full is chosen by default
     build        makes a meter from size, frame rate, stride and mask; call `meter`
-    every_frame  its meters must see every frame; else those that are to be scored
+    every_frame  its meters must see every frame; otherwise only those to be scored
     """
 
     name: str
@@ -65,7 +65,7 @@ class Metric:
 
         size    width and height in px of every picture
         fps     frames per second of the lane
-        stride  of a metric that sees every frame: score each stride-th, from the first on; the others score all given
+        stride  for a metric that sees every frame: score each stride-th, from the first on; the others score all given
         mask    which pixels count (of windows: their centres); None for all
         raises  UserError for pictures that are too small, a mask that the metric cannot use, a mask without a pixel
         """
@@ -100,7 +100,7 @@ class FrameMeter:
 
 
 def check(size: PictureSize, *pictures: Luma) -> None:
-    """Refuse what compiled code would read beyond its end. Raises ValueError."""
+    """Refuse pictures that compiled code would read beyond their end. Raises ValueError."""
     for picture in pictures:
         if picture.shape != size[::-1] or picture.dtype != np.uint8:
             raise ValueError(f"picture of {picture.dtype} {picture.shape}, must be uint8 {size[::-1]}")

@@ -4,11 +4,11 @@ similarity", IEEE Trans. Image Processing 13(4), 2004).
     SSIM(x, y) = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sx^2 + sy^2 + C2)),    C1 = (.01 L)^2, C2 = (.03 L)^2
 
 with mean m, variance s^2 and covariance sxy under an 11x11 Gaussian window of sigma 1.5, L = 255, averaged over all
-windows that lie wholly inside the picture. Full resolution: no decimation before. Computed with d = x - y as
+windows that lie wholly inside the picture. Full resolution: no prior decimation. Computed with d = x - y as
 
     SSIM(x, y) = (1 - md^2 / (mx^2 + my^2 + C1)) (1 - sd^2 / (sx^2 + sy^2 + C2)),
 
-which is the same, and exact enough in float32: of two flat pictures sxy is a small difference of large numbers.
+which is the same, and exact enough in float32: for two flat pictures sxy is a small difference of large numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SIDE, SIGMA = 11, 1.5  # of the window, px
 MARGIN = SIDE // 2
 C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
 ONE = np.float32(1)
-GREY = np.float32(128)  # taken off first: squares stay small, and float32 exact enough
+GREY = np.float32(128)  # subtracted first: squares stay small, and float32 exact enough
 
 PixelRow = NDArray[np.float32]
 PixelRows = np.ndarray[Any, np.dtype[np.float32]]
@@ -58,7 +58,7 @@ def meter(size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> F
     weights = gaussian()
 
     def score(reference: Luma, picture: Luma) -> float:
-        # A crop of a larger picture has gaps between its rows, which the machine code does not know.
+        # A crop of a larger picture has gaps between its rows, which the machine code does not handle.
         return total(np.ascontiguousarray(reference), np.ascontiguousarray(picture), weights, counts) / windows
 
     return FrameMeter(size, score)
@@ -104,7 +104,7 @@ def total(x: Luma, y: Luma, weights: PixelRow, counts: NDArray[np.uint8]) -> flo
 
 @compiled
 def multiply(x: Luma, y: Luma, lines: PixelRows) -> None:
-    """What means are taken of, for one row: x, d, x^2 + y^2 and d^2, with x and y less grey, d = x - y."""
+    """The terms to average, for one row: x, d, x^2 + y^2 and d^2, with x and y less grey, d = x - y."""
     for j in range(len(x)):
         a, b = np.float32(x[j]) - GREY, np.float32(y[j]) - GREY
         d = a - b
@@ -112,12 +112,12 @@ def multiply(x: Luma, y: Luma, lines: PixelRows) -> None:
         lines[2, j], lines[3, j] = a * a + b * b, d * d
 
 
-# Written out below: as loops over the taps they are not turned into vector instructions.
+# Unrolled below: loops over the taps would not be vectorised.
 
 
 @compiled
 def smooth_row(line: PixelRow, w: PixelRow, smooth: PixelRow) -> None:
-    """Weighted mean of each 11 neighbours in a row."""
+    """Weighted mean of every 11 neighbours in a row."""
     for j in range(len(smooth)):
         smooth[j] = (
             w[0] * (line[j] + line[j + 10])
@@ -131,7 +131,7 @@ def smooth_row(line: PixelRow, w: PixelRow, smooth: PixelRow) -> None:
 
 @compiled
 def smooth_column(ring: PixelRows, w: PixelRow, smooth: PixelRow) -> None:
-    """Weighted mean of the 11 lines of a ring; the weights are turned as the ring is."""
+    """Weighted mean of the 11 lines of a ring; the weights are rotated like the ring."""
     w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10]
     for j in range(len(smooth)):
         smooth[j] = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.rate_quality.metrics.interface import FrameMeter, Luma, Mask, Metric, PictureSize, no_pixels
 
-HIGHEST_DB = 100.0  # also of equal pictures, whose ratio is infinite
+HIGHEST_DB = 100.0  # also for equal pictures, whose ratio is infinite
 
 
 def metric() -> Metric:
@@ -38,7 +38,7 @@ def meter(size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> F
 def psnr(reference: Luma, picture: Luma, mask: NDArray[np.uint8] | None, pixels: int) -> float:
     """10 log10(255^2 / MSE) in dB, at most `HIGHEST_DB`.
 
-    mask    not 0 where a pixel counts; None for everywhere
+    mask    nonzero where a pixel counts; None: everywhere
     pixels  how many count
     """
     squares = cv2.norm(reference, picture, cv2.NORM_L2SQR, mask)

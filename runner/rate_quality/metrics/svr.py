@@ -3,7 +3,7 @@
     f(x) = sum_i alpha_i exp(-gamma |v_i - x|^2) - rho               (C.-C. Chang, C.-J. Lin, "LIBSVM", 2011, Eq. 10)
 
 The files: libsvm's text (svm-train -s 3 -t 2) with ranges in the text of svm-scale, or both in OpenCV's YAML
-(cv::ml::SVM::save; a matrix `range` whose rows are the least and the most of each feature, scaled to [-1, 1]).
+(cv::ml::SVM::save; a matrix `range` whose rows are the minimum and maximum of each feature, scaled to [-1, 1]).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Kernels:
-    """What a training found.
+    """The result of training.
 
     vectors  [i, feature], of scaled features
     alpha    [i]
@@ -39,7 +39,7 @@ class Kernels:
 
 @dataclass(frozen=True)
 class Ranges:
-    """What features were scaled to before training: from [least, most] of each to [lower, upper]."""
+    """Scaling of the features before training: from [least, most] of each to [lower, upper]."""
 
     least: Vector
     most: Vector
@@ -65,14 +65,14 @@ class Regression:
 
 
 def scale(features: Vector, ranges: Ranges) -> Vector:
-    """Features as the training saw them; one that never changed there is 0, as svm-scale leaves it out."""
+    """Features scaled as in training; one that was constant there is 0, as svm-scale leaves it out."""
     span = ranges.most - ranges.least
     share = (features - ranges.least) / np.where(span > 0, span, 1)
     return np.where(span > 0, ranges.lower + (ranges.upper - ranges.lower) * share, 0.0)
 
 
 def load(model: Path, ranges: Path, features: int) -> Regression:
-    """Read a regression of so many features, each file in either form.
+    """Read a regression of this many features, each file in either form.
 
     raises  UserError that names file, place and rule
     """
@@ -105,7 +105,7 @@ def _expect(path: Path, place: str, found: object, rule: str, good: bool) -> Non
 
 
 def _libsvm_kernels(path: Path, text: str, features: int) -> Kernels:
-    """Lines of settings, then SV, then per vector its alpha and its features as index:value, those of 0 left out."""
+    """Lines of settings, then SV, then per vector its alpha and its features as index:value, zeros left out."""
     head, _, body = text.partition("\nSV\n")
     settings = {name: value for name, _, value in (line.partition(" ") for line in head.splitlines())}
     for name, value in (("svm_type", "epsilon_svr"), ("kernel_type", "rbf")):
@@ -126,7 +126,7 @@ def _libsvm_kernels(path: Path, text: str, features: int) -> Kernels:
 
 
 def _libsvm_ranges(path: Path, text: str, features: int) -> Ranges:
-    """A line x, a line with lower and upper, then for each feature its index, its least and its most."""
+    """A line x, a line with lower and upper, then for each feature its index, minimum and maximum."""
     rows = [line.split() for line in text[text.find("x") :].splitlines() if line.strip()]
     _expect(path, "", rows[:1], "must have a line x before the ranges of features", rows[:1] == [["x"]])
     for number, row in enumerate(rows[1:]):
@@ -141,7 +141,7 @@ def _libsvm_ranges(path: Path, text: str, features: int) -> Ranges:
 
 
 def _feature(path: Path, place: str, text: str, features: int) -> int:
-    """Where a feature is that libsvm counts from 1."""
+    """Index of a feature that libsvm counts from 1."""
     good = text.isdecimal() and 1 <= int(text) <= features
     _expect(path, place, text, f"must be the number of a feature, 1 to {features}", good)
     return int(text) - 1
@@ -157,7 +157,7 @@ def _number(path: Path, place: str, text: str) -> float:
 
 
 # --- OpenCV ---------------------------------------------------------------------------------------------------------
-# Read as the YAML that it nearly is: cv2.FileStorage takes the process with it on files that are damaged.
+# Read as the YAML that it nearly is: cv2.FileStorage crashes the process on damaged files.
 
 
 def _opencv_kernels(path: Path, text: str, features: int) -> Kernels:
@@ -179,7 +179,7 @@ def _opencv_kernels(path: Path, text: str, features: int) -> Kernels:
 
 
 def _opencv_ranges(path: Path, text: str, features: int) -> Ranges:
-    """The matrix `range`: a row of the least, a row of the most of each feature."""
+    """The matrix `range`: a row of the minimum, a row of the maximum of each feature."""
     found = _mapping(_document(path, text).get("range"))
     shape = (found["rows"], found["cols"]) if {"rows", "cols", "data"} <= found.keys() else None
     values = _row(path, "range", found.get("data"))
@@ -218,7 +218,7 @@ def _row(path: Path, place: str, node: Any) -> list[float]:
 
 
 def _real(path: Path, place: str, node: Any) -> float:
-    """A number; YAML 1.1 takes OpenCV's "1.5e-01" for one and its "2.e+00" for text."""
+    """A number; YAML 1.1 reads OpenCV's "1.5e-01" as one and its "2.e+00" as text."""
     try:
         value = math.nan if isinstance(node, bool) else float(node)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""VMAF (Netflix) of luma, by an ffmpeg with libvmaf in a process of its own that the pictures are piped to."""
+"""VMAF (Netflix) of luma, by an ffmpeg with libvmaf in a separate process to which the pictures are piped."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ import numpy as np
 from runner.errors import RunError, UserError
 from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
 
-PATIENCE_S = 120.0  # a busy machine scores a picture in less
-PIPE_BYTES = 1 << 20  # most that a user may ask for; fewer, larger writes
-SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, which they say
-GREY = 128  # chroma, which VMAF does not look at
+PATIENCE_S = 120.0  # even a busy machine scores a picture faster
+PIPE_BYTES = 1 << 20  # the most that a user may request; fewer, larger writes
+SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, and say so
+GREY = 128  # chroma, which VMAF ignores
 LOG, STDERR_FILE = "scores.json", "stderr"
 
 
@@ -38,7 +38,7 @@ class Tool(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """What libvmaf wrote: its version, and the score by number of the picture, from 0."""
+    """The output of libvmaf: its version, and the score by number of the picture, from 0."""
 
     version: str
     by_picture: dict[int, float]
@@ -54,14 +54,14 @@ class LoggedPicture(msgspec.Struct):
 
 
 class VmafLog(msgspec.Struct):
-    """What is read of libvmaf's log."""
+    """The parts of libvmaf's log that are read."""
 
     version: str
     pictures: list[LoggedPicture] = msgspec.field(name="frames")
 
 
 def metric(model: str) -> Metric:
-    """VMAF with a model that libvmaf has built in. Raises UserError for an unknown model, RunError without a tool."""
+    """VMAF with a model that is built into libvmaf. Raises UserError for an unknown model, RunError without a tool."""
     if not re.fullmatch(r"[\w.]+", model):
         raise UserError("", "vmaf_model", repr(model), "must be the name of a model, such as vmaf_v0.6.1")
     tool = find_tool()
@@ -88,9 +88,9 @@ def meter(tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int,
 
 
 def find_tool() -> Tool:
-    """The ffmpeg of TOD_FFMPEG, else the first with libvmaf of: that of imageio-ffmpeg, that on the PATH.
+    """The ffmpeg of TOD_FFMPEG, otherwise the first with libvmaf: that of imageio-ffmpeg, then that on the PATH.
 
-    raises  RunError where none has libvmaf; one that TOD_FFMPEG names is not silently replaced by another
+    raises  RunError if none has libvmaf; the one that TOD_FFMPEG names is never silently replaced by another
     """
     named = os.environ.get("TOD_FFMPEG")
     for name in [named] if named else _known():
@@ -102,7 +102,7 @@ def find_tool() -> Tool:
 
 
 def _known() -> Iterator[str]:
-    # The module raises RuntimeError where its wheel came without a binary.
+    # The module raises RuntimeError if its wheel came without a binary.
     with suppress(ModuleNotFoundError, RuntimeError):
         import imageio_ffmpeg
 
@@ -135,7 +135,7 @@ def _version(exe: str) -> str:
 def libvmaf_version(tool: Tool, model: str) -> str:
     """Version of libvmaf, found by scoring one picture, which also proves that the model exists.
 
-    raises  UserError for an unknown model, RunError where scoring fails for another reason
+    raises  UserError for an unknown model, RunError if scoring fails for another reason
     """
     grey = np.full((360, 640), GREY, np.uint8)  # large enough for every model
     probe = VmafMeter(tool, model, (640, 360), Fraction(1), 1)
@@ -154,7 +154,7 @@ def libvmaf_version(tool: Tool, model: str) -> str:
 def command(exe: str, inputs: Sequence[Sequence[str]], model: str, stride: int) -> list[str]:
     """Score the first input against the second, into a log in the working directory.
 
-    inputs  for each raw video its options, ending in -i and where it is
+    inputs  for each raw video its options, ending in -i and its location
     """
     options = f"model=version={model}:n_threads=1:n_subsample={stride}:log_fmt=json:log_path={LOG}"
     raw = [word for words in inputs for word in ("-f", "rawvideo", "-threads", "1", *words)]
@@ -167,7 +167,7 @@ def picture_format(size: PictureSize, pixel_format: str, fps: Fraction) -> list[
 
 
 def read_log(directory: Path, status: int) -> Scores:
-    """What libvmaf wrote. Raises RunError where it did not: ffmpeg may end with status 0 all the same."""
+    """The output of libvmaf. Raises RunError if there is none: ffmpeg may end with status 0 all the same."""
     if status:
         raise complaint(directory, status)
     try:
@@ -178,7 +178,7 @@ def read_log(directory: Path, status: int) -> Scores:
 
 
 def complaint(directory: Path, status: int) -> RunError:
-    """An end of ffmpeg that should not be, with its first words: the last ones name no cause."""
+    """An unexpected end of ffmpeg, with its first message: the last ones do not name the cause."""
     lines = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
     why = re.sub(r"^\[[^]]*\] ", "", lines[0]) if lines else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
@@ -203,10 +203,10 @@ def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format:
 
 
 class VmafMeter:
-    """Pictures to a process, scores from its log.
+    """Pipes pictures to a process and reads the scores from its log.
 
-    No call waits forever: whichever pipe has room is written to, the end of the process is seen at once, and one
-    that stands still is given up after `PATIENCE_S`.
+    No call waits forever: whichever pipe has room is written to, the end of the process is noticed at once, and a
+    stalled one is abandoned after `PATIENCE_S`.
     """
 
     version = ""  # of libvmaf, known at the end
@@ -214,7 +214,7 @@ class VmafMeter:
     def __init__(self, tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int) -> None:
         self._size = size
         self._frames: list[int] = []
-        self._sound = True  # no picture went in by half
+        self._sound = True  # no picture was written only in part
         self._scores: dict[int, float] | None = None
         luma, chroma = math.prod(size), 2 * math.prod((side + 1) // 2 for side in size)
         self._pictures = [np.full(luma + chroma, GREY, np.uint8) for _ in range(2)]
@@ -268,7 +268,7 @@ class VmafMeter:
         self._sound = True
 
     def _write(self) -> None:
-        """One picture into each pipe. Raises BrokenPipeError when the process has ended, RunError when it stands."""
+        """One picture into each pipe. Raises BrokenPipeError when the process has ended, RunError when it stalls."""
         left = {pipe: picture.data for pipe, picture in zip(self._pipes, self._pictures, strict=True)}
         room = select.poll()
         for pipe in left:
@@ -296,7 +296,7 @@ class VmafMeter:
         return self._scores
 
     def _finish(self) -> dict[int, float]:
-        """Let the process score what it has, and read what it found."""
+        """Let the process score the remaining pictures, and read its results."""
         self._close_pipes()
         scores = read_log(self._path, self._wait())
         self.version = scores.version
