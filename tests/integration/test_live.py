@@ -230,7 +230,7 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         drive = read_drive(tmp_path / "out" / name)
         assert (sorted(drive.sides), drive.warnings) == (["link", "operator", "vehicle"], [])
         link = drive.sides["link"].lines
-        assert len(link) > 40
+        assert len(link) > 5 * (link[-1].t - link[0].t)  # ten a second, unless the machine is busy
         assert link[-1].bytes > 500_000
         predicted = [event.kbps for event in drive.sides["vehicle"].of(BitratePredicted)]
         assert link[20].kbps <= 0.75 * max(predicted)
