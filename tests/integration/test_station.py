@@ -105,6 +105,8 @@ def test_a_new_station_announces_itself_and_is_answered(both):
 
 def test_retained_telemetry_is_no_sign_of_life(both):
     station, vehicle, _ = both
+    vehicle.publish("state", STATE | {"total_kbps": 2999})  # behind all telemetry: from now on that is retained
+    until(lambda: station.state.total_kbps == 2999)
     late = Station(station._vehicle, {})
     listener = RecordingListener()
     late.listeners.append(listener)
