@@ -263,7 +263,11 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     },
     "camera_configured": {**FRONT_LEFT, **KBPS, "scaling": st.sampled_from([0.125, 0.5])},
     "weights_set": {"weights": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([0, 0.5, 3]))},
-    "link_measured": {**FRONT_LEFT, **KBPS},
+    "link_measured": {
+        **KBPS,
+        "queue_ms": st.sampled_from([0, 30, 300]),
+        "state": st.sampled_from(["clear", "filling", "draining", "stalled"]),
+    },
     "operator_connected": {},
     "operator_disconnected": {},
     "clock_advanced": {},

@@ -185,6 +185,8 @@ def test_the_vehicles_own_weights_hold_until_others_are_set() -> None:
         ("operator_disconnected", {}),
         ("clock_advanced", {}),
         ("link_measured", {"camera": "front_left", "kbps": 1, "loss": 1, "rtt_ms": 9000, "jitter_ms": 500}),
+        ("link_measured", {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}),
+        ("link_measured", {"queue_ms": 300, "state": "stalled"}),
         ("position_reported", {"lat": 48.2, "lon": 11.6, "speed_mps": 8, "heading_deg": 90}),
         ("bitrate_predicted", {"kbps": 3000, "lower_kbps": 1, "valid_s": 0}),
     ],

@@ -11,6 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.model import Kbps, Mode, Roi, exact, plain
+from runner.core.uplink import LinkState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,13 +85,22 @@ class WeightsSet(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkMeasured(Event):
-    """Reception at the operator: kbit/s, share of packets lost, round trip and jitter."""
+    """The uplink, estimated from what the operator's side received of all cameras, see `runner.core.uplink`.
 
-    camera: str
-    kbps: Kbps
+    kbps      kbit/s that arrive; while a queue lasts, what the link carries; None: too little has arrived
+    queue_ms  wait in front of the link
+    loss      share of packets lost, 0 to 1
+    rtt_ms    round trip of the control link
+    camera    set in older logs, which measured each camera; no rule reads these
+    """
+
+    kbps: Kbps | None = None
+    queue_ms: float | None = None
     loss: float | None = None
+    state: LinkState | None = None
     rtt_ms: float | None = None
     jitter_ms: float | None = None
+    camera: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +147,8 @@ def parse(document: Mapping[str, Any]) -> Event:
             values[key] = exact(values[key])
     if kind is ModeSelected:
         values["mode"] = Mode(values["mode"])
+    elif kind is LinkMeasured and "state" in values:
+        values["state"] = LinkState(values["state"])
     elif kind is RoiSet:
         values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
     elif kind is WeightsSet:

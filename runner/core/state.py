@@ -33,6 +33,7 @@ class State:
     prediction        the last one, in whichever mode it arrived
     total_set         kbit/s, the operator's last total
     collective_total  kbit/s, total of mode collective
+    link              the newest measurement of the uplink
     operator_lost     t at which the operator's side disconnected
     """
 
@@ -46,7 +47,7 @@ class State:
     total_set: Kbps | None = None
     collective_total: Kbps | None = None
     operator_lost: float | None = None
-    links: Mapping[str, ev.LinkMeasured] | None = None
+    link: ev.LinkMeasured | None = None
 
     @staticmethod
     def initial(vehicle: Vehicle, mode: Mode) -> State:
@@ -98,8 +99,10 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 _known(vehicle, name)
             return {"weights": {**state.weights, **weights}}
         case ev.LinkMeasured(camera=name):
+            if name is None:
+                return {"link": event}
             _known(vehicle, name)
-            return {"links": {**(state.links or {}), name: event}}
+            return {}
         case ev.OperatorConnected():
             return {"operator_lost": None}
         case ev.OperatorDisconnected():

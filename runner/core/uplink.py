@@ -1,0 +1,252 @@
+"""What the uplink carries, estimated from what the operator's side receives of every camera. Pure.
+
+All cameras share one uplink and so one estimate. An access unit is delayed by the path and by the queue in front of the
+link. The smallest delay that its camera had lately is the path's; the rest is the queue's, and an offset between the
+clocks of both sides cancels out. While a queue lasts, the rate at which units arrive is the rate of the link.
+
+Delay-based like NADA (RFC 8698), with the two cases in which delay misleads kept apart. A link that stalls and then
+delivers everything at once, as cellular links do, shows a gap and no lasting queue. A path that becomes longer shows a
+queue that does not drain although less is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from statistics import median
+from types import MappingProxyType
+
+BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time and the one before
+KEPT_S = 1.0  # units are kept for this long
+RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
+RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
+EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
+EMPTY_S = 0.006  # a unit that waited less met no queue
+GROWN_S = 0.010  # a queue from here on may be growing
+GROWTH_S = 0.004  # by how much a queue must grow within COMPARED_S to be growing, or shrink to be draining
+COMPARED_S = 0.08
+LONG_S = 0.040  # a queue from here on is too long unless it drains
+PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, the rate is measured anew
+GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
+FEW_PACKETS = 100  # of fewer no share of losses is stated
+STUCK_S = 0.6  # a queue that has not drained for this long ...
+STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
+
+
+class LinkState(StrEnum):
+    """What the queue in front of the link does."""
+
+    CLEAR = "clear"
+    FILLING = "filling"
+    DRAINING = "draining"
+    STALLED = "stalled"
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedUnit:
+    """One access unit as the operator's side received it.
+
+    captured  s, by the vehicle's clock
+    arrived   s, by the operator's monotonic clock
+    bytes     on the wire, headers included
+    """
+
+    camera: str
+    captured: float
+    arrived: float
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """What the operator's side has received since its previous report.
+
+    at             s, time of the report by the operator's monotonic clock
+    units          in order of arrival
+    packets, lost  RTP packets of all cameras received, and missing
+    """
+
+    at: float
+    units: tuple[ReceivedUnit, ...] = ()
+    packets: int = 0
+    lost: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEstimate:
+    """The uplink at the time of a report.
+
+    kbps      kbit/s that arrive; while the link is filling or draining, what it carries. None: too little has arrived
+    queue_ms  wait in the queue
+    loss      share of packets lost in the last second, 0 to 1
+    """
+
+    kbps: float | None
+    queue_ms: float
+    loss: float
+    state: LinkState
+
+
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """Delay of one camera's path: the minimum of the bucket before and of the current one, which began then."""
+
+    before: float
+    current: float
+    began: float
+
+    @property
+    def delay(self) -> float:
+        return min(self.before, self.current)
+
+    def after(self, unit: ReceivedUnit) -> _Path:
+        delay = unit.arrived - unit.captured
+        if unit.arrived - self.began > BUCKET_S:
+            return _Path(self.current, delay, unit.arrived)
+        return replace(self, current=min(self.current, delay))
+
+
+@dataclass(frozen=True, slots=True)
+class _Unit:
+    """When a unit arrived, how long it waited in the queue, s, and its size in bytes."""
+
+    arrived: float
+    queue: float
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Uplink:
+    """Memory of the estimator.
+
+    paths      by camera
+    captured   by camera, capture time of its last unit
+    intervals  by camera, s between its last two units
+    units      of the last second, in order of arrival
+    queues     (time of the report, wait in the queue) of the last STUCK_S
+    packets    (time of the report, received, lost) of the last second
+    resumed    when units arrived again after the last gap
+    onset      when the queue was last empty; None: it is empty
+    peak       kbit/s, highest rate since the onset
+    """
+
+    paths: Mapping[str, _Path] = field(default_factory=lambda: MappingProxyType({}))
+    captured: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    intervals: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    units: tuple[_Unit, ...] = ()
+    queues: tuple[tuple[float, float], ...] = ()
+    packets: tuple[tuple[float, int, int], ...] = ()
+    resumed: float = -float("inf")
+    onset: float | None = None
+    peak: float = 0.0
+
+
+def estimate(uplink: Uplink, report: LinkReport) -> tuple[Uplink, LinkEstimate | None]:
+    """Take a report.
+
+    returns  None before the first unit has arrived
+    """
+    before, uplink = uplink, _received(uplink, report.units)
+    packets = (*_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
+    if uplink.resumed != before.resumed:
+        packets = ()  # what was lost in a stall says nothing about the link after it
+    uplink = replace(uplink, packets=packets)
+    if not uplink.units:
+        return uplink, None
+    frame, last = _frame_interval(uplink.intervals), uplink.units[-1].arrived
+    queue = min(unit.queue for unit in uplink.units if unit.arrived > last - max(RECENT_S, frame))
+    if queue <= EMPTY_S:
+        onset = None
+    elif uplink.onset is None:
+        onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
+    else:
+        onset = uplink.onset
+    queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue))
+    uplink = replace(uplink, onset=onset, queues=queues)
+    kbps = _rate(uplink, last, max(RATE_S, 3 * frame))
+    uplink = replace(uplink, peak=max(uplink.peak if onset else 0.0, kbps or 0.0))
+    if _is_stuck(uplink, kbps):
+        return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
+    stalled = report.at - last > _longest_gap(frame)
+    state = LinkState.STALLED if stalled else _state(queues, queue, onset)
+    return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
+
+
+def _received(uplink: Uplink, units: Iterable[ReceivedUnit]) -> Uplink:
+    """Add units; a capture time that goes back shows a clock that was set, after which all delays are unknown."""
+    paths, captured, intervals = dict(uplink.paths), dict(uplink.captured), dict(uplink.intervals)
+    kept, resumed = list(uplink.units), uplink.resumed
+    for unit in units:
+        if unit.captured < captured.get(unit.camera, unit.captured):
+            paths, captured, intervals, kept = {}, {}, {}, []
+        if unit.camera in captured:
+            intervals[unit.camera] = unit.captured - captured[unit.camera]
+        captured[unit.camera] = unit.captured
+        delay = unit.arrived - unit.captured
+        paths[unit.camera] = paths.get(unit.camera, _Path(delay, delay, unit.arrived)).after(unit)
+        if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
+            resumed = unit.arrived
+        kept.append(_Unit(unit.arrived, delay - paths[unit.camera].delay, unit.bytes))
+    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)
+    return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
+
+
+def _frame_interval(intervals: Mapping[str, float]) -> float:
+    return median(intervals.values()) if intervals else 0.0
+
+
+def _longest_gap(frame: float) -> float:
+    """s between two units of any cameras that are not yet a stall."""
+    return max(GAP_S, 2 * frame)
+
+
+def _rate(uplink: Uplink, last: float, window: float) -> float | None:
+    """kbit/s that arrived: since the queue began where it lasts, and never across a gap."""
+    since = max(last - window, uplink.resumed, uplink.onset or uplink.resumed)
+    if last - since < EVIDENCE_S:
+        if uplink.resumed > last - window:
+            return None
+        since = last - window
+    return sum(unit.bytes for unit in uplink.units if unit.arrived > since) * 8 / 1000 / (last - since)
+
+
+def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float | None) -> LinkState:
+    if onset is None or queue <= GROWN_S:
+        return LinkState.CLEAR
+    now = queues[-1][0]
+    before = min((was for at, was in queues if now - 0.3 < at < now - COMPARED_S), default=queue)
+    if queue > before + GROWTH_S or (queue > LONG_S and queue > before - GROWTH_S):
+        return LinkState.FILLING
+    return LinkState.DRAINING
+
+
+def _is_stuck(uplink: Uplink, kbps: float | None) -> bool:
+    """Whether a queue lasts although less arrives than at its beginning, so that it cannot be one."""
+    lasting = uplink.queues[-1][0] - uplink.queues[0][0] > 0.8 * STUCK_S
+    shortest = min(was for _, was in uplink.queues)
+    return (
+        uplink.onset is not None
+        and kbps is not None
+        and lasting
+        and shortest > GROWN_S
+        and uplink.queues[-1][1] > 0.9 * uplink.queues[0][1]
+        and kbps < STUCK_SHARE * uplink.peak
+    )
+
+
+def _lengthened(uplink: Uplink) -> Uplink:
+    """The path's delays raised by what was taken for a queue."""
+    longer = min(was for _, was in uplink.queues)
+    paths = {name: _Path(path.delay + longer, path.delay + longer, path.began) for name, path in uplink.paths.items()}
+    units = tuple(replace(unit, queue=max(0.0, unit.queue - longer)) for unit in uplink.units)
+    return replace(uplink, paths=paths, onset=None, queues=(), units=units)
+
+
+def _loss(packets: Sequence[tuple[float, int, int]]) -> float:
+    received, lost = sum(got for _, got, _ in packets), sum(gone for _, _, gone in packets)
+    return lost / (received + lost) if received + lost >= FEW_PACKETS else 0.0
+
+
+def _since(entries: Iterable[tuple[float, ...]], begin: float) -> tuple[tuple, ...]:  # type: ignore[type-arg]
+    return tuple(entry for entry in entries if entry[0] > begin)
