@@ -16,6 +16,7 @@ from typing import Any
 
 from runner.core import allocation, scaling
 from runner.core.decision import Decision, Draft, Setting
+from runner.core.link_cap import UNCAPPED, advanced
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
 from runner.errors import RunError
@@ -219,6 +220,22 @@ def fade_when_stale(
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
     return draft.noted(note, total=total), memory
+
+
+@rule(needs=["total"], gives=["total"], reads=["link", "t"])
+def cap_by_link(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """The total is at most what the uplink carries, as measured by the operator's side; see `runner.core.link_cap`.
+
+    Memory: the cap, `LinkCap`.
+    """
+    assert draft.total is not None
+    cap = advanced(memory.get("cap_by_link", UNCAPPED), state.link, state.t, draft.total)
+    if cap is not memory.get("cap_by_link", UNCAPPED):
+        memory = {**memory, "cap_by_link": cap}
+    if cap.kbps is None or cap.kbps >= draft.total:
+        return draft, memory
+    why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
+    return draft.noted(f"total {_short(draft.total)} -> {_short(cap.kbps)}: {why}", total=cap.kbps), memory
 
 
 @rule(reads=["operator_lost", "t"])

@@ -1,0 +1,169 @@
+"""Cameras, a link and reports of what arrives, simulated: the estimator and the cap in a closed loop."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+from runner.core.events import LinkMeasured
+from runner.core.link_cap import LinkCap, advanced
+from runner.core.uplink import LinkReport, ReceivedUnit, Uplink, estimate
+
+Profile = Callable[[float], float]  # value over time, s
+SLOT_S = 0.01  # capacity is constant for this long
+
+
+@dataclass(repr=False)
+class Link:
+    """A link with a queue that drops what would wait too long.
+
+    kbps     capacity
+    delay_s  further delay of what is sent then, both ways; packets stay in order
+    queue_s  longest wait
+    """
+
+    kbps: Profile
+    delay_s: Profile = lambda t: 0.0
+    one_way_s: float = 0.015
+    queue_s: float = 0.3
+    loss: float = 0.0
+
+
+@dataclass(repr=False)
+class Drive:
+    """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived."""
+
+    caps: list[tuple[float, float, str]] = field(default_factory=list)
+    waits: list[tuple[float, float]] = field(default_factory=list)
+    arrived: list[tuple[float, int]] = field(default_factory=list)
+
+    def wait_ms(self, share: float, since: float = 0.0) -> float:
+        waits = sorted(wait for t, wait in self.waits if t >= since)
+        return 1000 * waits[min(len(waits) - 1, int(share * len(waits)))]
+
+    def kbps(self, begin: float, end: float) -> float:
+        return sum(size for t, size in self.arrived if begin <= t < end) * 8 / 1000 / (end - begin)
+
+    def lowest(self, begin: float, end: float) -> float:
+        return min(cap for t, cap, _ in self.caps if begin <= t < end)
+
+    def first(self, since: float, wanted: Callable[[float], bool]) -> float:
+        """s from a time until the cap fulfils a condition."""
+        return next(t for t, cap, _ in self.caps if t >= since and wanted(cap)) - since
+
+
+def drive(
+    link: Link,
+    limit: Profile,
+    seconds: float,
+    *,
+    cameras: int = 8,
+    fps: float = 30,
+    report_s: float = 0.04,
+    noise: float = 0.15,
+    seed: int = 1,
+) -> Drive:
+    """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
+
+    noise  share by which sizes of access units vary
+    """
+    chance, order = random.Random(seed), itertools.count()
+    uplink, cap, done = Uplink(), LinkCap(), Drive()
+    queue: list[tuple[float, int, str, Any]] = []
+
+    def at(t: float, kind: str, what: Any) -> None:
+        heapq.heappush(queue, (t, next(order), kind, what))
+
+    for camera in range(cameras):
+        at(0.001 * camera, "frame", camera)
+    at(report_s, "report", None)
+    free = last_unit = last_report = 0.0
+    on_the_way: list[ReceivedUnit] = []
+    packets = lost = 0
+    in_force = limit(0.0)
+    while queue and queue[0][0] < seconds:
+        t, _, kind, what = heapq.heappop(queue)
+        if kind == "frame":
+            at(t + 1 / fps, "frame", what)
+            size = int(in_force * 1000 / 8 / fps / cameras * chance.uniform(1 - noise, 1 + noise))
+            count = -(-size // 1200)
+            gone = sum(chance.random() < link.loss for _ in range(count)) if link.loss else 0
+            if free - t > link.queue_s or gone:
+                lost += gone or count
+                packets += count - gone if gone else 0
+                continue
+            free = _sent(link, max(t, free), size)
+            last_unit = max(last_unit, free + link.one_way_s + link.delay_s(t))
+            done.waits.append((t, free - t))
+            done.arrived.append((last_unit, size))
+            on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size))
+            packets += count
+        elif kind == "report":
+            at(t + report_s, "report", None)
+            units = tuple(unit for unit in on_the_way if unit.arrived <= t)
+            on_the_way = on_the_way[len(units) :]
+            last_report = max(last_report, t + link.one_way_s + link.delay_s(t))
+            at(last_report, "arrived", LinkReport(t, units, packets, lost))
+            packets = lost = 0
+        else:
+            uplink, estimated = estimate(uplink, what)
+            if estimated:
+                rtt_ms = 2000 * link.one_way_s
+                kbps = None if estimated.kbps is None else Fraction(round(estimated.kbps, 1)).limit_denominator(10)
+                measured = LinkMeasured(
+                    t=t,
+                    kbps=kbps,
+                    queue_ms=round(estimated.queue_ms, 1),
+                    loss=round(estimated.loss, 4),
+                    state=estimated.state,
+                    rtt_ms=rtt_ms,
+                )
+                cap = advanced(cap, measured, t, Fraction(limit(t)))
+            in_force = min(limit(t), float(cap.kbps)) if cap.kbps is not None else limit(t)
+            done.caps.append((t, in_force, estimated.state if estimated else ""))
+    return done
+
+
+def _sent(link: Link, t: float, size: int) -> float:
+    """When the last bit has left."""
+    bits = size * 8 / 1000
+    while True:
+        end = (int(t / SLOT_S + 1e-9) + 1) * SLOT_S
+        kbps = max(0.001, link.kbps(t))
+        if kbps * (end - t) >= bits:
+            return t + bits / kbps
+        bits -= kbps * (end - t)
+        t = end
+
+
+def steps(*values: tuple[float, float]) -> Profile:
+    """A profile that has each value from its time on."""
+
+    def value(t: float) -> float:
+        return [v for begin, v in values if begin <= t or begin == values[0][0]][-1]
+
+    return value
+
+
+def stalls(*spans: tuple[float, float]) -> Profile:
+    """Delay of a link that stands still for spans of time and then delivers all at once."""
+
+    def delay(t: float) -> float:
+        return next((end - t for begin, end in spans if begin <= t < end), 0.0)
+
+    return delay
+
+
+def utilisation(done: Drive, link: Link, limit: Profile, begin: float, end: float) -> float:
+    """Received over what the link and the limit allowed."""
+    allowed = [min(link.kbps(t), limit(t)) for t in _times(begin, end)]
+    return done.kbps(begin, end) / (sum(allowed) / len(allowed))
+
+
+def _times(begin: float, end: float) -> Iterator[float]:
+    return (begin + i * SLOT_S for i in range(int((end - begin) / SLOT_S)))

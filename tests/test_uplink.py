@@ -1,0 +1,117 @@
+"""The uplink's estimate and the cap that follows from it, in a closed loop with a simulated link."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simulated_link import Link, drive, stalls, steps, utilisation
+
+from runner.core.events import LinkMeasured
+from runner.core.link_cap import LEAST, LinkCap, advanced
+from runner.core.uplink import LinkState
+
+RIGHT, HIGH = 3600.0, 6000.0  # kbit/s predicted over a link of 4000
+
+
+@pytest.mark.slow
+def test_a_right_prediction_costs_nothing() -> None:
+    link, limit = Link(steps((0, 4000))), steps((0, RIGHT))
+    done = drive(link, limit, 30)
+    assert {cap for _, cap, _ in done.caps} == {RIGHT}
+    assert utilisation(done, link, limit, 1, 29) == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_prediction_that_is_too_high_fills_no_queue() -> None:
+    link, limit = Link(steps((0, 4000))), steps((0, HIGH))
+    done = drive(link, limit, 60)
+    assert done.wait_ms(0.95, since=2) <= 100
+    assert utilisation(done, link, limit, 2, 59) >= 0.9
+
+
+def test_a_link_that_halves_is_answered_at_once() -> None:
+    done = drive(Link(steps((0, 4000), (5, 2000))), steps((0, RIGHT)), 10)
+    assert done.first(5, lambda cap: cap <= 2000) <= 0.03 + 0.25
+    assert done.wait_ms(0.99, since=6) <= 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.1, 0.15, 0.2, 0.25])
+@pytest.mark.parametrize("begin", [5.0, 5.013, 5.021, 5.03])
+def test_a_stall_cuts_once_and_is_over_within_a_second(begin: float, seconds: float) -> None:
+    end = begin + seconds
+    done = drive(Link(steps((0, 4000)), stalls((begin, end))), steps((0, RIGHT)), 8)
+    assert done.lowest(begin, 8) >= 0.6 * 0.97 * RIGHT
+    assert done.first(end, lambda cap: cap >= 0.9 * RIGHT) <= 1
+    assert done.lowest(end + 1, 8) >= 0.9 * RIGHT
+
+
+@pytest.mark.parametrize("limit", [RIGHT, HIGH])
+def test_after_an_outage_the_link_is_used_again(limit: float) -> None:
+    done = drive(Link(steps((0, 4000), (5, 0), (8, 4000))), steps((0, limit)), 14)
+    assert done.kbps(9, 10) > 0.3 * RIGHT
+    assert done.kbps(11, 14) > 0.85 * RIGHT
+    assert done.wait_ms(0.95, since=9) <= 100
+
+
+def test_random_loss_does_not_cut() -> None:
+    done = drive(Link(steps((0, 4000)), loss=0.03), steps((0, RIGHT)), 20)
+    assert done.lowest(1, 20) == RIGHT
+
+
+def test_a_longer_path_is_no_queue() -> None:
+    """A handover adds 60 ms for good."""
+    done = drive(Link(steps((0, 4000)), lambda t: 0.06 if t >= 5 else 0.0), steps((0, RIGHT)), 15)
+    assert done.lowest(5, 15) >= 0.4 * RIGHT
+    assert done.lowest(9, 15) >= 0.9 * RIGHT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fps", [5, 10, 15, 40])
+def test_any_frame_rate(fps: float) -> None:
+    link, limit = Link(steps((0, 4000), (10, 2000), (20, 4000))), steps((0, HIGH))
+    done = drive(link, limit, 30, fps=fps)
+    assert utilisation(done, link, limit, 2, 29) >= 0.8
+    assert done.first(10, lambda cap: cap <= 2000) <= 0.03 + 0.25 + 2 / fps
+
+
+@pytest.mark.slow
+def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
+    """Rates times two."""
+    link, limit = Link(steps((0, 2000), (40, 5000), (60, 1200), (80, 2000))), steps((0, HIGH))
+    done = drive(link, limit, 100)
+    assert utilisation(done, link, limit, 1, 99) >= 0.8
+    assert done.wait_ms(0.95) <= 100
+
+
+MEASURED = st.tuples(
+    st.sampled_from(LinkState),
+    st.none() | st.integers(0, 20_000),
+    st.sampled_from([0, 3, 20, 90, 500, 4000]),
+    st.sampled_from([0, 0.01, 0.2, 1]),
+    st.sampled_from([0.001, 0.04, 0.2, 1, 30]),
+    st.integers(1, 9000),
+)
+
+
+@settings(deadline=None)
+@given(st.lists(MEASURED, max_size=40))
+def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> None:  # type: ignore[type-arg]
+    cap, t = LinkCap(), 0.0
+    for state, kbps, queue_ms, loss, passed, limit in measured:
+        t += passed
+        link = LinkMeasured(
+            t=t, kbps=None if kbps is None else Fraction(kbps), queue_ms=queue_ms, loss=loss, state=state, rtt_ms=30
+        )
+        cap = advanced(cap, link, t, Fraction(limit))
+        assert cap.kbps is None or cap.kbps >= LEAST
+        for _ in range(3):  # and time in which no report arrives
+            t += passed / 3
+            cap = advanced(cap, link, t, Fraction(limit))
+    for _ in range(500):
+        t += 0.1
+        cap = advanced(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
+    assert cap.kbps is None or cap.kbps >= 5000
