@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 from helpers import Command, UserConf
+from hypothesis import settings
+
+settings.register_profile("any machine", deadline=None)  # a busy one may take longer than 0.2 s for an example
+settings.load_profile("any machine")
 
 
 @pytest.fixture(autouse=True)

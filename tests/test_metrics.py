@@ -145,7 +145,7 @@ def test_psnr_ends_at_100_db() -> None:
     assert score(PSNR, 0 * almost, almost) == 100
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40))
 def test_psnr_is_its_definition(seed: int, height: int, width: int) -> None:
     x, y = noise(seed, height, width), noise(seed + 1, height, width)
@@ -168,7 +168,7 @@ def reference_map(x: Luma, y: Luma) -> tuple[float, Any]:
     return float(mean), found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(11, 60), st.integers(11, 60), st.integers(0, 255))
 def test_mssim_of_noise(seed: int, height: int, width: int, strength: int) -> None:
     x = noise(seed, height, width)

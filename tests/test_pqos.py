@@ -67,7 +67,7 @@ def brute_force(places: Any, rates: Any, radius_m: float, way: Way) -> float | N
     return best
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 200),

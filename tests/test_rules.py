@@ -288,7 +288,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 
 
 @pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))
 def test_stating_what_is_read_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
     stated = vehicle(f"modes={modes}")

@@ -18,7 +18,7 @@ def noise(seed: int, height: int = 36, width: int = 50) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 40), st.integers(3, 40))
 def test_definition(seed: int, height: int, width: int) -> None:
     ndimage = pytest.importorskip("scipy.ndimage")

@@ -280,7 +280,7 @@ events = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(["paper", "safe", "steady"]), st.lists(st.tuples(st.floats(0, 4), events), max_size=25))
 def test_whatever_happens_the_commands_lead_to_the_decision(modes: str, story: list[Any]) -> None:
     vehicle = Drive(f"modes={modes}").vehicle

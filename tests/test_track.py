@@ -65,7 +65,7 @@ def test_driving_order_is_kept() -> None:
         assert hops(points, order).max() < 8
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(200, 600))
 def test_any_order_gives_the_loop(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).permutation(oval(count))

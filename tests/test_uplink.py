@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from simulated_link import Link, drive, stalls, steps, utilisation
 
@@ -97,7 +97,6 @@ MEASURED = st.tuples(
 )
 
 
-@settings(deadline=None)
 @given(st.lists(MEASURED, max_size=40))
 def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> None:  # type: ignore[type-arg]
     cap, t = LinkCap(), 0.0

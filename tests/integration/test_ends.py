@@ -89,17 +89,28 @@ def test_a_part_of_a_demo_that_dies_is_named_and_ends_it(tmp_path, part):
         assert not _alive(parts.values())
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("part", PARTS)
 def test_a_part_of_a_demo_that_hangs_does_not_delay_its_end(tmp_path, part):
+    end_of_a_demo_with_a_hanging_part(tmp_path, part)
+
+
+@pytest.mark.soak  # 2.3 s of these 3 are normal
+@pytest.mark.parametrize("part", PARTS)
+def test_a_demo_with_a_part_that_hangs_ends_within_its_limit(tmp_path, part):
+    assert end_of_a_demo_with_a_hanging_part(tmp_path, part) < LIMIT_S
+
+
+def end_of_a_demo_with_a_hanging_part(tmp_path, part):
+    """s from the signal to the end of the last process."""
     with demo(tmp_path) as (child, parts, output):
         os.kill(parts[part], signal.SIGSTOP)
         child.send_signal(signal.SIGINT)
         began = time.monotonic()
         until(lambda: child.poll() is not None and not _alive(parts.values()), seconds=20)
-        assert time.monotonic() - began < LIMIT_S
+        ended = time.monotonic()
         assert child.returncode == 130
         assert "Traceback" not in output()
+    return ended - began
 
 
 def test_the_broker_serves_any_number_of_connections():
