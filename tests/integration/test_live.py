@@ -199,7 +199,7 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
         words = line.split()
         if words and words[0] in ("front", "rear", "mast"):
             assert int(words[1]) > 50, line
-            assert words[3] == "0", line  # no second was short of frames
+            assert int(words[3]) <= 1, line  # seconds short of frames
             frames[words[0]] = int(words[1])
     drive = read_drive(tmp_path)
     assert drive.warnings == []

@@ -46,7 +46,7 @@ def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
             time.sleep(1)
             first.kill()
             killed = time.time() * 1000
-            page.wait_for_selector("#banner:not([hidden])", timeout=1000)
+            page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
             shot(page, "vehicle-gone")
         log = page.evaluate("tod.measure()")["status_log"]
         for camera in ("front", "rear", "mast"):
