@@ -173,18 +173,24 @@ def _drive(run: _Run, duration_s: float) -> None:
     """
     own = [*run.arguments.overrides, *([f"conf={run.arguments.conf}"] if run.arguments.conf else [])]
     own += [f"log={run.directory}"] if run.directory else []
+    began = time.monotonic()
     with (
         signals.stopping(END_S),
         _link(run) as (link, log),
         private_broker(link.broker if link else run.vehicle.control) as broker,
         _sides(own, link, duration_s) as (vehicle, operator),
     ):
-        began, waiting = time.monotonic(), link is not None
-        while operator.poll() != 0 or time.monotonic() < began + duration_s:
+        waiting = link is not None
+        while True:
             signals.check()
-            for part in (broker, link, vehicle, operator):
+            for part in (broker, link, vehicle):
                 if part:
                     part.check()
+            status = operator.poll()  # asked once: it may end at any moment, and at the end that is no fault
+            if status == 0 and time.monotonic() >= began + duration_s:
+                break
+            if status is not None:
+                operator.check()
             if waiting and link and run.directory and (at := _began(run.directory)):
                 waiting = False
                 log.begin(at)

@@ -89,7 +89,10 @@ def verbs() -> Iterator[dict[str, Verb]]:
     with tempfile.TemporaryDirectory() as name:
         directory, broker = Path(name), Endpoint("127.0.0.1", free_port())
         drive = directory / "drive"
-        subprocess.run(_command(*_demo(directory), "duration_s=4", f"log={drive}"), check=True, capture_output=True)
+        done = subprocess.run(
+            _command(*_demo(directory), "duration_s=4", f"log={drive}"), capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
         with private_broker(broker):
             yield {
                 "demo": Verb(_demo, 5.0),
