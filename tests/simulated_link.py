@@ -12,7 +12,7 @@ from typing import Any
 
 from runner.core.events import LinkMeasured
 from runner.core.link_cap import LinkCap, advanced
-from runner.core.uplink import LinkReport, ReceivedUnit, Uplink, estimate
+from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
 SLOT_S = 0.01  # capacity is constant for this long
@@ -73,7 +73,7 @@ def drive(
     noise  share by which sizes of access units vary
     """
     chance, order = random.Random(seed), itertools.count()
-    uplink, cap, done = Uplink(), LinkCap(), Drive()
+    uplink, cap, done = UplinkMemory(), LinkCap(), Drive()
     queue: list[tuple[float, int, str, Any]] = []
 
     def at(t: float, kind: str, what: Any) -> None:

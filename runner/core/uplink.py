@@ -117,7 +117,7 @@ class _Unit:
 
 
 @dataclass(frozen=True, slots=True)
-class Uplink:
+class UplinkMemory:
     """Memory of the estimator.
 
     paths      by camera
@@ -142,7 +142,7 @@ class Uplink:
     peak: float = 0.0
 
 
-def estimate(uplink: Uplink, report: LinkReport) -> tuple[Uplink, LinkEstimate | None]:
+def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
     """Take a report.
 
     returns  None before the first unit has arrived
@@ -173,7 +173,7 @@ def estimate(uplink: Uplink, report: LinkReport) -> tuple[Uplink, LinkEstimate |
     return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
 
 
-def _received(uplink: Uplink, units: Iterable[ReceivedUnit]) -> Uplink:
+def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemory:
     """Add units; a capture time that goes back shows a clock that was set, after which all delays are unknown."""
     paths, captured, intervals = dict(uplink.paths), dict(uplink.captured), dict(uplink.intervals)
     kept, resumed = list(uplink.units), uplink.resumed
@@ -201,7 +201,7 @@ def _longest_gap(frame: float) -> float:
     return max(GAP_S, 2 * frame)
 
 
-def _rate(uplink: Uplink, last: float, window: float) -> float | None:
+def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
     """kbit/s that arrived: since the queue began where it lasts, and never across a gap."""
     since = max(last - window, uplink.resumed, uplink.onset or uplink.resumed)
     if last - since < EVIDENCE_S:
@@ -221,7 +221,7 @@ def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float |
     return LinkState.DRAINING
 
 
-def _is_stuck(uplink: Uplink, kbps: float | None) -> bool:
+def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
     """Whether a queue lasts although less arrives than at its beginning, so that it cannot be one."""
     lasting = uplink.queues[-1][0] - uplink.queues[0][0] > 0.8 * STUCK_S
     shortest = min(was for _, was in uplink.queues)
@@ -235,7 +235,7 @@ def _is_stuck(uplink: Uplink, kbps: float | None) -> bool:
     )
 
 
-def _lengthened(uplink: Uplink) -> Uplink:
+def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     """The path's delays raised by what was taken for a queue."""
     longer = min(was for _, was in uplink.queues)
     paths = {name: _Path(path.delay + longer, path.delay + longer, path.began) for name, path in uplink.paths.items()}
