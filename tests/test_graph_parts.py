@@ -66,6 +66,7 @@ def test_the_composed_graph_is_whole_lists() -> None:
         assert all(isinstance(entry, dict) for side in ("vehicle", "operator") for entry in composed[side])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text, problem",
     [

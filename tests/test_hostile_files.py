@@ -173,6 +173,7 @@ def test_a_file_that_breaks_what_it_builds_on_is_blamed(conf: UserConf, tod: Com
     assert problem.startswith(f"{conf.path}/vehicle/mine.yaml: cameras.a.rate_quality.b_min_kbps: [0, 150, 400]: ")
 
 
+@pytest.mark.slow
 def test_a_file_with_a_mistake_of_its_own_stays_blamed(conf: UserConf, tod: Command) -> None:
     conf.change("cameras/top_view.yaml", {"3000": "400"})
     found = tod("print", "source=test", "cameras.top_left.weight=3", "fps_max=-1", conf.word).problems

@@ -13,10 +13,11 @@ from runner.core.events import LinkMeasured
 from runner.core.link_cap import LEAST, LinkCap, advanced
 from runner.core.uplink import LinkState
 
+pytestmark = pytest.mark.slow  # simulates drives
+
 RIGHT, HIGH = 3600.0, 6000.0  # kbit/s predicted over a link of 4000
 
 
-@pytest.mark.slow
 def test_a_right_prediction_costs_nothing() -> None:
     link, limit = Link(steps((0, 4000))), steps((0, RIGHT))
     done = drive(link, limit, 30)
@@ -24,7 +25,6 @@ def test_a_right_prediction_costs_nothing() -> None:
     assert utilisation(done, link, limit, 1, 29) == pytest.approx(1, abs=0.02)
 
 
-@pytest.mark.slow
 def test_a_prediction_that_is_too_high_fills_no_queue() -> None:
     link, limit = Link(steps((0, 4000))), steps((0, HIGH))
     done = drive(link, limit, 60)
@@ -38,7 +38,6 @@ def test_a_link_that_halves_is_answered_at_once() -> None:
     assert done.wait_ms(0.99, since=6) <= 100
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.1, 0.15, 0.2, 0.25])
 @pytest.mark.parametrize("begin", [5.0, 5.013, 5.021, 5.03])
 def test_a_stall_cuts_once_and_is_over_within_a_second(begin: float, seconds: float) -> None:
@@ -69,7 +68,6 @@ def test_a_longer_path_is_no_queue() -> None:
     assert done.lowest(9, 15) >= 0.9 * RIGHT
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fps", [5, 10, 15, 40])
 def test_any_frame_rate(fps: float) -> None:
     link, limit = Link(steps((0, 4000), (10, 2000), (20, 4000))), steps((0, HIGH))
@@ -78,7 +76,6 @@ def test_any_frame_rate(fps: float) -> None:
     assert done.first(10, lambda cap: cap <= 2000) <= 0.03 + 0.25 + 2 / fps
 
 
-@pytest.mark.slow
 def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
     """Rates times two."""
     link, limit = Link(steps((0, 2000), (40, 5000), (60, 1200), (80, 2000))), steps((0, HIGH))

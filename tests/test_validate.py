@@ -264,6 +264,7 @@ def test_files_that_reach_into_other_groups_are_not_assembled(conf: UserConf, na
     assert Combinations([], conf.path, choices.items()).assembled(choices) is None
 
 
+@pytest.mark.slow
 def test_a_reference_to_another_group_meets_each_file_of_it(tod: Command, conf: UserConf) -> None:
     conf.write("pqos/mine.yaml", "defaults: [constant, _self_]\nkbps: ${graph.mtu_bytes}\n")
     one_of_each = [f"{group}={name}" for group, name in ONE.items() if group not in ("pqos", "graph")]
