@@ -22,6 +22,7 @@ RESERVE = Fraction(23, 25)  # share of what the link carried up to which recover
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 5  # first increase beyond that, and the number of steps that double it
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
+REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
@@ -49,8 +50,8 @@ class LinkCap:
     before: Kbps | None = None
     stalled: float | None = None
     halved: int = 0
-    changed: float = -1e9
-    measured: float = -1e9
+    changed: float = -float("inf")
+    measured: float = -float("inf")
 
 
 UNCAPPED = LinkCap()
@@ -114,7 +115,7 @@ def _halved(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
 
 def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """Without a report the link may be gone: half, once for each such time."""
-    longest = max(SILENCE_S, 2 * (link.rtt_ms or 0) / 1000 + 3 * 0.04)
+    longest = max(SILENCE_S, 2 * (link.rtt_ms or 0) / 1000 + 3 * REPORT_S)
     if t - max(link.t, cap.changed) < longest:
         return cap
     return _halved(replace(cap, stalled=link.t if cap.stalled is None else cap.stalled), t, limit)

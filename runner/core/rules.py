@@ -229,8 +229,9 @@ def cap_by_link(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) ->
     Memory: the cap, `LinkCap`.
     """
     assert draft.total is not None
-    cap = advanced(memory.get("cap_by_link", UNCAPPED), state.link, state.t, draft.total)
-    if cap is not memory.get("cap_by_link", UNCAPPED):
+    before = memory.get("cap_by_link", UNCAPPED)
+    cap = advanced(before, state.link, state.t, draft.total)
+    if cap is not before:
         memory = {**memory, "cap_by_link": cap}
     if cap.kbps is None or cap.kbps >= draft.total:
         return draft, memory

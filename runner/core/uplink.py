@@ -165,7 +165,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue))
     uplink = replace(uplink, onset=onset, queues=queues)
     kbps = _rate(uplink, last, max(RATE_S, 3 * frame))
-    uplink = replace(uplink, peak=max(uplink.peak if onset else 0.0, kbps or 0.0))
+    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
@@ -203,7 +203,7 @@ def _longest_gap(frame: float) -> float:
 
 def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
     """kbit/s that arrived: since the queue began where it lasts, and never across a gap."""
-    since = max(last - window, uplink.resumed, uplink.onset or uplink.resumed)
+    since = max(last - window, uplink.resumed, uplink.resumed if uplink.onset is None else uplink.onset)
     if last - since < EVIDENCE_S:
         if uplink.resumed > last - window:
             return None

@@ -184,6 +184,17 @@ def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
 @pytest.mark.alone
 @pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp", "h264_srt"])
 def test_the_demo_runs_over_every_transport(graph, tmp_path):
+    assert max(seconds_short_of_frames(graph, tmp_path)) <= 1
+
+
+@pytest.mark.soak  # `make test` leaves less of the machine
+@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp", "h264_srt"])
+def test_no_second_of_a_demo_is_short_of_frames(graph, tmp_path):
+    assert max(seconds_short_of_frames(graph, tmp_path)) == 0
+
+
+def seconds_short_of_frames(graph, tmp_path):
+    """By camera, after a demo whose log is checked."""
     words = (
         *ROBOT[:2],
         "fps_max=15",
@@ -194,12 +205,12 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
     )
     done = run("demo", *words, "duration_s=6", f"log={tmp_path}")
     assert done.returncode == 0, done.stderr
-    frames = {}
+    frames, short = {}, []
     for line in done.stdout[done.stdout.rindex("received") :].splitlines():
         words = line.split()
         if words and words[0] in ("front", "rear", "mast"):
             assert int(words[1]) > 50, line
-            assert int(words[3]) <= 1, line  # seconds short of frames
+            short.append(int(words[3]))
             frames[words[0]] = int(words[1])
     drive = read_drive(tmp_path)
     assert drive.warnings == []
@@ -210,6 +221,7 @@ def test_the_demo_runs_over_every_transport(graph, tmp_path):
         assert len(arrivals) == count
         assert [t for t, _ in arrivals] == sorted(t for t, _ in arrivals)
         assert all((ms is None) == (graph == "h264_srt") for _, ms in arrivals)
+    return short
 
 
 def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):

@@ -40,13 +40,22 @@ def sides(*overrides, log="log.video=false"):
 
 @pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
+    kill_and_restart_the_vehicle(chromium, banner_ms=10_000)
+
+
+@pytest.mark.soak
+def test_the_banner_of_a_killed_vehicle_is_shown_within_a_second(chromium):
+    kill_and_restart_the_vehicle(chromium, banner_ms=1000)
+
+
+def kill_and_restart_the_vehicle(chromium, banner_ms):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
             all_live(page, seconds=30)
             time.sleep(1)
             first.kill()
             killed = time.time() * 1000
-            page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
+            page.wait_for_selector("#banner:not([hidden])", timeout=banner_ms)
             shot(page, "vehicle-gone")
         log = page.evaluate("tod.measure()")["status_log"]
         for camera in ("front", "rear", "mast"):
