@@ -48,7 +48,7 @@ def demo(tmp_path, *words):
     ):
         try:
             until(lambda: (tmp_path / "drive" / "link.jsonl").exists() and "front" in (tmp_path / "output").read_text())
-            yield child, _parts(mark), (tmp_path / "output").read_text
+            yield child, until(lambda: _parts(mark)), (tmp_path / "output").read_text
         finally:
             for pid in marked(mark):
                 with suppress(ProcessLookupError):
@@ -56,10 +56,10 @@ def demo(tmp_path, *words):
 
 
 def _parts(mark):
-    found = {}
-    for name, pattern in PARTS.items():
-        (found[name],) = (pid for pid, words in marked(mark).items() if re.search(pattern, words + " "))
-    return found
+    """The process id of each part; None before all of them run."""
+    started = marked(mark)
+    found = {name: [p for p, words in started.items() if re.search(part, words + " ")] for name, part in PARTS.items()}
+    return {name: pid for name, (pid,) in found.items()} if all(found.values()) else None
 
 
 def _alive(pids):
