@@ -55,7 +55,7 @@ def measure(page):
     return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before the introduction
 
 
-def all_live(page, seconds=30):
+def all_live(page, seconds=rig.WAIT_S):
     """Every camera has been live at some time; on a busy machine hardly ever all at the same moment."""
     waiting = set(measure(page))
 
@@ -73,7 +73,7 @@ def state(page):
     return page.evaluate("tod.state")
 
 
-def state_when(page, wanted, seconds=15):
+def state_when(page, wanted, seconds=rig.WAIT_S):
     return until(lambda: (now := state(page)) and now["online"] and wanted(now) and now, seconds)
 
 

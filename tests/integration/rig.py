@@ -40,6 +40,8 @@ CHROMIUM_FLAGS = [
 _PORTS = itertools.cycle(range(10_000, 30_000))
 next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes start elsewhere
 
+WAIT_S = 60.0  # a demo starts in 3 s, and in 15 where five such tests run beside each other
+
 
 def free_port() -> int:
     """A port that nothing is bound to, UDP or TCP, and that this process has not handed out."""
@@ -57,7 +59,7 @@ def answers(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def until(done: Callable[[], Any], seconds: float = 15, every_s: float = 0.01) -> Any:
+def until(done: Callable[[], Any], seconds: float = WAIT_S, every_s: float = 0.01) -> Any:
     """Wait until a condition is true; the limit is far above what is normal."""
     end = time.monotonic() + seconds
     while not (seen := done()):
@@ -115,7 +117,7 @@ class Operator:
         }
         self.link = ControlLink(broker, (self.requests, OPERATOR_GONE), listen, lambda here: None, lambda what: None)
         self.link.connect()
-        assert self.link.wait_connected(15)
+        assert self.link.wait_connected(WAIT_S)
 
     def _on_telemetry(self, message: Any) -> None:
         from runner.mqtt.messages import read_telemetry
@@ -136,7 +138,7 @@ class Operator:
 
     def state(self, wanted: Callable[[Any], bool]) -> Any:
         """The next state that fulfils a condition."""
-        end = time.monotonic() + 15
+        end = time.monotonic() + WAIT_S
         while not wanted(state := self.states.get(timeout=max(0.0, end - time.monotonic()))):
             self.last = state
         self.last = state

@@ -231,6 +231,7 @@ def test_both_sides_wait_for_a_broker(stack):
         assert any(f"connected to the MQTT broker at {broker}" in line for line in output["vehicle"])
 
 
+@pytest.mark.alone
 def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
     """A broker that hangs accepts connections and answers nothing, like a link that is cut."""
     broker = Endpoint("127.0.0.1", free_port())

@@ -76,7 +76,7 @@ def test_after_a_cut_of_20_s_everything_is_back_within_5_s():
             def frames(known):
                 return {transport: count(known) for transport, count in cameras.items()}
 
-            until(lambda: min(frames(True).values()) > 30, seconds=30)
+            until(lambda: min(frames(True).values()) > 30)
             _forward(router, 0)
             cut = time.monotonic()
             while time.monotonic() < cut + CUT_S:

@@ -124,7 +124,7 @@ def check_sides(line: str, place: Path) -> None:
             verb, *rest = adapted(part, words)
             output = stack.enter_context((place / f"output.{number}").open("w+"))
             running.append(stack.enter_context(process(verb, *rest, stdout=output.fileno(), cwd=place)))
-        until(lambda: all((place / f"output.{number}").stat().st_size for number in range(len(running))), seconds=30)
+        until(lambda: all((place / f"output.{number}").stat().st_size for number in range(len(running))))
         for child in running:
             child.send_signal(signal.SIGINT)
             assert child.wait(timeout=30) in (0, 130), line

@@ -131,7 +131,7 @@ def test_a_viewer_of_a_missing_camera_is_refused_and_served_when_it_is_back():
     with driving() as (camera, side, _, plan, reported):
         camera.send_signal(signal.SIGSTOP)
         with watching(plan) as client:
-            until(lambda: client.errors, seconds=30)
+            until(lambda: client.errors)
         camera.send_signal(signal.SIGCONT)
         until(lambda: "rear: pipeline stopped" in reported)
         with watching(plan) as client:

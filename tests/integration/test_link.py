@@ -91,7 +91,7 @@ def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
         side = OperatorSide([_over_tcp(plan) if tcp else plan for plan in plans], lambda *_: None)
         try:
             drive = Drive(link, lines, side, vehicle)
-            until(lambda: drive.received().decoded > 5, seconds=30)
+            until(lambda: drive.received().decoded > 5)
             link.start(time.time())
             until(lambda: lines)
             yield drive
@@ -193,7 +193,7 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     ):
         side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
         with watching(_at(plans[0], link.operator_overrides)) as client:
-            until(lambda: _retransmitted(client) > 5 and len(client.sizes) > 5, seconds=30)
+            until(lambda: _retransmitted(client) > 5 and len(client.sizes) > 5)
 
 
 def _at(plan, overrides):

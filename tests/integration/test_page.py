@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from browser import all_live, luma, measure, opened, send, shot, state, state_when, take_control, until
-from rig import answers, free_port, process
+from rig import WAIT_S, answers, free_port, process
 from runner.page.server import EVENTS
 
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
@@ -76,7 +76,7 @@ def apart(coroutine):
         return pool.submit(asyncio.run, coroutine).result(timeout=60)
 
 
-def pictures_continue(page, counted, pictures=2, seconds=5):
+def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
     """Every camera draws more than so many pictures after it was counted, and no decoder fails."""
 
     def waiting():
@@ -270,7 +270,7 @@ def test_a_reload_loses_nothing(page):
 
 def test_charts_and_map_are_drawn(page):
     page.set_viewport_size({"width": 1920, "height": 1080})
-    until(lambda: page.evaluate("document.querySelectorAll('.js-plotly-plot').length >= 4"), seconds=30)
+    until(lambda: page.evaluate("document.querySelectorAll('.js-plotly-plot').length >= 4"))
     shot(page, "wide")
     page.locator("#theme").click()
     time.sleep(1.0)  # until redrawn

@@ -51,7 +51,7 @@ def test_the_banner_of_a_killed_vehicle_is_shown_within_a_second(chromium):
 def kill_and_restart_the_vehicle(chromium, banner_ms):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
-            all_live(page, seconds=30)
+            all_live(page)
             time.sleep(1)
             first.kill()
             killed = time.time() * 1000
@@ -64,33 +64,35 @@ def kill_and_restart_the_vehicle(chromium, banner_ms):
             )
             assert at - killed < 150, f"{camera}: {at - killed} ms"
         with vehicle():
-            state_when(page, lambda now: True, seconds=30)
+            state_when(page, lambda now: True)
             online = time.monotonic()
             all_live(page)
             assert time.monotonic() - online < 3
             assert page.locator("#banner").is_hidden()
 
 
+@pytest.mark.alone
 def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
-        all_live(page, seconds=30)
+        all_live(page)
         operator.send_signal(signal.SIGSTOP)
         stopped = time.monotonic()
         page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
         assert time.monotonic() - stopped < 3  # 2 s without a message
         assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4, seconds=12)  # each gives up after 1 s
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4)  # each gives up after 1 s
         shot(page, "station-gone")
         operator.send_signal(signal.SIGCONT)
         found_again(page)
 
 
+@pytest.mark.alone
 def test_a_station_that_starts_again_is_found_at_once(chromium):
     """However many attempts have failed: browsers delay WebSockets that failed often."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
-        all_live(page, seconds=30)
+        all_live(page)
         operator.kill()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 25, seconds=40)
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 25)
         with process(*operator.args[3:]):
             until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
             found_again(page)
@@ -110,7 +112,7 @@ def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
     with sides() as (url, vehicle, _), vehicle() as running:
         media = next(word for word in running.args if word.startswith("media.port="))
         with live_frames([*ROBOT, media]) as frames, opened(chromium, url) as page:
-            all_live(page, seconds=30)
+            all_live(page)
             assert frames.next(5)
 
 
@@ -120,7 +122,7 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
     turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
     graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # keyframes there, refresh waves elsewhere
     with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
-        all_live(page, seconds=30)
+        all_live(page)
         counted = measure(page)
         for turn in range(turns):
             for camera in ("front", "rear", "mast"):
@@ -172,7 +174,7 @@ def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_shown(chromiu
     ahead = {"LD_PRELOAD": str(tmp_path / "shifted.so")}
     log = f"log={tmp_path / 'drive'}"
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
-        all_live(page, seconds=30)
+        all_live(page)
         page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
         expected = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
         assert re.fullmatch(expected, page.locator("#warning").inner_text())
@@ -193,7 +195,7 @@ def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_shown(chromiu
 def test_nothing_old_is_shown_of_a_camera_that_is_off_or_lost(chromium):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as running:
-            all_live(page, seconds=30)
+            all_live(page)
             until(lambda: "– fps" not in caption(page, "rear"))
             page.locator("[data-camera=rear] .switch").click()
             until(lambda: measure(page)["rear"]["status"] == "off")
@@ -237,7 +239,7 @@ def h265(tmp_path):
 
 def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
     with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
-        until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()}, seconds=30)
+        until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()})
         until(lambda: page.evaluate("tod.sample").get("cameras", {}).get("rear", {}).get("fps", 0) > 5)
         supported = "VideoDecoder.isConfigSupported({codec: 'hev1.1.6.L90.90'}).then(({supported}) => supported)"
         if page.evaluate(supported):

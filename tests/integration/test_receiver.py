@@ -130,6 +130,7 @@ def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
     assert connected[-1] - connected[0] < 3 * 2.0
 
 
+@pytest.mark.alone
 def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     """As rtspsrc can on network faults, on its way to NULL."""
     from runner.gst import Gst, aside, receiver

@@ -67,7 +67,7 @@ def sending(conf: Path):
 def kbps(side, frames=20):
     """The encoder's output bitrate at 15 Hz."""
     first, before = side.sent()["rear"]
-    until(lambda: side.sent()["rear"][0] >= first + frames, seconds=30)
+    until(lambda: side.sent()["rear"][0] >= first + frames)
     last, after = side.sent()["rear"]
     return 8 * (after - before) / 1000 / ((last - first) / 15)
 
