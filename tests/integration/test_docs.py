@@ -125,9 +125,17 @@ def check_sides(line: str, place: Path) -> None:
             output = stack.enter_context((place / f"output.{number}").open("w+"))
             running.append(stack.enter_context(process(verb, *rest, stdout=output.fileno(), cwd=place)))
         until(lambda: all((place / f"output.{number}").stat().st_size for number in range(len(running))))
+        logs = [place / word.removeprefix("log=") for word in line.split() if word.startswith("log=")]
+        until(lambda: all(_is_driving(log) for log in logs))
         for child in running:
             child.send_signal(signal.SIGINT)
             assert child.wait(timeout=30) in (0, 130), line
+
+
+def _is_driving(log: Path) -> bool:
+    """Whether a drive's files hold more than their beginning."""
+    files = list(log.glob("*.jsonl"))
+    return bool(files) and all(len(file.read_text().splitlines()) > 5 for file in files)
 
 
 def check_shell(lines: list[str], place: Path) -> None:

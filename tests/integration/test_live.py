@@ -161,6 +161,7 @@ def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_p
     assert run("replay", f"input={tmp_path / 'drive'}").returncode == 0
 
 
+@pytest.mark.alone
 def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
     ports = (f"control.port={broker.port}", f"media.port={free_port()}")
     with process("operator", *ROBOT, *ports, "duration_s=16") as operator:

@@ -19,7 +19,11 @@ from rig import CHECKOUT, answers, free_port, process
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
-pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+pytestmark = [
+    pytest.mark.gst,
+    pytest.mark.alone,
+    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+]
 
 
 ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
@@ -38,7 +42,6 @@ def sides(*overrides, log="log.video=false"):
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
 
 
-@pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
     kill_and_restart_the_vehicle(chromium, banner_ms=10_000)
 
@@ -71,7 +74,6 @@ def kill_and_restart_the_vehicle(chromium, banner_ms):
             assert page.locator("#banner").is_hidden()
 
 
-@pytest.mark.alone
 def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page)
@@ -86,7 +88,6 @@ def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
         found_again(page)
 
 
-@pytest.mark.alone
 def test_a_station_that_starts_again_is_found_at_once(chromium):
     """However many attempts have failed: browsers delay WebSockets that failed often."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
