@@ -125,7 +125,7 @@ def check_sides(line: str, place: Path) -> None:
             output = stack.enter_context((place / f"output.{number}").open("w+"))
             running.append(stack.enter_context(process(verb, *rest, stdout=output.fileno(), cwd=place)))
         until(lambda: all((place / f"output.{number}").stat().st_size for number in range(len(running))))
-        logs = [place / word.removeprefix("log=") for word in line.split() if word.startswith("log=")]
+        logs = [place / word.removeprefix("log=") for child in running for word in child.args if "log=" in word[:4]]
         until(lambda: all(_is_driving(log) for log in logs))
         for child in running:
             child.send_signal(signal.SIGINT)

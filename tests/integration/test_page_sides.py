@@ -21,7 +21,6 @@ from runner.mqtt.broker import private_broker
 
 pytestmark = [
     pytest.mark.gst,
-    pytest.mark.alone,
     pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
 ]
 
@@ -42,6 +41,7 @@ def sides(*overrides, log="log.video=false"):
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
 
 
+@pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
     kill_and_restart_the_vehicle(chromium, banner_ms=10_000)
 
@@ -74,6 +74,7 @@ def kill_and_restart_the_vehicle(chromium, banner_ms):
             assert page.locator("#banner").is_hidden()
 
 
+@pytest.mark.alone
 def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page)
@@ -88,6 +89,7 @@ def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
         found_again(page)
 
 
+@pytest.mark.alone
 def test_a_station_that_starts_again_is_found_at_once(chromium):
     """However many attempts have failed: browsers delay WebSockets that failed often."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
