@@ -18,7 +18,7 @@ from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.aside import settle
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
+from runner.gst.receiver import Arrival, OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer, OnReport
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TYPELIBS",
+    "Arrival",
     "OnUnit",
     "OperatorSide",
     "Reception",
@@ -197,6 +198,10 @@ class VehicleSide:
             if pipeline:
                 pipeline.turn(self._wanted_of(name), values)
 
+    def copies(self) -> dict[str, int]:
+        """By camera, the viewers outside the vehicle: each is sent a copy of the stream."""
+        return self._server.copies() if self._server else {}
+
     def give_control(self, operator: str) -> None:
         """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
         if self._server:
@@ -275,7 +280,6 @@ class OperatorSide:
     video       where to keep what is received; None: nowhere
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
     raises      RunError if something that `video` needs is not installed
-    Without `on_unit`, `on_picture` and `arrivals` no Python runs per frame.
     """
 
     def __init__(
@@ -316,6 +320,15 @@ class OperatorSide:
 
         self._glib.call("reading the receivers' counters", sample)
         return samples
+
+    def take_arrivals(self) -> dict[str, list[Arrival]]:
+        """By camera, the access units that have arrived since the last call; to be called from one thread."""
+        return {name: receiver.take_arrivals() for name, receiver in self._receivers.items()}
+
+    def take_packets(self) -> tuple[int, int]:
+        """RTP packets of all cameras received, and missing at first, since the last call; from one thread."""
+        counted = [receiver.take_packets() for receiver in self._receivers.values()]
+        return (sum(received for received, _ in counted), sum(lost for _, lost in counted))
 
     def stop(self) -> None:
         def stop() -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -101,8 +101,10 @@ class CameraState(CameraDecision):
 class VehicleState:
     """State of a vehicle that is online.
 
-    cause  the event that triggered the decision
-    fault  why the rules could not decide, so that an earlier decision stays in force
+    cause       the event that triggered the decision
+    asked_kbps  the total that the prediction or the operator gives; None in older logs
+    total_kbps  the same after what rules have taken away, such as the cap by the measured link
+    fault       why the rules could not decide, so that an earlier decision stays in force
     """
 
     t: float = field(compare=False)
@@ -112,6 +114,13 @@ class VehicleState:
     cameras: Mapping[str, CameraState]
     fault: str | None = None
     online: bool = True
+    asked_kbps: Number | None = None
+
+    @property
+    def total_words(self) -> str:
+        """The total in kbit/s, and what was asked for where that is more: 1800 of 3000."""
+        less = self.asked_kbps is not None and self.total_kbps < self.asked_kbps
+        return f"{self.total_kbps:.6g} of {self.asked_kbps:.6g}" if less else f"{self.total_kbps}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +229,47 @@ class Sample:
     clock_ahead_ms: float | None = None
 
 
+class UnitReceived(NamedTuple):
+    """An access unit as the operator's side received it; a list in JSON, since there are hundreds a second.
+
+    ago_s    s from its arrival to the report
+    delay_s  s from its capture, by the vehicle's clock, to its arrival; less a constant, since clocks differ
+    bytes    without the headers of packets
+    """
+
+    camera: str
+    ago_s: float
+    delay_s: float
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReceptionReport:
+    """What the operator's side has received since its previous report; the vehicle estimates the uplink from it.
+
+    at             s, by the operator's monotonic clock
+    as_of          s, the vehicle's time that the operator assumed, see `runner.vehicle.operators`
+    units          in order of arrival
+    packets, lost  RTP packets of all cameras received, and missing at first: some may have been repaired
+    """
+
+    at: float
+    as_of: float
+    units: tuple[UnitReceived, ...]
+    packets: int
+    lost: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReceptionReported:
+    """Vehicle's log line: a reception report that arrived at t, and whether its operator was in control."""
+
+    t: float
+    operator: str
+    in_control: bool
+    report: ReceptionReport
+
+
 # --- other log lines --------------------------------------------------------------------------------------------------
 
 
@@ -255,7 +305,7 @@ class VideoBegan:
 
 @dataclass(frozen=True, slots=True)
 class LinkSample:
-    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded and dropped so far."""
+    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded, dropped and lost so far."""
 
     t: float
     kbps: float
@@ -263,6 +313,7 @@ class LinkSample:
     bytes: int
     packets: int
     dropped: int
+    lost: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,6 +338,7 @@ Record = (
     | VehicleState
     | Offline
     | Sample
+    | ReceptionReported
     | Note
     | VideoBegan
     | LinkSample
@@ -300,6 +352,7 @@ KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     VehicleState: "state",
     Offline: "state",
     Sample: "sample",
+    ReceptionReported: "reception",
     Note: "note",
     VideoBegan: "video",
     LinkSample: "link",

@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured
-from runner.core.link_cap import LinkCap, advanced
+from runner.core.link_cap import LinkCap, advanced, believed
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -123,8 +123,9 @@ def drive(
                     state=estimated.state,
                     rtt_ms=rtt_ms,
                 )
-                cap = advanced(cap, measured, t, Fraction(limit(t)))
-            in_force = min(limit(t), float(cap.kbps)) if cap.kbps is not None else limit(t)
+                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2))
+            trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
+            in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
 

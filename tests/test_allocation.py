@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.core.allocation import allocate, demand
+from runner.core.allocation import allocate, allocate_above_floors, demand, shed
 from runner.core.model import Roi
 
 FULL = Roi(0, 0, 1920, 1040)
@@ -101,3 +101,66 @@ def test_weights_that_are_all_the_same_are_the_paper(
     wanted = sum(demands.values())
     paper = {n: d / wanted * min(total, wanted) if wanted else Fraction(0) for n, d in demands.items()}
     assert allocate(demands, total, ONES) == allocate(demands, total, dict.fromkeys(demands, weight)) == paper
+
+
+# --- floors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "demands, total, floors, expected",
+    [
+        ((300, 100), 200, (0, 0), (150, 50)),  # none: Eq. (2)
+        ((300, 100), 200, (0, 80), (120, 80)),
+        ((300, 100), 200, (0, 40), (150, 50)),  # a floor below the share changes nothing
+        ((300, 100, 100), 200, (0, 60, 41), (99, 60, 41)),  # the first floor takes from the others' shares
+        ((300, 100), 90, (100, 80), (50, 40)),  # less than both: in proportion to them
+        ((300, 100), 90, (0, 95), (0, 90)),
+        ((300, 50), 200, (0, 80), (150, 50)),  # a floor above the demand counts as the demand
+        ((0, 100), 50, (500, 0), (0, 50)),  # the floor of a camera that is off takes nothing
+        ((300, 100), 400, (400, 400), (300, 100)),
+    ],
+)
+def test_floors(demands: tuple[int, ...], total: int, floors: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    named = {name: Fraction(own) for name, own in zip("abc", demands, strict=False)}
+    lowest = {name: Fraction(own) for name, own in zip("abc", floors, strict=False)}
+    allocated = allocate_above_floors(named, Fraction(total), ONES, lowest)
+    assert list(allocated.items()) == list(zip("abc", expected, strict=False))
+
+
+@given(cameras, bitrates, st.dictionaries(st.sampled_from("abcdefgh"), bitrates))
+def test_floors_come_first_and_the_total_holds(
+    of: dict[str, tuple[Fraction, Fraction]], total: Fraction, some: dict[str, Fraction]
+) -> None:
+    demands, weights = {name: own for name, (own, _) in of.items()}, {name: weight for name, (_, weight) in of.items()}
+    floors = {name: some.get(name, Fraction(0)) for name in demands}
+    allocated = allocate_above_floors(demands, total, weights, floors)
+    assert sum(allocated.values()) <= total
+    assert all(0 <= allocated[name] <= own for name, own in demands.items())
+    lowest = {name: min(floors[name], own) for name, own in demands.items()}
+    if sum(lowest.values()) <= total:
+        assert all(allocated[name] >= low for name, low in lowest.items())
+    if not any(lowest.values()):
+        assert allocated == allocate(demands, total, weights)
+
+
+@pytest.mark.parametrize(
+    "total, before, expected",
+    [
+        (300, (), ()),
+        (299, (), ("a",)),
+        (300, ("a",), ("a",)),  # it returns with a margin
+        (330, ("a",), ()),
+        (199, (), ("a", "b")),
+        (99, (), ("a", "b")),  # c is never given up
+        (219, ("a", "b"), ("a", "b")),
+        (220, ("a", "b"), ("a",)),
+    ],
+)
+def test_who_is_given_up(total: int, before: tuple[str, ...], expected: tuple[str, ...]) -> None:
+    demands, floors = dict.fromkeys("abc", Fraction(1000)), dict.fromkeys("abc", Fraction(100))
+    assert shed(demands, Fraction(total), floors, ("a", "b"), before) == expected
+
+
+def test_a_camera_that_is_off_is_not_given_up() -> None:
+    demands = {"a": Fraction(0), "b": Fraction(100), "c": Fraction(100)}
+    assert shed(demands, Fraction(10), dict.fromkeys("abc", Fraction(50)), ("a", "b")) == ("b",)

@@ -15,7 +15,7 @@ from runner.errors import ConfigError, Problem
 
 TOP_KEYS = "mode, fps_max, media, control, page, log, name, cameras, modes, graph, source, pqos, recording, ..."
 CAMERA_KEYS = (
-    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, place, pose, device, address, clip, ..."
+    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, shed, place, pose, device, ..."
 )
 OWN = "files of your own need conf=DIR"
 QUOTE = """; quote a value with special characters: 'key="value"'"""

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.link import Limit
+from runner.core.model import Endpoint
+from runner.errors import RunError
+from runner.link import Limit, limited_link
 from runner.link.bucket import Bucket
 from runner.link.limit import burst_bytes, queue_bytes
+from runner.link.relay import Lottery
 from runner.link.rtsp import Units, ports, with_ports
 
 KBPS, QUEUE_MS = 800, 100  # 100 bytes in a ms
@@ -124,3 +129,27 @@ def test_ports_are_read_and_replaced_in_the_transport_header_alone():
     for other in (SDP, PACKET):
         assert ports(other, "client_port") == []
         assert with_ports(other, "client_port", lambda _: 1) == other
+
+
+@pytest.mark.parametrize(("loss", "burst"), [(0.002, 1), (0.01, 1), (0.03, 10), (0.2, 3)])
+def test_losses_have_their_share_and_length(loss, burst):
+    lottery = Lottery(loss, burst)
+    drawn = [lottery.draw() for _ in range(400_000)]
+    runs = sum(lost and not before for before, lost in pairwise([False, *drawn]))
+    assert sum(drawn) / len(drawn) == pytest.approx(loss, rel=0.1)
+    assert sum(drawn) / runs == pytest.approx(max(burst, 1 / (1 - loss)), rel=0.1)
+
+
+@pytest.mark.parametrize(("loss", "drawn"), [(0, {False}), (1, {True})])
+def test_all_or_nothing_is_lost(loss, drawn):
+    lottery = Lottery(loss, 1)
+    assert {lottery.draw() for _ in range(1000)} == drawn
+
+
+def test_the_kernel_loses_nothing_at_random():
+    limit = Limit(lambda t: 1000, queue_ms=100, delay_ms=0, loss=0.01)
+    with (
+        pytest.raises(RunError, match="link=netns: loss is not supported, or choose link=relay"),
+        limited_link("netns", limit, Endpoint("127.0.0.1", 1), Endpoint("127.0.0.1", 2), print),
+    ):
+        pass

@@ -416,3 +416,13 @@ def test_downlink_alone_is_refused() -> None:
         ModelError, match="must be a header with the columns t_s, kbps or bandwidth_kbps or uplink_kbps"
     ):
         build_pqos({**TRACE, "file": str(path)}, [])
+
+
+def test_wrong_predictions() -> None:
+    """Too high and late; the first one comes when it is due."""
+    settings = {"kind": "constant", "kbps": 1000, "period_s": 0.5, "wrong": {"share": 1.5, "late_s": 1}}
+    source = build_pqos(settings, [])
+    made = [source.observe(ClockAdvanced(t=tenth / 10)) for tenth in range(21)]
+    assert [(one.t, one.kbps) for one in made if one] == [(1.0, 1500), (1.5, 1500), (2.0, 1500)]
+    silent = build_pqos(settings | {"wrong": {"silent": True}}, [])
+    assert not any(silent.observe(ClockAdvanced(t=t)) for t in range(5))

@@ -214,7 +214,8 @@ class Builder:
         fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens")) | {k: exact(v) for k, v in _given(data, ("weight",)).items()}
+        options = _given(data, ("fov_deg", "lens", "shed"))
+        options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,
             lambda: Camera(

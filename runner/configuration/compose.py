@@ -20,7 +20,8 @@ from runner.resources import directory
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-OF_THE_PLACE = ("place", "pose", "weight", "device", "address", "clip", "graph", "source")  # keys of a mount
+# keys of a mount
+OF_THE_PLACE = ("place", "pose", "weight", "floor_kbps", "shed", "device", "address", "clip", "graph", "source")
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
 # Groups that Hydra composes only for applications that it starts itself: a tenth of the time.
 HYDRAS_OWN = ("output", "launcher", "sweeper", "help", "hydra_help", "hydra_logging", "job_logging", "env")

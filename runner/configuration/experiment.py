@@ -9,7 +9,7 @@ from typing import Any
 
 from runner.core.events import ClockAdvanced, Event
 from runner.core.model import Kbps, exact
-from runner.link.limit import Limit
+from runner.link.limit import Limit, Reverse
 from runner.pqos import Pqos, build_pqos, trace
 from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
@@ -60,15 +60,25 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     def kbps_at(t: float) -> float:
         return share * float(rates(t))
 
-    return LinkSettings(data["kind"], Limit(kbps_at, float(data["queue_ms"]), float(data["delay_ms"])))
+    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), reverse=_reverse(data.get("reverse"))))
+
+
+def _reverse(data: Mapping[str, Any] | None) -> Reverse | None:
+    return Reverse(float(data["kbps"]), **_path(data)) if data else None
+
+
+def _path(data: Mapping[str, Any]) -> dict[str, float]:
+    """What one direction of the link does, beside its rate."""
+    lost = {"loss": float(data.get("loss", 0)), "burst": float(data.get("loss_burst", 1))}
+    return {"queue_ms": float(data["queue_ms"]), "delay_ms": float(data["delay_ms"])} | lost
 
 
 def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
-    """The rate that the prediction source of the `pqos` section states for each time and place, without look-ahead.
+    """The rate that the source of the `pqos` section states for each time and place, without look-ahead or `wrong`.
 
     raises  ModelError with the key, the value found and the rule
     """
-    return _known(build_pqos({**pqos, "look_ahead_s": 0}, bases), build_track(pqos, bases))
+    return _known(build_pqos({**pqos, "look_ahead_s": 0, "wrong": None}, bases), build_track(pqos, bases))
 
 
 def _known(source: Pqos, track: Track | None) -> RateAtTime:

@@ -9,6 +9,7 @@ from math import lcm
 from runner.core.model import Kbps, Roi
 
 ZERO = Fraction(0)
+RETURN = Fraction(11, 10)  # times the floors: below, a total that varies would switch a camera on and off
 
 
 def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
@@ -57,6 +58,56 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
         allocated[name] = waiting.pop(name)
         left -= allocated[name]
     return allocated
+
+
+def allocate_above_floors(
+    demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fraction], floors: Mapping[str, Kbps]
+) -> dict[str, Kbps]:
+    """Eq. (2) with a lower bound for each camera.
+
+        b_alloc,i = max(f_i, b_i),   sum_i b_alloc,i = min(b_pred, sum_i b_dem,i)
+
+    where b_i is the share by `allocate` of what the floors of the others leave. If the total is less than all floors
+    together, it is shared in proportion to them.
+
+    demands  kbit/s per camera, 0 for a camera that is off
+    floors   kbit/s per camera, 0: none; a floor above the demand counts as the demand
+    returns  kbit/s per camera; without floors the same as `allocate`
+    """
+    lowest = {name: min(floors[name], own) for name, own in demands.items() if floors[name] and own}
+    if lowest and total <= _sum(lowest.values()):
+        return dict.fromkeys(demands, ZERO) | allocate(lowest, total, dict.fromkeys(lowest, Fraction(1)))
+    held: dict[str, Kbps] = {}
+    while True:
+        others = {name: own for name, own in demands.items() if name not in held}
+        shares = allocate(others, total - _sum(held.values()), weights)
+        below = {name: floor for name, floor in lowest.items() if name not in held and shares[name] < floor}
+        if not below:
+            return {name: held[name] if name in held else shares[name] for name in demands}
+        held |= below
+
+
+def shed(
+    demands: Mapping[str, Kbps],
+    total: Kbps,
+    floors: Mapping[str, Kbps],
+    order: Sequence[str],
+    before: Iterable[str] = (),
+) -> tuple[str, ...]:
+    """Cameras to give up, first ones first, until the total covers the floors of all others.
+
+    order    cameras that may be given up, in this order
+    before   those that are given up now; each returns only once the total exceeds the floors by a margin
+    returns  the first part of `order`, without cameras that are off
+    """
+    given_up: list[str] = []
+    lowest = {name: min(floors[name], own) for name, own in demands.items()}
+    for name in (name for name in order if demands[name]):
+        needed = _sum(floor for other, floor in lowest.items() if other not in given_up)
+        if total >= needed * (RETURN if name in before else 1):
+            break
+        given_up.append(name)
+    return tuple(given_up)
 
 
 def _sum(bitrates: Iterable[Kbps]) -> Kbps:

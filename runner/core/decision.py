@@ -41,11 +41,15 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What is in force: the mode, its total before the cap at demand, and a setting for each camera."""
+    """What is in force: the mode, its total before the cap at demand, and a setting for each camera.
+
+    asked  kbit/s that the prediction or the operator gives, before later rules lowered it; ignored in comparisons
+    """
 
     mode: Mode
     total: Kbps
     settings: Mapping[str, Setting]
+    asked: Kbps = field(default=Fraction(0), compare=False)
 
     def equals_with_reasons(self, other: Decision) -> bool:
         """Whether it is equal and for the same reasons."""
@@ -59,6 +63,7 @@ class Draft(NamedTuple):
     demand   kbit/s by camera, 0 when off
     bitrate  exact kbit/s by camera
     scaling  factor by camera that is on
+    measured True: the total is what the link is measured to carry, whatever the age of the prediction
     sending  False stops all cameras, whatever their bitrate
     notes    reasons that concern all cameras
     reasons  reason by camera
@@ -68,6 +73,7 @@ class Draft(NamedTuple):
     demand: Mapping[str, Kbps] = NOTHING
     bitrate: Mapping[str, Kbps] = NOTHING
     scaling: Mapping[str, Fraction] = NOTHING
+    measured: bool = False
     sending: bool = True
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING

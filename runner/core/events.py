@@ -104,6 +104,20 @@ class LinkMeasured(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CopiesCounted(Event):
+    """How many copies of each camera's stream leave the vehicle, one for each viewer; cameras not named: one."""
+
+    copies: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlPassed(Event):
+    """Another operator is in control, "" for none; what the one before has measured no longer holds."""
+
+    operator: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(Event):
     pass
 
@@ -128,10 +142,13 @@ EVENTS: dict[str, type[Event]] = {
     "camera_configured": CameraConfigured,
     "weights_set": WeightsSet,
     "link_measured": LinkMeasured,
+    "copies_counted": CopiesCounted,
+    "control_passed": ControlPassed,
     "operator_connected": OperatorConnected,
     "operator_disconnected": OperatorDisconnected,
     "clock_advanced": ClockAdvanced,
 }
+OWN = (LinkMeasured, CopiesCounted, ControlPassed)  # made by the vehicle itself; no operator may request them
 NAMES = {kind: name for name, kind in EVENTS.items()}
 
 _EXACT = ("kbps", "lower_kbps", "scaling")
@@ -166,7 +183,7 @@ def to_json(event: Event) -> dict[str, Any]:
         if isinstance(value, Roi):
             document |= {key: getattr(value, key) for key in _ROI}
         elif isinstance(value, Mapping):
-            document[name] = {camera: plain(weight) for camera, weight in value.items()}
+            document[name] = {camera: plain(Fraction(of)) for camera, of in value.items()}
         else:
             document[name] = plain(value) if isinstance(value, Fraction) else value
     return document

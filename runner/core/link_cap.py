@@ -24,6 +24,14 @@ CAREFUL, DOUBLING = Fraction(1, 50), 5  # first increase beyond that, and the nu
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
+UNMEASURED_S = 2.0  # an operator that is present and reports nothing for longer does not measure the link
+FRESH_S = 1.0  # a measurement that is older does not stand in for a prediction
+BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
+FALL_S = 1.0  # cuts within this time answer the same fall of the link
+EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many falls within this time ...
+LATE_S = 2.5  # ... and at least this long after the first: a prediction that is only late is right by then
+REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
+LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
 
@@ -41,6 +49,11 @@ class LinkCap:
     halved    how often the cap was halved since then
     changed   t of the last change
     measured  t of the last measurement
+    idle      t at which nothing was to be sent, last
+    alone     whether nothing else limits the total
+    trust     share of the limit that is believed
+    trusted   t of its last change
+    doubts    (t, share of the limit that the link carried) of the last cuts
     """
 
     kbps: Kbps | None = None
@@ -52,32 +65,98 @@ class LinkCap:
     halved: int = 0
     changed: float = -float("inf")
     measured: float = -float("inf")
+    idle: float = -float("inf")
+    alone: bool = False
+    trust: Fraction = Fraction(1)
+    trusted: float = -float("inf")
+    doubts: tuple[tuple[float, Fraction], ...] = ()
 
 
 UNCAPPED = LinkCap()
 
 
-def advanced(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps) -> LinkCap:
-    """The cap at time t under a limit, with the newest measurement."""
+def advanced(
+    cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps, least_trust: Fraction = Fraction(1)
+) -> LinkCap:
+    """The cap at time t under a limit, with the newest measurement. The limit that holds is the one `believed`.
+
+    least_trust  share of the limit that is believed at least, however often it proved too high; 1: it is not doubted
+    """
     if link is None:
-        return cap
+        unmeasured = t - max(cap.measured, cap.changed, cap.idle)
+        return UNCAPPED if unmeasured > UNMEASURED_S else cap
+    cap, full, limit = _trusting(cap, t), limit, believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
     cap = replace(cap, measured=link.t)
     if link.state is LinkState.STALLED:
-        return _stalled(cap, t, limit)
+        return _stalled(cap, link, t, limit)
     if (link.state is LinkState.FILLING or (link.loss or 0) > TOO_LOSSY) and link.kbps:
-        return _cut(cap, link, t, limit)
+        return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust)
     if link.state is LinkState.CLEAR:
         return _recovered(_resumed(cap, limit), link, t, limit)
     return cap
+
+
+def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
+    """The share of a limit that is believed, after limits that proved too high; see `advanced`."""
+    return limit if cap.trust == 1 or least_trust == 1 or cap.alone else limit * cap.trust
+
+
+def _doubting(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction) -> LinkCap:
+    """After a cut: believe less of a limit that has been too high for some time."""
+    if cap.changed != t or link.kbps is None or cap.alone or least == 1:
+        return cap
+    share = min(Fraction(1), _thousandths(BELIEVED * link.kbps / limit))
+    doubts = tuple(doubt for doubt in cap.doubts if t - doubt[0] <= EPISODE_S)
+    if doubts and t - doubts[-1][0] < FALL_S:
+        doubts, share = doubts[:-1], max(share, doubts[-1][1])
+    doubts, trust = (*doubts, (t, share)), cap.trust
+    if len(doubts) >= FEW and t - doubts[0][0] >= LATE_S:
+        # By the mildest: a limit that is only late is far off at first, and almost right soon after.
+        trust = max(least, min(trust, max(share for _, share in doubts)))
+    return replace(cap, doubts=doubts, trust=trust, trusted=t)
+
+
+def _trusting(cap: LinkCap, t: float) -> LinkCap:
+    """Trust returns while nothing speaks against the limit."""
+    if cap.trust == 1 or t - cap.trusted < 1:
+        return cap
+    return replace(cap, trust=min(Fraction(1), cap.trust + REGAINED), trusted=t)
+
+
+def _thousandths(share: Fraction) -> Fraction:
+    return Fraction(share.numerator * 1000 // share.denominator, 1000)
+
+
+def raised(cap: LinkCap, least: Kbps) -> LinkCap:
+    """The cap, but not below what it takes to measure the link at all."""
+    return replace(cap, kbps=least) if cap.kbps is not None and cap.kbps < least else cap
+
+
+def is_fresh(link: LinkMeasured | None, t: float) -> bool:
+    """Whether the link has been measured lately."""
+    return link is not None and t - link.t <= FRESH_S
+
+
+def probing(cap: LinkCap, asked: Kbps, limit: Kbps) -> LinkCap:
+    """The cap when nothing but the measurement limits the total any more: it grows from what was asked for last."""
+    if cap.alone:
+        return cap
+    kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
+    return replace(cap, alone=True, kbps=kbps, carried=(kbps, limit), steps=0)
+
+
+def idle(cap: LinkCap, t: float) -> LinkCap:
+    """The cap at time t, when nothing is to be sent: that nothing arrives then, or soon after, says nothing."""
+    return replace(cap, idle=t)
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     target = link.kbps * max(DEEPEST, min(SHALLOWEST, drain))
-    settled = t - cap.changed >= SETTLE_S + (link.rtt_ms or 0) / 1000
+    settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return cap
     return replace(
@@ -87,7 +166,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
 
 def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
-    if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + (link.rtt_ms or 0) / 1000:
+    if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is not tested, and so does not grow
     steps, factor = cap.steps, FAST
     if cap.carried:
@@ -99,9 +178,11 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     return replace(cap, kbps=None if kbps >= limit else kbps, steps=steps, changed=t)
 
 
-def _stalled(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+def _stalled(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """One cut at first, since most stalls are short; then half again and again."""
     if cap.stalled is None:
+        if t - cap.idle < SILENCE_S + _rtt_s(link):
+            return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
         return replace(cap, kbps=_short(arrived * DEEPEST), stalled=t, halved=0, changed=t)
     return _halved(cap, t, limit)
@@ -115,8 +196,8 @@ def _halved(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
 
 def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """Without a report the link may be gone: half, once for each such time."""
-    longest = max(SILENCE_S, 2 * (link.rtt_ms or 0) / 1000 + 3 * REPORT_S)
-    if t - max(link.t, cap.changed) < longest:
+    longest = max(SILENCE_S, 2 * _rtt_s(link) + 3 * REPORT_S)
+    if t - max(link.t, cap.changed, cap.idle) < longest:
         return cap
     return _halved(replace(cap, stalled=link.t if cap.stalled is None else cap.stalled), t, limit)
 
@@ -129,6 +210,10 @@ def _resumed(cap: LinkCap, limit: Kbps) -> LinkCap:
     if kbps is not None and cap.halved and cap.before:
         kbps = max(kbps, min(cap.before, limit) / 2)
     return replace(cap, kbps=kbps, stalled=None, halved=0)
+
+
+def _rtt_s(link: LinkMeasured) -> float:
+    return min((link.rtt_ms or 0.0) / 1000, LONGEST_RTT_S)
 
 
 def _in_force(cap: LinkCap, limit: Kbps) -> Kbps:

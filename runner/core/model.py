@@ -274,6 +274,9 @@ class Camera:
     width, height   px of the full image, after the crop of the native one
     native          px size of the source's image, of which `crop` is kept; None: it is the full image
     weight          explicit weight in the allocation, >= 0
+    floor_kbps      kbit/s that the camera gets first where `modes` have floors; 0: none
+    shed            where all floors together exceed the total, cameras with the lowest number are given up first;
+                    None: never
     mount           device, address, clip: values of the placeholders of these names
     """
 
@@ -285,6 +288,8 @@ class Camera:
     graph: Graph
     source: Source
     weight: Fraction = Fraction(1)
+    floor_kbps: Kbps = Fraction(0)
+    shed: int | None = None
     native: tuple[int, int] | None = None
     crop: Roi | None = None
     mount: Mapping[str, Value] = field(default_factory=dict)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cache
 from typing import Any
 
 from runner.core import allocation, scaling
+from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
-from runner.core.link_cap import UNCAPPED, advanced
+from runner.core.events import LinkMeasured
+from runner.core.link_cap import LEAST, UNCAPPED, advanced, believed, idle, is_fresh, probing, raised
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
 from runner.errors import RunError
@@ -141,6 +143,43 @@ def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
     return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
 
 
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"])
+def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """As `share_by_demand`, but each camera first gets its `floor_kbps`; `shed` says which ones go without a picture.
+
+    Memory: the cameras given up.
+    """
+    assert draft.total is not None
+    given_up = _given_up(vehicle, state, draft, memory.get("share_above_floors", ()))
+    if given_up != memory.get("share_above_floors", ()):
+        memory = {**memory, "share_above_floors": given_up}
+    wanted = {name: allocation.ZERO if name in given_up else own for name, own in draft.demand.items()}
+    draft = draft.replaced(bitrate=_shared(vehicle, state, wanted, draft.total))
+    return (draft.noted(f"{', '.join(given_up)} given up for the floors of others") if given_up else draft), memory
+
+
+def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> dict[str, Kbps]:
+    """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
+    floors = {name: camera.floor_kbps for name, camera in vehicle.cameras.items()}
+    if not state.copies:
+        return allocation.allocate_above_floors(wanted, total, state.weights, floors)
+    copies = {name: state.copies.get(name, 1) for name in wanted}
+    of_all = {name: own * copies[name] for name, own in wanted.items()}
+    lowest = {name: floor * copies[name] for name, floor in floors.items()}
+    shares = allocation.allocate_above_floors(of_all, total, state.weights, lowest)
+    return {name: share / copies[name] for name, share in shares.items()}
+
+
+def _given_up(vehicle: Vehicle, state: State, draft: Draft, before: tuple[str, ...]) -> tuple[str, ...]:
+    numbers = {name: camera.shed for name, camera in vehicle.cameras.items() if camera.shed is not None}
+    if not numbers or draft.total is None:
+        return ()
+    floors = {name: camera.floor_kbps * state.copies.get(name, 1) for name, camera in vehicle.cameras.items()}
+    order = sorted(numbers, key=lambda name: numbers[name])
+    of_all = {name: own * state.copies.get(name, 1) for name, own in draft.demand.items()}
+    return allocation.shed(of_all, draft.total, floors, order, before)
+
+
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Each camera that is on gets the same, times its weight, but no more than its demand: for comparison."""
@@ -167,15 +206,39 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
     return draft.replaced(scaling=factors, reasons=reasons), memory
 
 
-@rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["manual", "on"])
+@rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["copies", "manual", "on"])
 def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Mode S: each camera is sent as the operator has set it; the total is the resulting sum."""
     on = [name for name in vehicle.cameras if state.on[name]]
     bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
-    total = sum(bitrates.values(), allocation.ZERO)
+    total = sum((own * state.copies.get(name, 1) for name, own in bitrates.items()), allocation.ZERO)
     return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+
+
+@rule(needs=["total", "bitrate", "scaling"], gives=["bitrate", "scaling"], reads=["copies", "rois", "weights"])
+def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Mode S under a cap: all cameras times one factor, with weights and floors as in `share_above_floors`.
+
+    Where the bitrate falls into a lower range of Eq. (4), the factor falls with it, never above the operator's own.
+    What the operator has set stays stored, and returns with the total.
+    """
+    assert draft.total is not None
+    if draft.total >= sum(own * state.copies.get(name, 1) for name, own in draft.bitrate.items()):
+        return draft, memory
+    bitrates = _shared(vehicle, state, draft.bitrate, draft.total)
+    factors, reasons = dict(draft.scaling), dict(draft.reasons)
+    for name, own in factors.items():
+        camera, roi = vehicle.cameras[name], state.rois[name]
+        asked, fitted = (
+            scaling.select_scaling(camera.rate_quality, scaling.as_full_image(kbps, roi, camera.full_roi))[0]
+            for kbps in (draft.bitrate[name], bitrates[name])
+        )
+        if fitted < asked:
+            factors[name] = min(own, fitted)
+        reasons[name] += f", sent with {_whole(bitrates[name])} kbit/s and {plain(factors[name])}"
+    return draft.replaced(bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
 # --- responses to stale or lost inputs: modes=safe --------------------------------------------------------------------
@@ -203,16 +266,14 @@ def fade_when_stale(
     halve_every_s: Fraction,
     floor_kbps: Kbps,
 ) -> Step:
-    """A stale prediction is trusted less and less.
+    """A stale prediction is trusted less and less, unless the measured link has taken its place (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
     down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run.
     """
-    made = state.prediction
-    limit = after_s if made is None or made.valid_s is None else exact(made.valid_s)
-    age = exact(state.t) - (exact(made.t) if made else 0)
+    age, limit = _age(state, after_s)
     assert draft.total is not None
-    if age <= limit:
+    if age <= limit or draft.measured:
         return draft, memory
     halvings = int((age - limit) / halve_every_s) + 1
     # 64 halvings are below any floor; more would only make the numbers long.
@@ -222,21 +283,76 @@ def fade_when_stale(
     return draft.noted(note, total=total), memory
 
 
-@rule(needs=["total"], gives=["total"], reads=["link", "t"])
-def cap_by_link(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """The total is at most what the uplink carries, as measured by the operator's side; see `runner.core.link_cap`.
+@rule(needs=["total"], gives=["total"], reads=["copies", "link", "on", "operator_lost", "prediction", "t"])
+def cap_by_link(
+    vehicle: Vehicle,
+    state: State,
+    draft: Draft,
+    memory: Memory,
+    *,
+    reserve_kbps: Kbps = allocation.ZERO,
+    alone_after_s: Fraction | None = None,
+    least_trust: Fraction = Fraction(1),
+) -> Step:
+    """The total is at most what the uplink carries, as the operator's side measures it; see `runner.core.link_cap`.
+
+    The measured link carries the headers of packets as well, and `reserve_kbps` of it are left to others. The operator
+    measures its own copy of each camera; others that leave the vehicle occupy the link in proportion. While
+    nothing is to be sent, nothing can be measured. A prediction older than its own `valid_s`, otherwise than
+    `alone_after_s`, is left aside while the link is measured: the total then follows the measurement alone. Of one
+    that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time.
 
     Memory: the cap, `LinkCap`.
     """
     assert draft.total is not None
-    before = memory.get("cap_by_link", UNCAPPED)
-    cap = advanced(before, state.link, state.t, draft.total)
-    if cap is not before:
+    cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
+    link, before = _of_all_copies(vehicle, state), memory.get("cap_by_link", UNCAPPED)
+    asked = wire_kbps(cameras, draft.total)
+    least = wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))  # with less, no camera would be sent and measured
+    if draft.total < max(1, len(cameras)) or not cameras or state.operator_lost is not None:
+        cap = idle(before, state.t)
+    else:
+        alone = alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t)
+        if alone:
+            limit = wire_kbps(cameras, sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO))
+            before = probing(before, asked, limit)
+            draft, asked = draft.replaced(measured=True, total=video_kbps(cameras, limit)), limit
+        elif before.alone:
+            before = replace(before, alone=False)
+        cap = raised(advanced(before, link, state.t, asked, least_trust), least)
+    if cap is not memory.get("cap_by_link", UNCAPPED):
         memory = {**memory, "cap_by_link": cap}
-    if cap.kbps is None or cap.kbps >= draft.total:
+    assert draft.total is not None
+    carried, why = believed(cap, asked, least_trust), f"{float(cap.trust):.0%} of a prediction that proved too high"
+    if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
+        carried = max(least, cap.kbps - reserve_kbps)
+        why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
+    total = video_kbps(cameras, carried)
+    if total >= draft.total:
         return draft, memory
-    why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
-    return draft.noted(f"total {_short(draft.total)} -> {_short(cap.kbps)}: {why}", total=cap.kbps), memory
+    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total), memory
+
+
+def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
+    """The measurement of one copy of each camera, as if it were of all copies that leave the vehicle."""
+    if state.link is None or state.link.kbps is None or not state.copies:
+        return state.link
+    sizes = {name: camera.rate_quality.b_full for name, camera in vehicle.cameras.items() if state.on[name]}
+    sent = sum(size * state.copies.get(name, 1) for name, size in sizes.items())
+    return replace(state.link, kbps=state.link.kbps * sent / max(1, sum(sizes.values())))
+
+
+def _is_stale(state: State, after_s: Fraction) -> bool:
+    """Whether the prediction is older than its own `valid_s`, otherwise `after_s`; before the first one, the run."""
+    age, limit = _age(state, after_s)
+    return age > limit
+
+
+def _age(state: State, after_s: Fraction) -> tuple[Fraction, Fraction]:
+    """Age of the prediction, s, and how old it may be."""
+    made = state.prediction
+    limit = after_s if made is None or made.valid_s is None else exact(made.valid_s)
+    return exact(state.t) - (exact(made.t) if made else 0), limit
 
 
 @rule(reads=["operator_lost", "t"])
@@ -283,7 +399,7 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
 
     raises  RuleFailed, since rules may be the user's own
     """
-    draft = Draft()
+    draft, asked = Draft(), None
     for call in vehicle.modes[state.mode]:
         before = draft
         try:
@@ -292,8 +408,10 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
             raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
         if problem := _draft_problem(state, before, draft):
             raise RuleFailed(f"rule {call.name} failed: {problem}")
-    assert draft.total is not None
-    return Decision(state.mode, draft.total, {name: _setting(state, draft, name) for name in vehicle.cameras}), memory
+        asked = draft.total if asked is None else asked
+    assert draft.total is not None and asked is not None
+    settings = {name: _setting(state, draft, name) for name in vehicle.cameras}
+    return Decision(state.mode, draft.total, settings, asked), memory
 
 
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:

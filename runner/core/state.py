@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, assert_never
 
 from runner.core import events as ev
-from runner.core.decision import Decision
+from runner.core.decision import NOTHING, Decision
 from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain, suggest
 
 
@@ -33,7 +33,8 @@ class State:
     prediction        the last one, in whichever mode it arrived
     total_set         kbit/s, the operator's last total
     collective_total  kbit/s, total of mode collective
-    link              the newest measurement of the uplink
+    link              the newest measurement of the uplink; None: no operator measures it
+    copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
     operator_lost     t at which the operator's side disconnected
     """
 
@@ -48,6 +49,7 @@ class State:
     collective_total: Kbps | None = None
     operator_lost: float | None = None
     link: ev.LinkMeasured | None = None
+    copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
 
     @staticmethod
     def initial(vehicle: Vehicle, mode: Mode) -> State:
@@ -83,8 +85,9 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"total_set": kbps, "collective_total": kbps}
         case ev.CameraSwitched(camera=name, on=on):
             _known(vehicle, name)
-            # Switched on again in S, a camera gets its last values.
-            manual = state.manual if on else {**state.manual, **keep(in_force, name)}
+            # Switched on again in S, a camera gets its last values; in S they are the operator's, whatever caps them.
+            kept = {} if on or state.mode is Mode.SINGLE else keep(in_force, name)
+            manual = {**state.manual, **kept} if kept else state.manual
             return {"on": {**state.on, name: on}, "manual": manual}
         case ev.RoiSet(camera=name, roi=roi):
             _only_in(Mode.SINGLE, state, event)
@@ -103,10 +106,16 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 return {"link": event}
             _known(vehicle, name)
             return {}
+        case ev.ControlPassed():
+            return {"link": None}  # another place, and another path to it
+        case ev.CopiesCounted(copies=copies):
+            for name in copies:
+                _known(vehicle, name)
+            return {"copies": copies}
         case ev.OperatorConnected():
             return {"operator_lost": None}
         case ev.OperatorDisconnected():
-            return {} if state.operator_lost is not None else {"operator_lost": event.t}
+            return {} if state.operator_lost is not None else {"operator_lost": event.t, "link": None}
         case ev.PositionReported() | ev.ClockAdvanced():
             return {}
         case _:

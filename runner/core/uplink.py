@@ -19,6 +19,8 @@ from types import MappingProxyType
 
 BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time and the one before
 KEPT_S = 1.0  # units are kept for this long
+MOST_UNITS = 5000  # and no more of them
+LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
 EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
@@ -181,14 +183,14 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
         if unit.captured < captured.get(unit.camera, unit.captured):
             paths, captured, intervals, kept = {}, {}, {}, []
         if unit.camera in captured:
-            intervals[unit.camera] = unit.captured - captured[unit.camera]
+            intervals[unit.camera] = min(LONGEST_INTERVAL_S, unit.captured - captured[unit.camera])
         captured[unit.camera] = unit.captured
         delay = unit.arrived - unit.captured
         paths[unit.camera] = paths.get(unit.camera, _Path(delay, delay, unit.arrived)).after(unit)
         if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
         kept.append(_Unit(unit.arrived, delay - paths[unit.camera].delay, unit.bytes))
-    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)
+    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
 
@@ -203,11 +205,14 @@ def _longest_gap(frame: float) -> float:
 
 def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
     """kbit/s that arrived: since the queue began where it lasts, and never across a gap."""
-    since = max(last - window, uplink.resumed, uplink.resumed if uplink.onset is None else uplink.onset)
+    # From one arrival to another: a window that begins between two would count too much or too little.
+    begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-float("inf"))
+    begin = max(begin, uplink.units[0].arrived)
+    since = max(begin, uplink.resumed, uplink.resumed if uplink.onset is None else uplink.onset)
     if last - since < EVIDENCE_S:
-        if uplink.resumed > last - window:
+        if uplink.resumed > begin or last - begin < EVIDENCE_S:
             return None
-        since = last - window
+        since = begin
     return sum(unit.bytes for unit in uplink.units if unit.arrived > since) * 8 / 1000 / (last - since)
 
 

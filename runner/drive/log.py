@@ -25,6 +25,7 @@ from runner.records import (
     LinesDropped,
     LinkSample,
     Note,
+    ReceptionReported,
     Record,
     Telemetry,
     VideoBegan,
@@ -37,7 +38,7 @@ WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 # Records of numbers and of the rules' own texts; redacting a decision takes twenty times as long as making it.
-WITHOUT_ADDRESSES = (DecisionMade, LinkSample, Telemetry)
+WITHOUT_ADDRESSES = (DecisionMade, LinkSample, ReceptionReported, Telemetry)
 RETRY_S = 1.0  # time between attempts to write to a full disk
 CLOSE_S = 5.0  # a disk that is stuck for longer does not keep the process from ending
 

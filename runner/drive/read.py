@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,14 +15,9 @@ from runner.records import Began, Ended, Json, LinesDropped, Record, from_json, 
 from runner.schema import event_problem, log_problem, read_json
 
 T = TypeVar("T")
-SKIPPED_KINDS = (
-    "decision",
-    "telemetry",
-    "note",
-    "video",
-    "dropped",
-    "ended",
-)  # if only the vehicle's events are wanted
+REPORTS = "reception"
+# Of a vehicle's log, the lines that are neither an event nor a reception report, nor the first.
+OTHER_KINDS = ("decision", "telemetry", "note", "video", "dropped", "ended")
 
 
 @dataclass(frozen=True)
@@ -112,11 +107,11 @@ def check_began(line: Json | None, name: str) -> Began:
 
 
 def read_lines(
-    lines: Iterable[str], name: str, warnings: list[str], *, events: bool = False
+    lines: Iterable[str], name: str, warnings: list[str], *, skipped: Container[str] = ()
 ) -> Iterator[tuple[int, Json]]:
     """The lines of a drive's file with their numbers, each checked against its schema.
 
-    events  yield events and the first line only; other lines of a side are not checked
+    skipped  kinds of log lines that are neither checked nor yielded
 
     An incomplete last line of a drive, left by a killed process, is skipped with a warning.
 
@@ -127,7 +122,7 @@ def read_lines(
         line, problem = read_line(text)
         if is_log(line):
             drive = True
-            if events and line["log"] in SKIPPED_KINDS:
+            if line["log"] in skipped:
                 continue
             problem = problem or log_problem(line)
         if problem and drive and not text.endswith("\n"):

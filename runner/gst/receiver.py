@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from gi.repository import GObject, Gst, GstSdp
 
@@ -18,6 +19,8 @@ from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
+RTP_HZ = 90_000  # of video (RFC 6184)
+KEPT_ARRIVALS = 1024  # not read yet; the oldest are dropped
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
@@ -50,6 +53,18 @@ class Reception:
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
+class Arrival(NamedTuple):
+    """An access unit as it arrived.
+
+    arrived   s, by this machine's monotonic clock
+    captured  s, by the vehicle's clock; since any time, if the transport carries the RTP timestamp only
+    """
+
+    arrived: float
+    captured: float
+    bytes: int
+
+
 OnUnit = Callable[[str, AccessUnit], None]  # camera, what was received
 OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
 PICTURES = (
@@ -65,7 +80,6 @@ class Receiver:
     on_picture  called with each decoded picture, from the streaming thread
     arrivals    record when each access unit arrived
     video       where to keep what is received; the plan then has `video`
-    Without these no Python runs per frame.
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
     """
 
@@ -83,8 +97,14 @@ class Receiver:
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
+        self._unread: deque[Arrival] = deque(maxlen=KEPT_ARRIVALS)
+        self._packets = (0, 0)  # received and missing, as last read
+        self._depayloader = next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
+        self._media_clock = MediaClock(1 / RTP_HZ)
+        self._jitter_buffers: list[Gst.Element] = []
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
+        self._serves = plan.serves
         self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
@@ -125,6 +145,18 @@ class Receiver:
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
 
+    def take_arrivals(self) -> list[Arrival]:
+        """Access units that have arrived since the last call. From any one thread."""
+        return [self._unread.popleft() for _ in range(len(self._unread))]
+
+    def take_packets(self) -> tuple[int, int]:
+        """RTP packets received, and missing at first, since the last call. From any one thread."""
+        before = self._packets
+        stats = [buffer.get_property("stats") for buffer in self._jitter_buffers]
+        lost = sum(s.get_value("num-lost") + s.get_value("rtx-success-count") for s in stats)
+        now = self._packets = (sum(s.get_value("num-pushed") for s in stats), lost)
+        return (max(0, now[0] - before[0]), max(0, now[1] - before[1]))  # a new pipeline counts from 0
+
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
         self._built = True
@@ -134,7 +166,7 @@ class Receiver:
         self._sink = pipeline.get_by_name(self._sink_name)
         self._received = pipeline.get_by_name("received")
         self._begun = False
-        self._jitter_buffers: list[Gst.Element] = []
+        self._jitter_buffers = []
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
         if GObject.signal_lookup("select-stream", self._client):
@@ -143,8 +175,9 @@ class Receiver:
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
             VideoFile(self._video, self._name, "operator", _came, self._on_report).follow(pipeline)
-        if self._on_unit or self._arrivals is not None:
-            self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
+        self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
+        if not self._serves and (depayloader := pipeline.get_by_name(self._depayloader)):
+            depayloader.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
         return self._received.get_static_pad("src")
@@ -203,13 +236,21 @@ class Receiver:
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """An access unit has arrived: page and log share its times."""
-        arrived, buffer = time.time(), info.get_buffer()
+        """An access unit has arrived: page and log share its times; the vehicle receives them in a report."""
+        arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
         captured = capture_time(buffer)
+        sampled = self._media_clock.seconds if captured is None else captured
+        if sampled is not None:
+            self._unread.append(Arrival(monotonic, sampled, buffer.get_size()))
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         if self._on_unit:
             self._pass_on(buffer, captured, arrived, self._on_unit)
+        return Gst.PadProbeReturn.OK
+
+    def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        """Without RTSP no element reads the capture time: note the RTP timestamp (RFC 3550, section 5.1)."""
+        self._media_clock.tick(int.from_bytes(info.get_buffer().extract_dup(4, 4), "big"))
         return Gst.PadProbeReturn.OK
 
     def _pass_on(self, buffer: Gst.Buffer, captured: float | None, arrived: float, on_unit: OnUnit) -> None:
@@ -234,6 +275,19 @@ class Receiver:
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
+
+
+class MediaClock:
+    """Time of a counter of 32 bits that wraps around; None before its first value."""
+
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s, self._last, self._ticks = tick_s, 0, 0
+        self.seconds: float | None = None
+
+    def tick(self, counter: int) -> None:
+        ahead = (counter - self._last) & 0xFFFFFFFF
+        self._ticks += ahead - (ahead >> 31 << 32)  # of two directions the shorter
+        self._last, self.seconds = counter, self._ticks * self._tick_s
 
 
 def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:

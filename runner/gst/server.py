@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, auto
 
@@ -20,7 +21,7 @@ from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
-from runner.gst.viewers import admit
+from runner.gst.viewers import admit, over_uplink
 from runner.system.ports import check_port_free
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
@@ -354,7 +355,8 @@ class CameraServer:
     def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._connection(client)
         if connection:
-            connection.cameras.pop(_camera_name(context), None)
+            with self._changed:
+                connection.cameras.pop(_camera_name(context), None)
             self._left.add(_camera_name(context))
 
     def _connection(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
@@ -364,6 +366,12 @@ class CameraServer:
     def _watching(self, camera: str) -> list[RtspConnection]:
         with self._changed:
             return [connection for connection in self._connections.values() if camera in connection.cameras]
+
+    def copies(self) -> dict[str, int]:
+        """By camera, the viewers outside the vehicle; cameras without any are left out. From any thread."""
+        with self._changed:
+            watched = [c.cameras for c in self._connections.values() if over_uplink(c.viewer.address)]
+            return dict(Counter(name for cameras in watched for name in tuple(cameras)))
 
     def _close(self, connection: RtspConnection, why: str) -> None:
         for camera in sorted(connection.cameras):

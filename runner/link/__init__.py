@@ -102,6 +102,7 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
         bytes=counters.bytes,
         packets=counters.packets,
         dropped=counters.dropped,
+        lost=counters.lost,
     )
 
 

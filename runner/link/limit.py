@@ -15,17 +15,34 @@ SLOWEST_KBPS = 1.0  # tbf cannot stop completely; at this rate one packet passes
 
 
 @dataclass(frozen=True)
+class Reverse:
+    """The direction from operator to vehicle: a constant rate, kbit/s, and otherwise as in `Limit`."""
+
+    kbps: float
+    queue_ms: float
+    delay_ms: float
+    loss: float = 0.0
+    burst: float = 1.0
+
+
+@dataclass(frozen=True)
 class Limit:
     """What the link does to all traffic from the vehicle to the operator.
 
     kbps_at   rate in force t seconds after the start of the drive; below 1 kbit/s it is 1 kbit/s
     queue_ms  packets that would wait longer are dropped
     delay_ms  one way, in addition to the wait
+    loss      share of UDP packets that are lost after the queue
+    burst     mean number of packets that are lost in a row
+    reverse   what it does to traffic from the operator to the vehicle; None: nothing
     """
 
     kbps_at: Callable[[float], float]
     queue_ms: float
     delay_ms: float
+    loss: float = 0.0
+    burst: float = 1.0
+    reverse: Reverse | None = None
 
     def kbps(self, t: float) -> float:
         """The rate to set, kbit/s; before the start, the rate at the start."""
@@ -39,13 +56,15 @@ class LinkCounters:
     queue_ms  wait of a packet that arrives now
     bytes     forwarded from vehicle to operator
     packets   of these
-    dropped   packets
+    dropped   packets that found the queue full
+    lost      packets lost after the queue
     """
 
     queue_ms: float
     bytes: int
     packets: int
     dropped: int
+    lost: int = 0
 
 
 class Shaper(Protocol):

@@ -47,6 +47,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
     media, control  their ports are used, on addresses of the link
     raises          RunError with the remedy
     """
+    _check_supported(limit)
     ip, tc = _find("ip"), _find("tc")
     _check_allowed()
     with _claimed(ip) as (name, network), urgent(lambda: _remove(ip, name)):
@@ -61,6 +62,13 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
                 shaper.end()
         finally:
             _remove(ip, name)
+
+
+def _check_supported(limit: Limit) -> None:
+    """raises RunError for what only the relay does"""
+    for key, given in (("loss", limit.loss), ("reverse", limit.reverse)):
+        if given:
+            raise RunError(f"link=netns: {key} is not supported, {OTHERWISE}")
 
 
 class _Tbf:

@@ -1,14 +1,14 @@
-"""usage: python -m runner.link.relay '{"media": [HOST, PORT], "control": [HOST, PORT], "kbps": N, "queue_ms": N, ...}'
+"""usage: python -m runner.link.relay '{"media": [HOST, PORT], "control": [HOST, PORT], "up": {...}, "down": null}'
 
 The process between vehicle and operator. It listens on two ports of its own, named in its first line of output:
 `media` for the operator's RTSP, forwarded to the vehicle's server, and `control` for the vehicle's MQTT, forwarded to
 the broker. In RTSP's SETUP it replaces both sides' UDP ports with its own, so that RTP and RTCP pass through it.
 Traffic from vehicle to operator shares one `Bucket`; UDP that finds it full is dropped, TCP waits before it. Packets
 count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP messages and interleaved
-packets are never split. The other direction is unlimited.
+packets are never split. The other direction has a `Bucket` of its own if `down` is given, otherwise it is unlimited.
+Losses and delay follow the queue; only UDP packets are lost.
 
-Each line of input is a rate in kbit/s, answered with the counters; at the end of its input the relay ends. A delay is
-added after the queue.
+Each line of input is a rate in kbit/s, answered with the counters; at the end of its input the relay ends.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import random
 import selectors
 import socket
 import sys
@@ -25,7 +26,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from runner.link import rtsp
 from runner.link.bucket import Bucket
@@ -41,21 +42,46 @@ WAIT_S = 0.5  # for a server to accept
 SocketAddress = tuple[str, int]
 Cut = Callable[[bytes], Iterable[bytes]]
 Delivery = Callable[[], object]
-Serve = Callable[["Uplink", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
+Serve = Callable[["Link", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
+UNLIMITED = {"kbps": 1e7, "queue_ms": 1000, "delay_ms": 0}
 
 
-class Uplink:
-    """Everything from vehicle to operator: one queue with one rate, then the delay."""
+class Lottery:
+    """Which packets are lost: the two states of Gilbert's model (Bell System Technical Journal, 1960).
 
-    def __init__(self, kbps: float, queue_ms: float, delay_ms: float) -> None:
+    loss   share of all packets
+    burst  mean number lost in a row; 1: each independently
+    """
+
+    def __init__(self, loss: float, burst: float, seed: int = 1) -> None:
+        self._ends = min(1 / burst, 1 - loss)  # by chance some follow each other, too
+        self._begins = 1.0 if loss >= 1 else loss * self._ends / (1 - loss)
+        self._chance = random.Random(seed)  # the same losses in every run
+        self._losing = False
+
+    def draw(self) -> bool:
+        """Whether the next packet is lost."""
+        if self._begins:
+            changes = self._ends if self._losing else self._begins
+            self._losing ^= self._chance.random() < changes
+        return self._losing
+
+
+class Direction:
+    """Everything from one side to the other: one queue with one rate, then losses and the delay."""
+
+    def __init__(self, kbps: float, queue_ms: float, delay_ms: float, loss: float = 0.0, burst: float = 1.0) -> None:
         self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
         self._delay_s = delay_ms / 1000
+        self._lottery, self._lost = Lottery(loss, burst), 0
         self._delayed: deque[tuple[float, Delivery]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
 
     def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
-        """Queue a packet of that many bytes; without `keep` a full queue drops it. `delivery` is called on arrival."""
+        """Queue a packet of that many bytes; without `keep` it may be dropped or lost. `delivery`: on arrival."""
+        if not keep and self._lottery.draw():
+            delivery = self._lose
         self._bucket.put(size, delivery, time.monotonic(), keep=keep)
         self._deliver()
 
@@ -64,7 +90,10 @@ class Uplink:
         now = time.monotonic()
         self._bucket.set_rate(kbps, now)
         self._deliver()
-        return asdict(self._bucket.counters(now))
+        return asdict(self._bucket.counters(now)) | {"lost": self._lost}
+
+    def _lose(self) -> None:
+        self._lost += 1
 
     async def room(self) -> None:
         """Wait until the queue has room for a segment of TCP."""
@@ -87,41 +116,51 @@ class Uplink:
         self._timer = asyncio.get_running_loop().call_at(min(known), self._deliver) if known else None
 
 
-async def join(uplink: Uplink, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
+class Link(NamedTuple):
+    """Both directions: from vehicle to operator, and back."""
+
+    up: Direction
+    down: Direction
+
+
+async def join(link: Link, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
     """Pass bytes between two connections until one ends.
 
-    vehicle   the end whose bytes are limited
     up, down  cut the bytes of each direction into units that are never split
     """
-    arrived: asyncio.Queue[bytes] = asyncio.Queue()
+    upwards: asyncio.Queue[bytes] = asyncio.Queue()
+    downwards: asyncio.Queue[bytes] = asyncio.Queue()
     for sock in (vehicle, other):
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    reading = asyncio.create_task(_pass_limited(uplink, vehicle, arrived, up))
-    ends = [asyncio.create_task(each) for each in (_write(arrived, other), _pass(other, vehicle, down))]
+    reading = [
+        asyncio.create_task(_pass(*each))
+        for each in ((link.up, vehicle, upwards, up), (link.down, other, downwards, down))
+    ]
+    ends = [asyncio.create_task(each) for each in (_write(upwards, other), _write(downwards, vehicle))]
     try:
         await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        for task in (reading, *ends):
+        for task in (*reading, *ends):
             task.cancel()
-        ended = await asyncio.gather(reading, *ends, return_exceptions=True)
+        ended = await asyncio.gather(*reading, *ends, return_exceptions=True)
     for error in ended:
         if isinstance(error, Exception):
             raise error
 
 
-async def _pass_limited(uplink: Uplink, source: socket.socket, arrived: asyncio.Queue[bytes], cut: Cut) -> None:
+async def _pass(direction: Direction, source: socket.socket, arrived: asyncio.Queue[bytes], cut: Cut) -> None:
     loop = asyncio.get_running_loop()
     with suppress(OSError, ValueError):
         while True:
             await arrived.join()  # a receiver that does not read is not sent more
-            await uplink.room()
+            await direction.room()
             if not (data := await loop.sock_recv(source, SEGMENT)):
                 break
             for unit in cut(data):
                 size = len(unit) + TCP_HEADERS * -(-len(unit) // SEGMENT)
-                uplink.put(size, partial(arrived.put_nowait, unit), keep=True)
-    uplink.put(0, partial(arrived.put_nowait, b""), keep=True)  # what was sent before still passes
+                direction.put(size, partial(arrived.put_nowait, unit), keep=True)
+    direction.put(0, partial(arrived.put_nowait, b""), keep=True)  # what was sent before still passes
 
 
 async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
@@ -133,14 +172,6 @@ async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
             arrived.task_done()
 
 
-async def _pass(source: socket.socket, sink: socket.socket, cut: Cut) -> None:
-    loop = asyncio.get_running_loop()
-    with suppress(OSError, ValueError):
-        while data := await loop.sock_recv(source, WINDOW):
-            for unit in cut(data):
-                await loop.sock_sendall(sink, unit)
-
-
 class Ports:
     """Two UDP sockets between both sides' RTP and RTCP ports.
 
@@ -148,8 +179,8 @@ class Ports:
     server    host of the vehicle's server; its ports are known once it has answered
     """
 
-    def __init__(self, uplink: Uplink, host: str, operator: SocketAddress, server: str) -> None:
-        self._uplink, self._operator, self._server = uplink, operator, server
+    def __init__(self, link: Link, host: str, operator: SocketAddress, server: str) -> None:
+        self._link, self._operator, self._server = link, operator, server
         self.server_port: int | None = None
         self._sockets = _bind_pair(host)
         self.port: int = self._sockets[0].getsockname()[1]
@@ -182,9 +213,10 @@ class Ports:
             if self.server_port is None:
                 continue  # too early: the server's ports are not known yet
             if source[1] - self.server_port in (0, 1):
-                self._uplink.put(len(data) + UDP_HEADERS, _sender(sock, data, operator))
+                self._link.up.put(len(data) + UDP_HEADERS, _sender(sock, data, operator))
             else:
-                _sender(sock, data, (self._server, self.server_port + index))()
+                to_vehicle = _sender(sock, data, (self._server, self.server_port + index))
+                self._link.down.put(len(data) + UDP_HEADERS, to_vehicle)
 
 
 class Rtsp:
@@ -195,8 +227,8 @@ class Rtsp:
     server    the server's host
     """
 
-    def __init__(self, uplink: Uplink, operator: str, far: socket.socket, server: str) -> None:
-        self._uplink, self._operator = uplink, operator
+    def __init__(self, link: Link, operator: str, far: socket.socket, server: str) -> None:
+        self._link, self._operator = link, operator
         self._host, self._server = far.getsockname()[0], server
         self._ports: list[Ports] = []
         self._requests, self._replies = rtsp.Units(), rtsp.Units()
@@ -225,7 +257,7 @@ class Rtsp:
         for ports in self._ports:
             if ports.operator_port == port:
                 return ports.port
-        self._ports.append(Ports(self._uplink, self._host, (self._operator, port), self._server))
+        self._ports.append(Ports(self._link, self._host, (self._operator, port), self._server))
         return self._ports[-1].port
 
 
@@ -254,22 +286,22 @@ def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
     raise OSError(f"no two neighbouring UDP ports are free on {host}")
 
 
-async def serve_media(uplink: Uplink, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
+async def serve_media(link: Link, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
     """Join an operator's connection to the vehicle's RTSP server, whose side is limited."""
     async with connected(server) as far:
         if far:
-            passing = Rtsp(uplink, operator[0], far, server[0])
+            passing = Rtsp(link, operator[0], far, server[0])
             try:
-                await join(uplink, far, near, passing.replies, passing.requests)
+                await join(link, far, near, passing.replies, passing.requests)
             finally:
                 passing.close()
 
 
-async def serve_control(uplink: Uplink, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
+async def serve_control(link: Link, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
     """Join the vehicle's connection, which is limited, to the broker."""
     async with connected(broker) as far:
         if far:
-            await join(uplink, near, far, lambda data: [data], lambda data: [data])
+            await join(link, near, far, lambda data: [data], lambda data: [data])
 
 
 @asynccontextmanager
@@ -296,12 +328,12 @@ def listen(host: str) -> socket.socket:
     return server
 
 
-async def accept(server: socket.socket, uplink: Uplink, serve: Serve, address: SocketAddress) -> None:
+async def accept(server: socket.socket, link: Link, serve: Serve, address: SocketAddress) -> None:
     """Serve each connection in its own task, forever."""
     async with asyncio.TaskGroup() as tasks:
         while True:
             near, client = await asyncio.get_running_loop().sock_accept(server)
-            tasks.create_task(_served(serve(uplink, address, near, client), near))
+            tasks.create_task(_served(serve(link, address, near, client), near))
 
 
 async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> None:
@@ -309,28 +341,28 @@ async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> No
         await serving
 
 
-async def take_rates(uplink: Uplink) -> None:
+async def take_rates(link: Link) -> None:
     """Set rates from standard input, each answered with the counters, until the input ends."""
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     while line := await lines.readline():
-        print(json.dumps(uplink.set_rate(float(line))), flush=True)
+        print(json.dumps(link.up.set_rate(float(line))), flush=True)
 
 
 async def main() -> None:
     settings = json.loads(sys.argv[1])
     media, control = ((socket.gethostbyname(host), port) for host, port in (settings["media"], settings["control"]))
-    uplink = Uplink(settings["kbps"], settings["queue_ms"], settings["delay_ms"])
+    link = Link(Direction(**settings["up"]), Direction(**(settings["down"] or UNLIMITED)))
     listening = {"media": listen(media[0]), "control": listen(control[0])}
     print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)
     gc.freeze()
     gc.disable()  # no reference cycle here lasts long; a collection would delay packets
     async with asyncio.TaskGroup() as tasks:
         serving = [
-            tasks.create_task(accept(listening["media"], uplink, serve_media, media)),
-            tasks.create_task(accept(listening["control"], uplink, serve_control, control)),
+            tasks.create_task(accept(listening["media"], link, serve_media, media)),
+            tasks.create_task(accept(listening["control"], link, serve_control, control)),
         ]
-        await take_rates(uplink)
+        await take_rates(link)
         for task in serving:
             task.cancel()
 

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 
 from runner.core.model import Endpoint
 from runner.link.child import Child
@@ -24,9 +25,14 @@ def relayed(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
     settings = {
         "media": [media.host, media.port],
         "control": [control.host, control.port],
-        "kbps": limit.kbps(0),
-        "queue_ms": limit.queue_ms,
-        "delay_ms": limit.delay_ms,
+        "up": {
+            "kbps": limit.kbps(0),
+            "queue_ms": limit.queue_ms,
+            "delay_ms": limit.delay_ms,
+            "loss": limit.loss,
+            "burst": limit.burst,
+        },
+        "down": asdict(limit.reverse) if limit.reverse else None,
     }
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
     relay = Child("relay", command, children.environment())

@@ -25,6 +25,8 @@ KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a wil
 LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
 FAULTS = 100  # distinct message faults that are reported; further ones are only counted
+LONGEST_FAULT = 1000  # characters of why
+REPEATED = {"telemetry", "reception"}  # the next message comes soon: without acknowledgement
 RETAINED = ("state", "telemetry", "configuration")
 
 
@@ -132,13 +134,13 @@ class ControlLink:
 
     def _drop(self, message: MQTTMessage, why: str) -> None:
         self.dropped += 1
-        fault = f"a message on {message.topic} was dropped: {why}"
+        fault = f"a message on {message.topic} was dropped: {why[:LONGEST_FAULT]}"
         if fault not in self._faults and len(self._faults) < FAULTS:
             self._faults.add(fault)
             self._on_report(fault)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
-        qos = 0 if topic.endswith("/telemetry") else 1
+        qos = 0 if set(topic.split("/")[2:]) & REPEATED else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
 
     def _connected(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:

@@ -6,11 +6,12 @@ Topics of a vehicle, below tod/<vehicle>/:
                          retained. The vehicle stamps it on receipt.
     reply/<operator>     to that operator: the same id, and applied (read back from the elements), refused, expired or
                          timed out
+    reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never answered or retained
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
 Last wills announce that a side is offline: the vehicle's state is {"online": false}, the operator's request is
-operator_disconnected. schemas/control.schema.json describes the vehicle's messages.
+operator_disconnected. schemas/control.schema.json describes the vehicle's messages and reception reports.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from runner.records import Reply, Settings, Telemetry, VehicleState, from_json
+from runner.records import ReceptionReport, Reply, Settings, Telemetry, VehicleState, from_json
 from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # it is shown to operators and logged
+OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
@@ -89,9 +91,18 @@ def read_reply(payload: bytes) -> Reply:
     return from_json(Reply, _checked("reply", payload))
 
 
-def _checked(kind: str, payload: bytes) -> dict[str, Any]:
-    """A message of the vehicle that satisfies schemas/control.schema.json."""
-    document = read_message(payload, MAX_MESSAGE_BYTES)
+def read_reception(message: MqttMessage) -> ReceptionReport:
+    """What an operator's side has received. Like the readers above, raises ValueError with the problem."""
+    if not OPERATOR.fullmatch(message.sender):
+        raise ValueError(OPERATOR_RULE)
+    if message.retained:
+        raise ValueError("must not be retained: a report is for now")
+    return from_json(ReceptionReport, _checked("reception", message.payload, MAX_REQUEST_BYTES))
+
+
+def _checked(kind: str, payload: bytes, limit: int = MAX_MESSAGE_BYTES) -> dict[str, Any]:
+    """A message that satisfies schemas/control.schema.json."""
+    document = read_message(payload, limit)
     if problem := message_problem(kind, document):
         raise ValueError(problem)
     return document
@@ -119,7 +130,7 @@ def read_request(message: MqttMessage) -> ParsedRequest:
     except ValueError as error:
         return ParsedRequest({}, problem=str(error))
     if not OPERATOR.fullmatch(message.sender):
-        return ParsedRequest({}, problem="topic: an operator's id must be 1 to 64 letters, digits, _ and -")
+        return ParsedRequest({}, problem=OPERATOR_RULE)
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
     if not isinstance(identity, str) or not identity:
         return ParsedRequest(document, problem="id: must be given, as text")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from runner.configuration import agreement
 from runner.configuration.config import configuration
+from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
@@ -48,6 +49,7 @@ class LiveOperator:
         self._until = float("inf")
         self._failure: RunError | None = None
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
+        self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
 
     def start(self, on_unit: OnUnit | None = None, duration_s: float | None = None) -> None:
         """Connect, receive, and sample, until stopped or for a given time.
@@ -59,6 +61,7 @@ class LiveOperator:
         self._log.begin()
         self._until = float("inf") if duration_s is None else time.monotonic() + duration_s
         self._thread.start()
+        self._reporting.start()
 
     def runs(self, wait_s: float = 0.0) -> bool:
         """Whether it still samples after a time; returns at once if it does not.
@@ -77,8 +80,9 @@ class LiveOperator:
     def stop(self) -> None:
         """Sign off from the vehicle, and end."""
         self.end()
-        if self._thread.ident:
-            self._thread.join(END_S)
+        for thread in (self._thread, self._reporting):
+            if thread.ident:
+                thread.join(END_S)
         self.station.close()
         if self._side:
             self._side.stop()
@@ -86,16 +90,36 @@ class LiveOperator:
 
     def _run(self) -> None:
         """In its own thread, so that a stopped terminal (Ctrl-S) does not block it."""
+        side = self._side
+        assert side
+        try:
+            self._repeat("sample", SAMPLE_S, lambda: self.station.take(side.sample(self.station.sending())))
+        except RunError as error:  # GStreamer hangs; kept for the main thread
+            self._failure = error
+
+    def _report(self) -> None:
+        """In its own thread, since a sample waits for GLib: the vehicle takes a missing report for a bad link."""
+        side = self._side
+        assert side
+        self._repeat(
+            "reception report",
+            REPORT_S,
+            lambda: self.station.report_reception(side.take_arrivals(), *side.take_packets()),
+        )
+
+    def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
+        """Do a piece of work until stopped; an exception in it must not end the operator's view of a moving vehicle.
+
+        raises  RunError
+        """
         noted = ""
-        assert self._side
-        while not self._stopped.wait(SAMPLE_S) and time.monotonic() < self._until:
+        while not self._stopped.wait(every_s) and time.monotonic() < self._until:
             try:
-                self.station.take(self._side.sample(self.station.sending()))
-            except RunError as error:  # GStreamer hangs; kept for the main thread
-                self._failure = error
-                return
-            except Exception as error:  # must not end the operator's view of a moving vehicle
-                if noted != (noted := f"a sample failed: {type(error).__name__}: {error}"):
+                work()
+            except RunError:
+                raise
+            except Exception as error:
+                if noted != (noted := f"a {what} failed: {type(error).__name__}: {error}"):
                     self.station.note(noted)
 
 

@@ -15,6 +15,8 @@ CAUSES = {
     "camera_configured": "{camera} configured",
     "weights_set": "Weights set",
     "link_measured": "Link measured",
+    "copies_counted": "Number of viewers changed",
+    "control_passed": "Control passed",
     "operator_connected": "Operator connected",
     "operator_disconnected": "Operator disconnected",
     "clock_advanced": "Time elapsed",
@@ -37,12 +39,12 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
     if before.mode != state.mode and not cause.startswith("Mode "):
         cause = f"Mode {state.mode}; {cause}"
     if not changed:
-        return None if before.mode == state.mode else f"{cause}: total {state.total_kbps} kbit/s"
+        return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s"
     reasons = [cameras[name].reason for name in changed]
     if len(changed) > 1:
         each = [reason.split("; ")[1:] for reason in reasons]  # after the camera's own, those of the whole decision
         shared = [part for part in each[0] if all(part in others for others in each)]
-        total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_kbps} kbit/s"
+        total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
         reasons = ["; ".join([total, *shared])]
     alike: dict[str, list[str]] = {}
     for name, change in changed.items():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple, Protocol
 
 from runner.configuration import agreement
 from runner.core.model import Vehicle
@@ -25,16 +25,37 @@ from runner.mqtt.messages import (
 )
 from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
-from runner.records import CameraSample, CameraState, Note, Outcome, Sample, Telemetry, VehicleState
+from runner.records import (
+    CameraSample,
+    CameraState,
+    Note,
+    Outcome,
+    ReceptionReport,
+    Sample,
+    Telemetry,
+    UnitReceived,
+    VehicleState,
+    to_json,
+)
 from runner.system.clocks import Clocks
 
 SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
-REPORT_EVERY_S = 1.0  # how often reception is reported to the vehicle
 MOST_VEHICLES = 100  # whose names are remembered
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
 
 OnReply = Callable[[Outcome], None]
+
+
+class ArrivedUnit(Protocol):
+    """An access unit as it arrived: s by this machine's monotonic and by the vehicle's clock, and its bytes."""
+
+    @property
+    def arrived(self) -> float: ...
+    @property
+    def captured(self) -> float: ...
+    @property
+    def bytes(self) -> int: ...
 
 
 class Listener:
@@ -93,7 +114,7 @@ class Station:
         self.clocks = Clocks()
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
-        self._reported = 0.0
+        self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         listen = {
             topic("+", "state"): self._on_any_state,
             topic(vehicle.name, "reply", self.identity): self._on_reply,
@@ -101,6 +122,7 @@ class Station:
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         self._requests = topic(vehicle.name, "request", self.identity)
+        self._receptions = topic(vehicle.name, "reception", self.identity)
         self._link = ControlLink(
             vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note
         )
@@ -161,13 +183,27 @@ class Station:
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, self._camera(name))
         self.samples = samples
-        if now - self._reported >= REPORT_EVERY_S:
-            self._reported = now
-            for name, rates in self._rates.items():
-                self.ask({"event": "link_measured", "camera": name, "kbps": round(rates.kbps, 1)})
         sample = self._sample()
         for listener in self.listeners:
             listener.on_sample(sample)
+
+    def report_reception(self, arrivals: Mapping[str, Iterable[ArrivedUnit]], packets: int, lost: int) -> None:
+        """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread.
+
+        packets, lost  RTP packets of all cameras received, and missing at first
+        """
+        now = time.monotonic()
+        units = sorted((unit.arrived, name, unit) for name, arrived in arrivals.items() for unit in arrived)
+        if units and self._delay_s is None:
+            self._delay_s = units[0][2].arrived - units[0][2].captured
+        base = self._delay_s or 0.0
+        received = tuple(
+            UnitReceived(name, round(now - at, 4), round(at - unit.captured - base, 4), unit.bytes)
+            for at, name, unit in units
+        )
+        if self.state is not None:
+            report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
+            self._link.publish(self._receptions, to_json(report))
 
     def rows(self) -> list[CameraRow]:
         return [
@@ -180,7 +216,7 @@ class Station:
             return f"{self._vehicle.name}: offline"
         ahead = self.clocks.ahead_ms
         clock = "" if ahead is None else f"; its clock is ahead by at least {ahead:.0f} ms: latencies are unknown"
-        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_kbps} kbit/s{clock}"
+        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s{clock}"
 
     def _with_known_ages(self, now: float, samples: Mapping[str, StreamCounters]) -> Mapping[str, StreamCounters]:
         before = self.clocks.ahead_ms

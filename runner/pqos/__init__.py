@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -121,6 +123,36 @@ class LivePqos:
         return None
 
 
+class WrongPqos:
+    """Makes the predictions of a source wrong, for experiments.
+
+    share   factor applied to the rate
+    late_s  every prediction comes so much later
+    silent  predict nothing
+    """
+
+    def __init__(self, source: Pqos, share: Kbps, late_s: float, silent: bool) -> None:
+        self._source, self._share, self._late_s, self._silent = source, share, late_s, silent
+        self._waiting: deque[BitratePredicted] = deque()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self._source.warnings
+
+    def observe(self, event: Event) -> BitratePredicted | None:
+        """The newest prediction that is due."""
+        made = self._source.observe(event)
+        if made and not self._silent:
+            self._waiting.append(made)
+        due = None
+        while self._waiting and self._waiting[0].t + self._late_s <= event.t + 1e-9:
+            due = self._waiting.popleft()
+        if due is None:
+            return None
+        lower = None if due.lower_kbps is None else due.lower_kbps * self._share
+        return replace(due, t=event.t, kbps=due.kbps * self._share, lower_kbps=lower)
+
+
 def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
     """Rate in force at a time: that of the last row not after it; `off_trace` before the first row and after the end.
 
@@ -147,6 +179,13 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
     bases     directories in which a relative file is looked up, first match wins
     raises    ModelError with the key, the value found and the rule
     """
+    source, wrong = _source(settings, bases), settings.get("wrong")
+    if not wrong:
+        return source
+    return WrongPqos(source, exact(wrong.get("share", 1)), float(wrong.get("late_s", 0)), wrong.get("silent", False))
+
+
+def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
     match kind := settings.get("kind"):
         case "map":
             lon, lat, kbps = read_map(find_file(settings, "file", bases)).T

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from runner.records import Outcome
+from runner.records import Outcome, ReceptionReport
 
 WAITING = 64  # queued requests of one sender; further ones are refused
 ROUND_S = 0.1
@@ -33,10 +33,41 @@ class Request(NamedTuple):
     as_of: float | None = None
 
     @property
+    def queue(self) -> str:
+        return self.sender
+
+    @property
     def measures(self) -> tuple[Any, Any] | None:
         """The quantity it measures, if a newer measurement supersedes it."""
         name = self.document.get("event")
         return (name, self.document.get("camera")) if name in MEASUREMENTS else None
+
+    @property
+    def changes_mode(self) -> bool:
+        return self.document.get("event") == MODE_CHANGING
+
+
+class Reported(NamedTuple):
+    """A reception report of an operator. None supersedes another: each holds what arrived since the one before."""
+
+    sender: str
+    report: ReceptionReport
+
+    @property
+    def queue(self) -> str:
+        """Reports do not take the place of the sender's requests."""
+        return f"{self.sender}/reception"
+
+    @property
+    def measures(self) -> None:
+        return None
+
+    @property
+    def changes_mode(self) -> bool:
+        return False
+
+
+Item = Request | Reported
 
 
 class Inbox:
@@ -47,20 +78,20 @@ class Inbox:
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[str, deque[Request]] = {}  # by sender, in the order of their turns
+        self._waiting: dict[str, deque[Item]] = {}  # by sender, in the order of their turns
         self._filled = threading.Condition()
         self._woken = False
         self._taken: dict[str, int] = {}  # by sender, in this round
         self._round_ends = 0.0
 
-    def put(self, request: Request) -> Request | None:
+    def put(self, request: Item) -> Item | None:
         """Queue a request; returns the one that is refused as a result: itself, an older measurement, or None."""
         with self._filled:
-            waiting = self._waiting.get(request.sender)
+            waiting = self._waiting.get(request.queue)
             if waiting is None:
                 if len(self._waiting) >= SENDERS:
                     return request
-                waiting = self._waiting[request.sender] = deque()
+                waiting = self._waiting[request.queue] = deque()
             older = _superseded(waiting, request)
             if older is None and len(waiting) >= WAITING:
                 return request
@@ -81,7 +112,7 @@ class Inbox:
         """Whether a further request of a sender would probably be refused."""
         return len(self._waiting.get(sender, ())) >= WAITING
 
-    def get(self, until: float) -> Request | None:
+    def get(self, until: float) -> Item | None:
         """The next request, as soon as there is one; None once woken or after `until`, by `time.monotonic()`."""
         with self._filled:
             while True:
@@ -108,12 +139,12 @@ class Inbox:
         return next((sender for sender in self._waiting if self._taken.get(sender, 0) < TAKEN), None)
 
 
-def _superseded(waiting: deque[Request], newer: Request) -> int | None:
+def _superseded(waiting: deque[Item], newer: Item) -> int | None:
     """Index of the older measurement of the same quantity since the last change of the mode."""
     if newer.measures is None:
         return None
     for index in range(len(waiting) - 1, -1, -1):
-        if waiting[index].document.get("event") == MODE_CHANGING:
+        if waiting[index].changes_mode:
             return None
         if waiting[index].measures == newer.measures:
             return index

@@ -24,10 +24,19 @@ from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
 from runner.mqtt.link import ControlLink
-from runner.mqtt.messages import OFFLINE, MqttMessage, read_request, read_settings, read_state, read_telemetry, topic
+from runner.mqtt.messages import (
+    OFFLINE,
+    MqttMessage,
+    read_reception,
+    read_request,
+    read_settings,
+    read_state,
+    read_telemetry,
+    topic,
+)
 from runner.plans import compile_plans, render_missing
 from runner.records import Outcome, Settings, Telemetry, VehicleState, to_json
-from runner.vehicle.inbox import Request
+from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
@@ -148,6 +157,7 @@ class _VehicleControl:
         self._announce_timer: threading.Timer | None = None
         listen = {
             self._topic("request", "+"): self._on_request,
+            self._topic("reception", "+"): self._on_reception,
             self._topic("telemetry"): self._on_telemetry,
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
@@ -201,6 +211,16 @@ class _VehicleControl:
             self._live.loop.refuse(request, parsed.problem)
         else:
             self._live.loop.take(request)
+
+    def _on_reception(self, message: MqttMessage) -> None:
+        if self._live.loop.overrun(message.sender, reports=True):
+            return
+        try:
+            report = read_reception(message)
+        except ValueError:
+            self._live.loop.reject(message.sender)
+            raise
+        self._live.loop.take(Reported(message.sender, report))
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         """Before this vehicle has published anything, live telemetry is another vehicle's."""

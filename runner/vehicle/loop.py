@@ -9,7 +9,11 @@ from typing import Any, NamedTuple, Protocol
 
 from runner.core.commands import Command, KnobValues
 from runner.core.events import (
+    NAMES,
+    OWN,
     ClockAdvanced,
+    ControlPassed,
+    CopiesCounted,
     Event,
     OperatorConnected,
     OperatorDisconnected,
@@ -28,13 +32,15 @@ from runner.records import (
     CameraTelemetry,
     Outcome,
     Position,
+    ReceptionReported,
     Telemetry,
     VehicleState,
     applied_to_json,
 )
 from runner.schema import event_problem
-from runner.vehicle.inbox import WAITING, Answer, Inbox, Request
+from runner.vehicle.inbox import WAITING, Answer, Inbox, Item, Reported, Request
 from runner.vehicle.operators import SILENT_S, Operators
+from runner.vehicle.uplink import MeasuredUplink
 
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
@@ -50,6 +56,7 @@ class Applier(Protocol):
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
+    def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
 
 
@@ -96,6 +103,8 @@ class ControlLoop:
 
     def __post_init__(self) -> None:
         self._operators = Operators(self.vehicle.expires_s)
+        self._uplink = MeasuredUplink(self.vehicle)
+        self._in_control = ""
         self._began = time.monotonic()
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
@@ -105,21 +114,31 @@ class ControlLoop:
         """
         self.take(Request("", document, answer))
 
-    def take(self, request: Request) -> None:
-        """A request, from any thread. Once a sender's queue is full, its further requests are refused."""
-        dropped = self._inbox.put(request)
-        if dropped is request:
-            self.refuse(request, f"too many: {WAITING} requests of this sender are waiting")
+    def take(self, item: Item) -> None:
+        """A request or a report, from any thread. Once a sender's queue is full, its further ones are refused."""
+        dropped = self._inbox.put(item)
+        if isinstance(dropped, Reported):
+            self.reject(dropped.sender)
+        elif dropped is item:
+            self.refuse(dropped, f"too many: {WAITING} requests of this sender are waiting")
         elif dropped:
             self.refuse(dropped, "superseded by a newer measurement")
 
-    def overrun(self, sender: str) -> bool:
-        """Whether a sender floods the vehicle, so that its message is only counted and not read. From any thread."""
+    def overrun(self, sender: str, *, reports: bool = False) -> bool:
+        """Whether a sender floods the vehicle, so that its message is only counted and not read. From any thread.
+
+        reports  of reception reports, which are not answered: an invalid one counts as much as one too many
+        """
         answers = self._refusals.get(sender, 0)
-        if answers < REFUSALS or not self._inbox.full(sender):
+        if answers < REFUSALS or not (reports or self._inbox.full(sender)):
             return False
         self.refused += 1
         return True
+
+    def reject(self, sender: str) -> None:
+        """Count a reception report that is invalid or too many. From any thread."""
+        self.refused += 1
+        self._refusals[sender] = self._refusals.get(sender, 0) + 1
 
     def refuse(self, request: Request, problem: str) -> None:
         """Count and answer a request that is not queued, from any thread; answers between two ticks are limited."""
@@ -157,9 +176,11 @@ class ControlLoop:
             if self._now() >= next_tick:
                 self._guarded("clock_advanced", self._tick)
                 next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
-            request = self._inbox.get(self._began + next_tick)
-            if request:
-                self._guarded(str(request.document.get("event")), lambda r=request: self._take_request(r))  # type: ignore[misc]
+            item = self._inbox.get(self._began + next_tick)
+            if isinstance(item, Reported):
+                self._guarded("reception report", lambda r=item: self._take_report(r))  # type: ignore[misc]
+            elif item:
+                self._guarded(str(item.document.get("event")), lambda r=item: self._take_request(r))  # type: ignore[misc]
             self._guarded("state", self._publish_state)
 
     def _guarded(self, what: str, work: Callable[[], None]) -> None:
@@ -189,6 +210,9 @@ class ControlLoop:
         if self.track is not None:
             self._take(replace(self.track.at(t), t=t))
         self._take(ClockAdvanced(t=t))
+        copies = {name: count for name, count in self.applier.copies().items() if count > 1}
+        if copies != self._run.state.copies:
+            self._take(CopiesCounted(t=t, copies=copies))
         for fault in self.applier.faults():
             self.on_report(fault)
         self._ticks += 1
@@ -214,6 +238,8 @@ class ControlLoop:
         if event is None:
             assert problem
             self._refuse(problem, t, request.answer)
+        elif request.sender and isinstance(event, OWN):
+            self._refuse(f"{NAMES[type(event)]}: only the vehicle itself makes this event", t, request.answer)
         elif request.as_of is not None and (late := self._operators.expired(request.sender, t, request.as_of)):
             self.refused += 1
             self._answer(request.answer, Outcome(t, "expired", late))
@@ -221,6 +247,16 @@ class ControlLoop:
             self._answer(request.answer, Outcome(t, "applied", ""))  # presence is already updated
         else:
             self._take(event, request.answer)
+
+    def _take_report(self, item: Reported) -> None:
+        t = self._now()
+        self._update_presence(item.sender, t, None)
+        if item.sender not in self._operators.present:
+            return
+        reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
+        self.log.record(reported)
+        if link := self._uplink.take(reported):
+            self._take(link)
 
     def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
         """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""
@@ -239,9 +275,11 @@ class ControlLoop:
         self._presence_changed(before, t, f"has been silent for {SILENT_S:g} s")
 
     def _presence_changed(self, before: frozenset[str], t: float, why: str) -> None:
-        now = self._operators.present
-        if now != before:
-            self.applier.give_control(self._operators.in_control)
+        now, in_control = self._operators.present, self._operators.in_control
+        if in_control != self._in_control:
+            self._in_control = in_control
+            self.applier.give_control(in_control)
+            self._take(ControlPassed(t=t, operator=in_control))
         for name in sorted(now - before):
             self.on_report(f"operator {name} is present")
         for name in sorted(before - now):
@@ -316,7 +354,8 @@ class ControlLoop:
             for name, setting in decision.settings.items()
         }
         fault = self._run.fault
-        return VehicleState(self._now(), self._cause, decision.mode, plain(decision.total), cameras, fault)
+        total, asked = plain(decision.total), plain(decision.asked)
+        return VehicleState(self._now(), self._cause, decision.mode, total, cameras, fault, asked_kbps=asked)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request if all its knob values are applied, or it has timed out."""

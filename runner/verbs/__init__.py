@@ -33,7 +33,7 @@ VERBS = {
         "print pipelines and decisions without starting them", "runner.verbs.print", ("total_kbps", "format")
     ),
     "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
-    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log")),
+    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),

@@ -1,4 +1,4 @@
-"""usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR]
+"""usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
@@ -12,10 +12,14 @@ new drive, for `report`, and to output= only if that is given.
 Predictions are those of the input. With a pqos= on the command line they are dropped and that source predicts instead,
 from the positions and times of the input; its events are marked "source": "pqos".
 
+Measurements of the link are those of the input. With link=again they are estimated again from the drive's reception
+reports: by the same version, to the same events.
+
   echo '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}' | tod-runner replay modes=paper
   tod-runner replay input=drive output=decisions.jsonl
   tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
   tod-runner replay input=drive pqos=map pqos.file=other_map.csv
+  tod-runner replay input=drive link=again     for a change of the estimator
   tod-runner replay input=drive cameras.rear_center.weight=2
   tod-runner replay input=drive vehicle=delivery_robot
 """
@@ -33,15 +37,16 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
-from runner.core.events import BitratePredicted, Event, parse, to_json
+from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, parse, to_json
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, log_run
-from runner.drive.read import check_began, is_log, read_line, read_lines
+from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines
 from runner.errors import UserError
-from runner.records import Began, decision_to_json
+from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
 from runner.schema import log_problem
 from runner.system.files import whole_file
+from runner.vehicle.uplink import MeasuredUplink
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
@@ -60,7 +65,8 @@ def run(arguments: Arguments) -> int:
         pqos = config.pqos()[0] if chosen else None
         vehicle = config.vehicle()
         with _output(arguments) as output, _log(arguments, config.document, began) as log:
-            for line in replay(vehicle, events(lines, name), pqos, log):
+            uplink = MeasuredUplink(vehicle) if arguments.choice("link", ("logged", "again")) == "again" else None
+            for line in replay(vehicle, events(lines, name, uplink), pqos, log):
                 output.write(line)
     return 0
 
@@ -158,14 +164,21 @@ def _heard(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
     return heard
 
 
-def events(lines: Iterable[str], name: str) -> Iterator[InputEvent]:
+def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None) -> Iterator[InputEvent]:
     """Events of a JSON Lines text, each with the JSON it came from. Other lines of a drive log are skipped.
 
+    uplink  measures the link again from the drive's reception reports, in place of the drive's own measurements
     raises  UserError with the number of the line
     """
     last, warnings = 0.0, list[str]()
-    for number, document in read_lines(lines, name, warnings, events=True):
+    skipped = OTHER_KINDS if uplink else (*OTHER_KINDS, REPORTS)
+    for number, document in read_lines(lines, name, warnings, skipped=skipped):
         if is_log(document):
+            record = line_from_json(document)
+            if uplink and isinstance(record, ReceptionReported) and (measured := uplink.take(record)):
+                yield to_json(measured), measured
+            continue
+        if uplink and document["event"] == NAMES[LinkMeasured] and "camera" not in document:
             continue
         if document["t"] < last:
             problem = f"t: {document['t']}: must not fall, the event before was at {last}"

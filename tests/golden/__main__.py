@@ -3,7 +3,7 @@
 Compares output that must not change, byte for byte, with copies beside this script; takes at most a minute:
 
   plans      `print` of every vehicle with every graph and source, as text and as JSON
-  events     decisions on 2400 generated events, over every vehicle and modes file
+  events     decisions on 2400 generated events, over every vehicle and five modes files
   drives     replays of three recorded drives
   validate   output of `validate` for a hundred broken files
   keys       keys of events, of lines of drive logs and of messages of the control link
@@ -38,6 +38,7 @@ HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
 CONF, SCHEMAS = CHECKOUT / "conf", CHECKOUT / "schemas"
 EVENTS, SEED = 2400, 20261122
+MODES = ("equal", "fixed", "paper", "safe", "steady")  # a new file must not change the events of these
 SHOWN = 60  # lines of a difference
 Texts = dict[str, str]
 
@@ -107,7 +108,7 @@ def plans(pool: ProcessPoolExecutor) -> Texts:
 
 
 def events(pool: ProcessPoolExecutor) -> Texts:
-    runs = list(product(_files("vehicle"), _files("modes")))
+    runs = list(product(_files("vehicle"), MODES))
     chance = random.Random(SEED)
     inputs = {f"{vehicle} {modes}": _events(chance, vehicle, EVENTS // len(runs)) for vehicle, modes in runs}
     with tempfile.TemporaryDirectory() as directory:

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from runner.apply import Reception
+from runner.apply import Arrival, Reception
 from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
 
@@ -57,6 +57,9 @@ class RecordingVehicle:
     def sources(self) -> dict[str, str]:
         return {}
 
+    def copies(self) -> dict[str, int]:
+        return {}
+
     def give_control(self, operator: str) -> None:
         self.controller = operator
 
@@ -79,6 +82,12 @@ class RecordingOperator:
             size = (640, 480) if frames else (0, 0)
             self._received[name] = Reception(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
         return dict(self._received)
+
+    def take_arrivals(self) -> dict[str, list[Arrival]]:
+        return {}
+
+    def take_packets(self) -> tuple[int, int]:
+        return (0, 0)
 
     def stop(self) -> None:
         self._received = {}

@@ -35,7 +35,7 @@ const listeners = new Map();
  * @property {string} reason
  * @property {string} [fault]
  * @property {Applied} applied
- * @typedef {{online: boolean, mode: string, total_kbps: number, cameras: Record<string, Decision>}} State
+ * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>}} State
  * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
  *   latency_ms: number|null, lost: number, rebuilt: number}} CameraSample
  * @typedef {object} Sample

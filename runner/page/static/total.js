@@ -11,6 +11,7 @@ const WHY = {
 };
 
 const figure = make("b", { class: "large" });
+const limited = make("span", { class: "muted" }); // what prediction or operator asked for, where it is more
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
 const slider = makeSlider({
@@ -25,16 +26,26 @@ function refresh() {
   const now = mode();
   const most = (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
   const total = now ? store.state?.total_kbps : undefined;
+  const asked = now ? store.state?.asked_kbps ?? total : undefined;
   const reason = !now ? "the vehicle is offline" : WHY[now] ?? (inControl() ? null : whyNoControl());
+  const less = total !== undefined && asked !== undefined && total < asked;
   write(figure, whole(total));
+  write(limited, less ? ` of ${whole(asked)}` : "");
   write(prediction, whole(store.sample?.predicted_kbps));
-  write(why, reason ?? "shared among the cameras by demand and weight");
-  slider.update({ value: total, max: most, why: reason });
+  write(why, less ? whyLess() : reason ?? "shared among the cameras by demand and weight");
+  slider.update({ value: asked, max: most, why: reason });
+}
+
+/** Why the total is less than asked for: a part of the reason that concerns all cameras. */
+function whyLess() {
+  const [camera] = Object.values(store.state?.cameras ?? {}).filter(({ on }) => on);
+  const parts = camera?.reason.split("; ").filter((part) => part.startsWith("total ")) ?? [];
+  return parts.join("; ") || "limited by a rule";
 }
 
 export function startTotal() {
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
-  const inForce = make("div", {}, make("span", {}, "Total "), figure, make("span", { class: "muted" }, " kbit/s"));
+  const inForce = make("div", {}, make("span", {}, "Total "), figure, limited, make("span", { class: "muted" }, " kbit/s"));
   by("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
   listen("hello state sample control requests socket", refresh);
   refresh();

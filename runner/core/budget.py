@@ -1,0 +1,46 @@
+"""Video and headers share the uplink: kbit/s of encoded video, and what they occupy on the wire. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+
+from runner.core.model import Camera, Graph, Kbps
+
+MTU_BYTES, HEADER_BYTES = 1200, 58  # of a graph that does not state its own
+INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-A), which count as part of the MTU
+
+
+def wire_bytes(graph: Graph, size: int) -> int:
+    """Bytes on the wire of an access unit of `size` bytes, with the headers of its packets."""
+    return size + -(-size // _payload(graph)) * _header(graph)
+
+
+def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:
+    """kbit/s on the wire, at most, of so much video: the last packet of an access unit is hardly ever full.
+
+    cameras  a camera of which several copies are sent occurs as often
+    """
+    fixed, factor = _overhead(list(cameras))
+    return video * factor + fixed
+
+
+def video_kbps(cameras: Iterable[Camera], wire: Kbps) -> Kbps:
+    """kbit/s of video that so much on the wire carries, 0 if headers alone exceed it."""
+    fixed, factor = _overhead(list(cameras))
+    return max(Fraction(0), (wire - fixed) / factor)
+
+
+def _overhead(cameras: list[Camera]) -> tuple[Kbps, Fraction]:
+    """kbit/s of one more packet per access unit, and bytes on the wire per byte of full packets."""
+    fixed = sum((_header(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
+    factors = [1 + Fraction(_header(camera.graph), _payload(camera.graph)) for camera in cameras]
+    return fixed, max(factors, default=Fraction(1))
+
+
+def _payload(graph: Graph) -> int:
+    return max(1, int(graph.settings.get("mtu_bytes", MTU_BYTES)) - INSIDE_MTU)
+
+
+def _header(graph: Graph) -> int:
+    return int(graph.settings.get("header_bytes", HEADER_BYTES))

@@ -1,0 +1,63 @@
+"""The measured uplink: reception reports in, `link_measured` out. Live and replay share it. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from operator import attrgetter
+
+from runner.core.budget import wire_bytes
+from runner.core.events import LinkMeasured
+from runner.core.model import Vehicle, exact
+from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
+from runner.records import ReceptionReport, ReceptionReported
+
+ROUND_TRIPS = 64  # remembered; the smallest is the round trip
+LONGEST_S = 60.0  # that is reported as a round trip
+
+
+@dataclass
+class MeasuredUplink:
+    """Estimates the uplink from what the operator in control receives; a change of operator begins anew."""
+
+    vehicle: Vehicle
+    _operator: str = ""
+    _at: float = 0.0
+    _memory: UplinkMemory = field(default_factory=UplinkMemory)
+    _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
+
+    def take(self, reported: ReceptionReported) -> LinkMeasured | None:
+        """The event that follows from a report; None if its operator is not in control, or nothing has arrived."""
+        if not reported.in_control:
+            return None
+        if reported.operator != self._operator or reported.report.at < self._at:
+            self._operator, self._memory = reported.operator, UplinkMemory()
+            self._round_trips.clear()
+        self._at = reported.report.at
+        self._round_trips.append(max(0.0, reported.t - reported.report.as_of))
+        self._memory, link = estimate(self._memory, _on_the_wire(self.vehicle, reported.report))
+        if link is None:
+            return None
+        return LinkMeasured(
+            t=reported.t,
+            kbps=None if link.kbps is None else exact(round(link.kbps, 1)),
+            queue_ms=round(link.queue_ms, 1),
+            loss=round(link.loss, 4),
+            state=link.state,
+            rtt_ms=round(1000 * min(*self._round_trips, LONGEST_S), 1),
+        )
+
+
+def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
+    """The report with the headers of packets; units of unknown cameras are left out."""
+    units = tuple(
+        ReceivedUnit(
+            unit.camera,
+            captured=report.at - unit.ago_s - unit.delay_s,
+            arrived=report.at - unit.ago_s,
+            bytes=wire_bytes(vehicle.cameras[unit.camera].graph, unit.bytes),
+        )
+        for unit in report.units
+        if unit.camera in vehicle.cameras
+    )
+    return LinkReport(report.at, tuple(sorted(units, key=attrgetter("arrived"))), report.packets, report.lost)

@@ -1,0 +1,76 @@
+"""The measured link between real sides: reports arrive, the total follows what the link carries, replay repeats it."""
+
+from __future__ import annotations
+
+from statistics import median
+
+import pytest
+
+from rig import Operator, free_port, process, run
+from runner.core.events import LinkMeasured
+from runner.core.uplink import LinkState
+from runner.drive.read import read_drive
+from runner.records import DecisionMade, LinkSample, ReceptionReported
+
+pytestmark = pytest.mark.gst
+
+NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
+RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
+ROBOT = ("vehicle=delivery_robot", "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
+SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs all of its bitrate
+SECONDS, SETTLED_S = 14, 6
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A drive over a link that carries half of what is predicted."""
+    path = tmp_path_factory.mktemp("feedback") / "drive"
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    link = ("link=relay", "link.share=0.5")
+    done = run("demo", *ROBOT, *SOURCE, *ports, *link, f"log={path}", f"duration_s={SECONDS}")
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+def test_reports_reach_the_vehicle_and_measure_the_link(drive):
+    vehicle = read_drive(drive).sides["vehicle"]
+    reports = list(vehicle.of(ReceptionReported))
+    assert len({report.operator for report in reports}) == 1
+    assert all(report.in_control for report in reports[1:])
+    times = [report.t for report in reports]
+    assert len(times) > 10 * (times[-1] - times[0])  # 25 a second, unless the machine is busy
+    units = [unit for report in reports for unit in report.report.units]
+    assert {unit.camera for unit in units} == {"front", "rear", "mast"}
+    measured = list(vehicle.of(LinkMeasured))
+    assert LinkState.FILLING in {link.state for link in measured}
+    settled = [float(link.kbps) for link in measured if link.t > SETTLED_S and link.kbps]
+    assert 1000 < median(settled) < 2100  # the link carries 2000
+
+
+def test_the_total_follows_what_the_link_carries(drive):
+    sides = read_drive(drive).sides
+    decisions = [line for line in sides["vehicle"].of(DecisionMade) if line.t > SETTLED_S]
+    assert decisions
+    assert max(line.total_kbps for line in decisions) < 2600
+    assert any("measured capacity of the link" in line.cameras["front"].reason for line in decisions)
+    link = list(sides["link"].of(LinkSample))
+    late = [line for line in link if line.t > SETTLED_S]
+    carried = (late[-1].bytes - late[0].bytes) * 8 / 1000 / (late[-1].t - late[0].t)
+    assert carried > 0.6 * 2000
+    assert late[-1].dropped - late[0].dropped < 0.02 * (late[-1].packets - late[0].packets)
+
+
+def test_a_replay_measures_the_link_again_bit_for_bit(drive):
+    logged, again = (run("replay", f"input={drive}", f"link={link}") for link in ("logged", "again"))
+    assert (logged.returncode, again.returncode) == (0, 0), again.stderr
+    assert "link_measured" in logged.stdout
+    assert again.stdout == logged.stdout
+
+
+def test_an_operator_may_not_state_what_the_link_carries(broker):
+    words = (*ROBOT, "source=test", f"control.port={broker.port}", f"media.port={free_port()}")
+    with process("vehicle", *words):
+        operator = Operator(broker)
+        operator.state(lambda state: state["online"])
+        reply = operator.ask("1", event="link_measured", kbps=100, queue_ms=500, state="filling")
+    assert (reply["result"], reply["reason"]) == ("refused", "link_measured: only the vehicle itself makes this event")

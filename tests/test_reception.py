@@ -1,0 +1,350 @@
+"""Reception reports: as messages, as measurements of the uplink, and headers on the wire."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+from itertools import pairwise
+
+import pytest
+from helpers import Drive, vehicle
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runner.core.budget import video_kbps, wire_bytes, wire_kbps
+from runner.core.events import LinkMeasured
+from runner.core.uplink import LinkState
+from runner.mqtt.messages import MqttMessage, read_reception, topic
+from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_from_json, line_to_json, to_json
+from runner.vehicle.uplink import MeasuredUplink
+
+ROBOT = vehicle("vehicle=delivery_robot")
+NAMES = tuple(ROBOT.cameras)
+REPORT = ReceptionReport(
+    at=100.04, as_of=3.2, units=(UnitReceived("front", 0.012, 0.0031, 2500), UnitReceived("rear", 0.0, 0.004, 900)),
+    packets=4, lost=1,
+)  # fmt: skip
+
+
+def message(document: object, sender: str = "me", *, retained: bool = False) -> MqttMessage:
+    return MqttMessage(topic("v", "reception", sender), json.dumps(document).encode(), retained)
+
+
+def test_a_report_is_read_back_as_it_was_sent() -> None:
+    assert read_reception(message(to_json(REPORT))) == REPORT
+    assert to_json(REPORT)["units"][0] == ("front", 0.012, 0.0031, 2500)
+    line = ReceptionReported(3.25, "me", True, REPORT)
+    assert line_from_json(json.loads(json.dumps(line_to_json(line)))) == line
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"units": [["front", -1, 0, 5]]}, "units[0][1]: -1: must be at least 0"),
+        ({"units": [["front", 1, 0]]}, 'units[0]: ["front", 1, 0]: must have at least 4 entries'),
+        ({"units": [["front", 1, 0, 5.5]]}, "units[0][3]: 5.5: must be a whole number"),
+        ({"lost": -1}, "lost: -1: must be at least 0"),
+        ({"extra": 1}, "extra: unknown key; expected one of at, as_of, units, packets, lost"),
+    ],
+)
+def test_an_invalid_report_is_named(change: dict[str, object], problem: str) -> None:
+    with pytest.raises(ValueError) as raised:
+        read_reception(message(to_json(REPORT) | change))
+    assert str(raised.value) == problem
+
+
+def test_a_report_must_be_for_now_and_from_somebody() -> None:
+    with pytest.raises(ValueError, match="must not be retained"):
+        read_reception(message(to_json(REPORT), retained=True))
+    with pytest.raises(ValueError, match="an operator's id must be"):
+        read_reception(message(to_json(REPORT), sender="not allowed"))
+
+
+def reports(count: int, *, kbytes: float = 10, operator: str = "me", in_control: bool = True, delay_s: float = 0.0):  # type: ignore[no-untyped-def]
+    """Reports of a steady stream of every camera, 25 a second."""
+    for number in range(count):
+        units = tuple(UnitReceived(name, 0.02, delay_s, int(kbytes * 1000 / 25 / len(NAMES))) for name in NAMES)
+        report = ReceptionReport(50 + 0.04 * number, 1 + 0.04 * number - 0.07, units, len(NAMES), 0)
+        yield ReceptionReported(1 + 0.04 * number, operator, in_control, report)
+
+
+def test_a_steady_stream_is_a_clear_link_and_its_headers_count() -> None:
+    uplink = MeasuredUplink(ROBOT)
+    measured = [uplink.take(reported) for reported in reports(30)]
+    last = measured[-1]
+    assert isinstance(last, LinkMeasured)
+    assert (last.t, last.state, last.queue_ms, last.loss) == (pytest.approx(2.16), LinkState.CLEAR, 0, 0)
+    assert last.rtt_ms == pytest.approx(70)
+    assert float(last.kbps or 0) == pytest.approx(80 + 25 * 58 * 8 / 1000 * len(NAMES), rel=0.02)
+
+
+def test_only_the_operator_in_control_is_measured() -> None:
+    uplink = MeasuredUplink(ROBOT)
+    assert not any(uplink.take(reported) for reported in reports(30, in_control=False))
+
+
+def test_another_operator_in_control_begins_anew() -> None:
+    """A second place has another path: its longer delay is no queue."""
+    uplink = MeasuredUplink(ROBOT)
+    for reported in reports(30):
+        uplink.take(reported)
+    measured = [uplink.take(reported) for reported in reports(30, operator="you", delay_s=0.5)]
+    assert {link.queue_ms for link in measured if link} == {0}
+
+
+def test_units_of_unknown_cameras_are_left_out() -> None:
+    uplink = MeasuredUplink(ROBOT)
+    strange = replace(REPORT, units=(UnitReceived("side", 0.0, 0.0, 5),))
+    assert uplink.take(ReceptionReported(1, "me", True, strange)) is None
+
+
+@given(video=st.integers(0, 10**5))
+def test_what_the_wire_carries_is_what_it_was_made_of(video: int) -> None:
+    cameras = tuple(ROBOT.cameras.values())
+    assert video_kbps(cameras, wire_kbps(cameras, Fraction(video))) == video
+    assert video_kbps(cameras, Fraction(1)) == 0
+
+
+def test_headers_of_an_access_unit() -> None:
+    graph = ROBOT.cameras["front"].graph
+    assert [wire_bytes(graph, size) for size in (1, 1186, 1187, 5000)] == [59, 1244, 1303, 5290]
+
+
+def test_the_cap_is_a_total_without_headers() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000)
+    drive.accept("link_measured", kbps=3000, queue_ms=60, state="filling", rtt_ms=30)
+    cameras = tuple(drive.vehicle.cameras.values())
+    assert drive.total == video_kbps(cameras, Fraction(3000) * Fraction(17, 20))
+    assert "measured capacity of the link" in drive[NAMES[0]].reason
+
+
+def test_a_reserve_is_left_to_others() -> None:
+    drives = [Drive("vehicle=delivery_robot", "modes=safe", *more) for more in ((), (RESERVE,))]
+    for drive in drives:
+        drive.accept("bitrate_predicted", kbps=6000)
+        drive.accept("link_measured", kbps=3000, queue_ms=60, state="filling", rtt_ms=30)
+    assert drives[0].total - drives[1].total == pytest.approx(200, rel=0.1)
+
+
+RESERVE = "modes.automatic=[{total_from_prediction:{start_kbps:3000}},{cap_by_link:{reserve_kbps:200}},{demand_from_roi:{}},{share_by_demand:{}},{scaling_from_rate_quality:{}}]"  # fmt: skip  # noqa: E501
+
+
+def test_an_operator_that_leaves_measures_nothing_any_more() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    drive.accept("link_measured", t=1, kbps=3000, queue_ms=0, state="clear", rtt_ms=30)
+    drive.accept("operator_disconnected", t=1.1)
+    drive.accept("operator_connected", t=20)
+    drive.accept("clock_advanced", t=30)
+    assert drive.total == 3000
+
+
+@pytest.mark.parametrize("kbps", [0, 2])
+def test_what_is_not_sent_is_not_missed(kbps: int) -> None:
+    """A total below 1 kbit/s for each camera stops all of them: nothing can arrive."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=kbps, valid_s=1000)
+    for tenth in range(50):
+        drive.accept("link_measured", t=tenth / 10, queue_ms=0, state="stalled")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    assert drive.total == 3000
+
+
+# --- without a prediction ---------------------------------------------------------------------------------------------
+
+
+def measured(drive: Drive, t: float, kbps: float, state: str = "clear", queue_ms: float = 0) -> Fraction:
+    drive.accept("link_measured", t=t, kbps=kbps, queue_ms=queue_ms, state=state, rtt_ms=30)
+    return drive.run.decision.total
+
+
+def test_without_a_prediction_the_measurement_alone_decides() -> None:
+    """From what was sent last up to what the link carries, by careful steps."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000)
+    totals = [measured(drive, t / 25, 3000) for t in range(250)]
+    assert set(totals[:50]) == {3000}
+    steps = [after / before for before, after in pairwise(totals) if after != before]
+    assert 1 < min(steps) < 1.03
+    assert max(steps) < 1.5
+    full = sum(camera.rate_quality.b_full for camera in drive.vehicle.cameras.values())
+    assert totals[-1] == full
+    cut = measured(drive, 10.02, 2000, "filling", 60)
+    assert cut < 2000
+    drive.accept("bitrate_predicted", t=10.1, kbps=1000)
+    assert drive.total == 1000
+
+
+def test_without_a_prediction_and_a_measurement_the_total_fades() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000)
+    for t in (1, 2.5, 3.6, 10):
+        drive.accept("clock_advanced", t=t)
+    assert drive.total == 500
+
+
+# --- mode S -----------------------------------------------------------------------------------------------------------
+
+
+def single(*overrides: str) -> Drive:
+    drive = Drive("vehicle=delivery_robot", "modes=safe", *overrides)
+    drive.accept("mode_selected", mode="single")
+    for name in NAMES:
+        drive.accept("camera_configured", camera=name, kbps=1000, scaling=1)
+    return drive
+
+
+def test_in_mode_s_all_cameras_are_cut_by_one_factor_and_return() -> None:
+    drive = single()
+    assert {drive.sent(name) for name in NAMES} == {(1000, 1.0)}
+    measured(drive, 0.1, 1200, "filling", 60)
+    sent = {name: drive.sent(name) for name in NAMES}
+    weights = {name: camera.weight for name, camera in drive.vehicle.cameras.items()}
+    assert sum(kbps for kbps, _ in sent.values()) < 1200
+    assert sent["front"][0] == pytest.approx(float(sent["mast"][0] * weights["front"] / weights["mast"]), abs=2)
+    assert all(factor is not None and factor < 1 for _, factor in sent.values())
+    assert drive.run.decision.asked == 3000
+    assert "as set in mode single, sent with" in drive["front"].reason
+    for t in range(10, 400):
+        measured(drive, t / 25, 3200)
+    assert {drive.sent(name) for name in NAMES} == {(1000, 1.0)}
+
+
+def test_floors_come_first_in_mode_s_too() -> None:
+    drive = single("cameras.front.floor_kbps=900")
+    measured(drive, 0.1, 1700, "filling", 60)
+    assert drive.sent("front")[0] == 900
+    assert drive.sent("rear")[0] < 300
+
+
+def test_a_camera_is_given_up_for_the_floors_of_others() -> None:
+    floors = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
+    drive = Drive("vehicle=delivery_robot", "modes=safe", *floors)
+    drive.accept("bitrate_predicted", kbps=800)
+    assert (drive["front"].sending, drive["rear"].sending) == (True, False)
+    assert drive["front"].reason.endswith("rear given up for the floors of others")
+    drive.accept("bitrate_predicted", kbps=2000)
+    assert drive["rear"].sending
+
+
+# --- several copies ---------------------------------------------------------------------------------------------------
+
+
+def test_the_total_counts_every_copy_that_leaves_the_vehicle() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000)
+    one = {name: drive[name].kbps for name in NAMES}
+    drive.accept("copies_counted", copies={"front": 2})
+    two = {name: drive[name].kbps for name in NAMES}
+    assert sum(two.values()) + two["front"] <= 3000
+    assert sum(two.values()) + two["front"] == pytest.approx(3000, abs=4)
+    assert all(two[name] < one[name] for name in NAMES)
+    drive.accept("copies_counted", copies={})
+    assert {name: drive[name].kbps for name in NAMES} == one
+
+
+def test_a_copy_that_another_viewer_gets_occupies_the_measured_link_too() -> None:
+    """All cameras twice: the operator measures half of what the link carries."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000)
+    drive.accept("copies_counted", copies=dict.fromkeys(NAMES, 2))
+    measured(drive, 0.1, 1500, "filling", 60)
+    assert 0.75 * 3000 < drive.total < 3000
+    assert 2 * sum(drive[name].kbps for name in NAMES) <= drive.total
+
+
+# --- what must not happen ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["delivery_robot", "tum_q7"])
+@pytest.mark.parametrize("copies", [1, 2])
+def test_a_long_stall_never_stops_all_cameras(name: str, copies: int) -> None:
+    """Headers alone take 130 kbit/s of eight cameras: without any picture the link could not be measured again."""
+    drive = Drive(f"vehicle={name}", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    drive.accept("copies_counted", copies=dict.fromkeys(drive.vehicle.cameras, copies))
+    for t in range(100):
+        drive.accept("link_measured", t=t / 10, queue_ms=0, state="stalled", rtt_ms=30)
+    assert all(setting.sending for setting in drive.run.decision.settings.values())
+    assert drive.total < 100
+    assert measured_until(drive, 10, 20, kbps=3500) == 3000
+
+
+def measured_until(drive: Drive, begin: float, end: float, kbps: float) -> Fraction:
+    for step in range(int((end - begin) * 25)):
+        total = measured(drive, begin + step / 25, kbps)
+    return total
+
+
+def test_an_operator_that_is_lost_lifts_no_cap() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000, valid_s=1000)
+    measured(drive, 0.1, 300, "filling", 100)
+    drive.accept("operator_disconnected", t=0.2)
+    drive.accept("clock_advanced", t=0.3)
+    assert drive.total < 300
+
+
+def test_an_operator_that_does_not_measure_is_not_capped_for_ever() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000, valid_s=1000)
+    measured(drive, 0.1, 300, "filling", 100)
+    drive.accept("control_passed", t=1, operator="another")
+    drive.accept("clock_advanced", t=1.5)
+    assert drive.total < 300
+    drive.accept("clock_advanced", t=4)
+    assert drive.total == 6000
+
+
+def test_all_cameras_off_and_a_stale_prediction() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    for name in NAMES:
+        drive.accept("camera_switched", camera=name, on=False)
+    measured(drive, 5, 0, "clear")
+    drive.accept("camera_switched", camera="front", on=True)
+    assert measured_until(drive, 5.1, 12, kbps=3000) > 3000
+    assert drive.run.fault is None
+
+
+def test_what_is_believed_of_a_prediction_concerns_mode_a_only() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000, valid_s=1000)
+    for t in range(50):
+        measured(drive, t / 5, 3000, *(("filling", 60) if t % 6 == 5 else ()))
+    believed = drive.total
+    assert believed < 4000
+    drive.accept("mode_selected", mode="collective")
+    drive.accept("total_set", kbps=2000)
+    assert drive.total == 2000
+
+
+def test_in_mode_s_a_camera_that_is_switched_on_again_is_as_the_operator_has_set_it() -> None:
+    drive = single()
+    measured(drive, 0.1, 600, "filling", 60)
+    drive.accept("camera_switched", camera="front", on=False)
+    drive.accept("camera_switched", camera="front", on=True)
+    measured_until(drive, 0.2, 20, kbps=3500)
+    assert drive.sent("front") == (1000, 1.0)
+
+
+def test_a_second_viewer_in_mode_s_is_no_reason_to_send_less() -> None:
+    drive = single()
+    drive.accept("copies_counted", copies=dict.fromkeys(NAMES, 2))
+    assert {drive.sent(name) for name in NAMES} == {(1000, 1.0)}
+    assert drive.total == 6000
+
+
+def test_a_clock_of_the_operator_that_goes_back_begins_anew() -> None:
+    uplink = MeasuredUplink(ROBOT)
+    for reported in (*reports(30), *reports(30, delay_s=-7)):
+        link = uplink.take(reported)
+    assert link is not None
+    assert (link.queue_ms, link.state) == (0, LinkState.CLEAR)
+
+
+def test_numbers_out_of_range_are_refused() -> None:
+    for key in ("at", "as_of"):
+        with pytest.raises(ValueError, match=f"{key}: 1e.308: must be at most"):
+            read_reception(message(to_json(REPORT) | {key: 1e308}))
