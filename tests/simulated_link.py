@@ -101,7 +101,7 @@ def drive(
             last_unit = max(last_unit, free + link.one_way_s + link.delay_s(t))
             done.waits.append((t, free - t))
             done.arrived.append((last_unit, size))
-            on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size))
+            on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size, count))
             packets += count
         elif kind == "report":
             at(t + report_s, "report", None)

@@ -12,7 +12,7 @@ from helpers import Drive, vehicle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.core.budget import video_kbps, wire_bytes, wire_kbps
+from runner.core.budget import on_the_wire, video_kbps, wire_kbps
 from runner.core.events import LinkMeasured
 from runner.core.uplink import LinkState
 from runner.mqtt.messages import MqttMessage, read_reception, topic
@@ -108,7 +108,7 @@ def test_what_the_wire_carries_is_what_it_was_made_of(video: int) -> None:
 
 def test_headers_of_an_access_unit() -> None:
     graph = ROBOT.cameras["front"].graph
-    assert [wire_bytes(graph, size) for size in (1, 1186, 1187, 5000)] == [59, 1244, 1303, 5290]
+    assert [on_the_wire(graph, size) for size in (1, 1186, 1187, 5000)] == [(59, 1), (1244, 1), (1303, 2), (5290, 5)]
 
 
 def test_the_cap_is_a_total_without_headers() -> None:

@@ -64,6 +64,7 @@ class Draft(NamedTuple):
     bitrate  exact kbit/s by camera
     scaling  factor by camera that is on
     measured True: the total is what the link is measured to carry, whatever the age of the prediction
+    capped   True: the measured link lowers the total
     sending  False stops all cameras, whatever their bitrate
     notes    reasons that concern all cameras
     reasons  reason by camera
@@ -74,6 +75,7 @@ class Draft(NamedTuple):
     bitrate: Mapping[str, Kbps] = NOTHING
     scaling: Mapping[str, Fraction] = NOTHING
     measured: bool = False
+    capped: bool = False
     sending: bool = True
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING

@@ -17,10 +17,12 @@ from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue is to be drained within about this time ...
 DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
+LOSSY = 0.03  # share of packets; with a queue that grows, from here on the queue is full
+LOSS_S = 1.0  # over which losses are measured; those before a cut say nothing about what followed
 TOO_LOSSY = 0.1  # share of packets; random loss on the radio link stays below
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
-CAREFUL, DOUBLING = Fraction(1, 50), 5  # first increase beyond that, and the number of steps that double it
+CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
@@ -91,7 +93,8 @@ def advanced(
     cap = replace(cap, measured=link.t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
-    if (link.state is LinkState.FILLING or (link.loss or 0) > TOO_LOSSY) and link.kbps:
+    lossy = (link.loss or 0) > TOO_LOSSY and t - cap.changed >= LOSS_S + _rtt_s(link)
+    if (link.state is LinkState.FILLING or lossy) and link.kbps:
         return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust)
     if link.state is LinkState.CLEAR:
         return _recovered(_resumed(cap, limit), link, t, limit)
@@ -155,7 +158,8 @@ def idle(cap: LinkCap, t: float) -> LinkCap:
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
-    target = link.kbps * max(DEEPEST, min(SHALLOWEST, drain))
+    full = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
+    target = link.kbps * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return cap

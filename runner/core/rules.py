@@ -330,7 +330,7 @@ def cap_by_link(
     total = video_kbps(cameras, carried)
     if total >= draft.total:
         return draft, memory
-    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total), memory
+    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, capped=True), memory
 
 
 def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
@@ -373,8 +373,28 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
 
     Memory: by camera, the factor in force and since when a larger one has been requested (None: it is not).
     """
-    past: Mapping[str, tuple[Fraction, float | None]] = memory.get("hold_upscaling", {})
-    now: dict[str, tuple[Fraction, float | None]] = {}
+    draft, held = _held(state, draft, memory.get("hold_upscaling", {}), for_s)
+    return draft, {**memory, "hold_upscaling": held}
+
+
+@rule(needs=["scaling"], gives=["scaling"], reads=["t"])
+def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
+    """As `hold_upscaling`, while the measured link caps the total: its rate is tried out, and each new size costs bits.
+
+    Memory: as there; empty while nothing caps the total.
+    """
+    past: Mapping[str, _Hold] = memory.get("hold_while_capped", {})
+    if not draft.capped:
+        return draft, {**memory, "hold_while_capped": {}} if past else memory
+    draft, held = _held(state, draft, past, for_s)
+    return draft, {**memory, "hold_while_capped": held}
+
+
+_Hold = tuple[Fraction, float | None]
+
+
+def _held(state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction) -> tuple[Draft, Mapping[str, _Hold]]:
+    now: dict[str, _Hold] = {}
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, called_for in draft.scaling.items():
         held, since = past.get(name, (called_for, None))
@@ -388,7 +408,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
             now[name] = (held, since)
             factors[name] = held
             reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
-    return draft.replaced(scaling=factors, reasons=reasons), {**memory, "hold_upscaling": now}
+    return draft.replaced(scaling=factors, reasons=reasons), now
 
 
 # --- running a list ---------------------------------------------------------------------------------------------------

@@ -18,17 +18,21 @@ from statistics import median
 from types import MappingProxyType
 
 BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time and the one before
+NEW_S = 1.0  # how long a new camera has to send before its own path is measured
 KEPT_S = 1.0  # units are kept for this long
+STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is lost or late makes it look lower
+MOST_INCOMPLETE = 2.0  # times what arrived in whole units
 MOST_UNITS = 5000  # and no more of them
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
 EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
-EMPTY_S = 0.006  # a unit that waited less met no queue
-GROWN_S = 0.010  # a queue from here on may be growing
-GROWTH_S = 0.004  # by how much a queue must grow within COMPARED_S to be growing, or shrink to be draining
+EMPTY_S = 0.010  # a unit that waited less met no queue
+GROWN_S = 0.030  # a queue from here on may be growing
+GROWTH_S = 0.006  # by how much a queue must grow within COMPARED_S to be growing, or shrink to be draining
 COMPARED_S = 0.08
-LONG_S = 0.040  # a queue from here on is too long unless it drains
+LONG_S = 0.060  # a queue from here on is too long unless it drains
+UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, the rate is measured anew
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
 FEW_PACKETS = 100  # of fewer no share of losses is stated
@@ -52,12 +56,14 @@ class ReceivedUnit:
     captured  s, by the vehicle's clock
     arrived   s, by the operator's monotonic clock
     bytes     on the wire, headers included
+    packets   that it came in
     """
 
     camera: str
     captured: float
     arrived: float
     bytes: int
+    packets: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,30 +98,44 @@ class LinkEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """Delay of one camera's path: the minimum of the bucket before and of the current one, which began then."""
+    """Delay of one camera's path: the minimum of the bucket of time before and of the current one, which began then.
+
+    own  whether this camera was seen with an empty queue. Until then the path is the shortest of all cameras: one that
+         starts while a queue lasts would take it for its path
+    """
 
     before: float
     current: float
     began: float
+    own: bool = False
 
     @property
     def delay(self) -> float:
         return min(self.before, self.current)
 
-    def after(self, unit: ReceivedUnit) -> _Path:
+    def after(self, unit: ReceivedUnit, *, empty: bool) -> _Path:
         delay = unit.arrived - unit.captured
+        if not self.own and empty and unit.arrived - self.began > NEW_S:
+            return _Path(delay, delay, unit.arrived, own=True)
         if unit.arrived - self.began > BUCKET_S:
-            return _Path(self.current, delay, unit.arrived)
+            return _Path(self.current, delay, unit.arrived, self.own)
         return replace(self, current=min(self.current, delay))
+
+
+def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
+    delay = unit.arrived - unit.captured
+    shortest = min((path.delay for path in others), default=None)
+    return _Path(delay, delay, unit.arrived, own=True) if shortest is None else _Path(shortest, shortest, unit.arrived)
 
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """When a unit arrived, how long it waited in the queue, s, and its size in bytes."""
+    """When a unit arrived, how long it waited in the queue, s, its size in bytes and packets."""
 
     arrived: float
     queue: float
     bytes: int
+    packets: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +151,7 @@ class UplinkMemory:
     resumed    when units arrived again after the last gap
     onset      when the queue was last empty; None: it is empty
     peak       kbit/s, highest rate since the onset
+    rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
     """
 
     paths: Mapping[str, _Path] = field(default_factory=lambda: MappingProxyType({}))
@@ -142,6 +163,7 @@ class UplinkMemory:
     resumed: float = -float("inf")
     onset: float | None = None
     peak: float = 0.0
+    rates: tuple[tuple[float, float], ...] = ()
 
 
 def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
@@ -172,6 +194,11 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
+    if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
+        rates = (*_since(uplink.rates, report.at - STEADY_S), (report.at, kbps))
+        uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
+    elif state is LinkState.CLEAR:
+        uplink = replace(uplink, rates=())
     return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
 
 
@@ -186,10 +213,11 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
             intervals[unit.camera] = min(LONGEST_INTERVAL_S, unit.captured - captured[unit.camera])
         captured[unit.camera] = unit.captured
         delay = unit.arrived - unit.captured
-        paths[unit.camera] = paths.get(unit.camera, _Path(delay, delay, unit.arrived)).after(unit)
+        known = paths.get(unit.camera) or _new_path(unit, paths.values())
+        paths[unit.camera] = known.after(unit, empty=uplink.onset is None)
         if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
-        kept.append(_Unit(unit.arrived, delay - paths[unit.camera].delay, unit.bytes))
+        kept.append(_Unit(unit.arrived, max(0.0, delay - paths[unit.camera].delay), unit.bytes, unit.packets))
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
@@ -213,7 +241,20 @@ def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
         if uplink.resumed > begin or last - begin < EVIDENCE_S:
             return None
         since = begin
-    return sum(unit.bytes for unit in uplink.units if unit.arrived > since) * 8 / 1000 / (last - since)
+    return (
+        sum(unit.bytes for unit in uplink.units if unit.arrived > since)
+        * 8
+        / 1000
+        / (last - since)
+        * _incomplete(uplink)
+    )
+
+
+def _incomplete(uplink: UplinkMemory) -> float:
+    """By how much more has arrived in the last second than whole units: of one that misses a packet all are dropped."""
+    whole, received = sum(unit.packets for unit in uplink.units), sum(received for _, received, _ in uplink.packets)
+    lost = sum(lost for _, _, lost in uplink.packets)
+    return min(MOST_INCOMPLETE, max(1.0, received / whole)) if whole and lost else 1.0
 
 
 def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float | None) -> LinkState:
@@ -221,7 +262,9 @@ def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float |
         return LinkState.CLEAR
     now = queues[-1][0]
     before = min((was for at, was in queues if now - 0.3 < at < now - COMPARED_S), default=queue)
-    if queue > before + GROWTH_S or (queue > LONG_S and queue > before - GROWTH_S):
+    long_ago = min((was for at, was in queues if at < now - UNDRAINED_S), default=None)
+    undrained = long_ago is not None and queue > long_ago - GROWTH_S
+    if queue > before + GROWTH_S or (queue > LONG_S and queue > before - GROWTH_S) or undrained:
         return LinkState.FILLING
     return LinkState.DRAINING
 
@@ -243,7 +286,10 @@ def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
 def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     """The path's delays raised by what was taken for a queue."""
     longer = min(was for _, was in uplink.queues)
-    paths = {name: _Path(path.delay + longer, path.delay + longer, path.began) for name, path in uplink.paths.items()}
+    paths = {
+        name: _Path(path.delay + longer, path.delay + longer, path.began, path.own)
+        for name, path in uplink.paths.items()
+    }
     units = tuple(replace(unit, queue=max(0.0, unit.queue - longer)) for unit in uplink.units)
     return replace(uplink, paths=paths, onset=None, queues=(), units=units)
 

@@ -44,6 +44,7 @@ from runner.vehicle.uplink import MeasuredUplink
 
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
+STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
 
@@ -341,7 +342,8 @@ class ControlLoop:
         """Publish the decided and the applied values if either changed; answer requests that are applied now."""
         applied = self.applier.applied()
         state = self._state(applied)
-        if state != self._published or self._publish_again:
+        due = self._published is None or state.t - self._published.t >= STATE_S or bool(self._pending)
+        if (state != self._published and due) or self._publish_again:
             self._publish_again = False
             self._published = state
             self.publish(state)

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from operator import attrgetter
 
-from runner.core.budget import wire_bytes
+from runner.core.budget import on_the_wire
 from runner.core.events import LinkMeasured
 from runner.core.model import Vehicle, exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
@@ -50,14 +50,14 @@ class MeasuredUplink:
 
 def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
     """The report with the headers of packets; units of unknown cameras are left out."""
-    units = tuple(
+    units = [
         ReceivedUnit(
             unit.camera,
-            captured=report.at - unit.ago_s - unit.delay_s,
-            arrived=report.at - unit.ago_s,
-            bytes=wire_bytes(vehicle.cameras[unit.camera].graph, unit.bytes),
+            report.at - unit.ago_s - unit.delay_s,
+            report.at - unit.ago_s,
+            *on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
         )
         for unit in report.units
         if unit.camera in vehicle.cameras
-    )
+    ]
     return LinkReport(report.at, tuple(sorted(units, key=attrgetter("arrived"))), report.packets, report.lost)
