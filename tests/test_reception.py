@@ -116,7 +116,7 @@ def test_the_cap_is_a_total_without_headers() -> None:
     drive.accept("bitrate_predicted", kbps=6000)
     drive.accept("link_measured", kbps=3000, queue_ms=60, state="filling", rtt_ms=30)
     cameras = tuple(drive.vehicle.cameras.values())
-    assert drive.total == video_kbps(cameras, Fraction(3000) * Fraction(17, 20))
+    assert drive.total == Fraction(int(10 * video_kbps(cameras, Fraction(3000) * Fraction(17, 20))), 10)
     assert "measured capacity of the link" in drive[NAMES[0]].reason
 
 

@@ -23,6 +23,7 @@ TOO_LOSSY = 0.1  # share of packets; random loss on the radio link stays below
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
+TESTED = 3  # times what arrives, up to which a cap grows
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
@@ -172,6 +173,8 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is not tested, and so does not grow
+    if link.kbps is not None and cap.kbps > TESTED * link.kbps:
+        return cap  # nor does one that standing pictures are far from using
     steps, factor = cap.steps, FAST
     if cap.carried:
         carried, limit_then = cap.carried

@@ -306,31 +306,33 @@ def cap_by_link(
     """
     assert draft.total is not None
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
-    link, before = _of_all_copies(vehicle, state), memory.get("cap_by_link", UNCAPPED)
-    asked = wire_kbps(cameras, draft.total)
-    least = wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))  # with less, no camera would be sent and measured
+    before, least = memory.get("cap_by_link", UNCAPPED), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
+    cap, limit = before, wire_kbps(cameras, draft.total)
+    link = _of_all_copies(vehicle, state)
     if draft.total < max(1, len(cameras)) or not cameras or state.operator_lost is not None:
-        cap = idle(before, state.t)
+        cap = idle(cap, state.t)
     else:
-        alone = alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t)
-        if alone:
-            limit = wire_kbps(cameras, sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO))
-            before = probing(before, asked, limit)
-            draft, asked = draft.replaced(measured=True, total=video_kbps(cameras, limit)), limit
-        elif before.alone:
-            before = replace(before, alone=False)
-        cap = raised(advanced(before, link, state.t, asked, least_trust), least)
-    if cap is not memory.get("cap_by_link", UNCAPPED):
-        memory = {**memory, "cap_by_link": cap}
-    assert draft.total is not None
-    carried, why = believed(cap, asked, least_trust), f"{float(cap.trust):.0%} of a prediction that proved too high"
+        if alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t):
+            most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
+            draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
+            cap = probing(cap, asked, limit)
+        cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust)
+        cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
+    memory = {**memory, "cap_by_link": cap}
+    carried, why = believed(cap, limit, least_trust), f"{float(cap.trust):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
-    total = video_kbps(cameras, carried)
+    return _lowered(draft, video_kbps(cameras, carried), why), memory
+
+
+def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:
+    """The draft with a smaller total, in tenths of a kbit/s; unchanged where it is not smaller."""
+    assert draft.total is not None
     if total >= draft.total:
-        return draft, memory
-    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, capped=True), memory
+        return draft
+    total = Fraction(int(10 * total), 10)
+    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, capped=True)
 
 
 def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:

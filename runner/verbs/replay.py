@@ -46,11 +46,11 @@ from runner.errors import UserError
 from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
 from runner.schema import log_problem
 from runner.system.files import whole_file
-from runner.vehicle.uplink import MeasuredUplink
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
     from runner.pqos import Pqos
+    from runner.vehicle.uplink import MeasuredUplink
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
 
@@ -65,10 +65,18 @@ def run(arguments: Arguments) -> int:
         pqos = config.pqos()[0] if chosen else None
         vehicle = config.vehicle()
         with _output(arguments) as output, _log(arguments, config.document, began) as log:
-            uplink = MeasuredUplink(vehicle) if arguments.choice("link", ("logged", "again")) == "again" else None
-            for line in replay(vehicle, events(lines, name, uplink), pqos, log):
+            for line in replay(vehicle, events(lines, name, _uplink(arguments, vehicle)), pqos, log):
                 output.write(line)
     return 0
+
+
+def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
+    """What measures the link again; None: it was measured by the vehicle."""
+    if arguments.choice("link", ("logged", "again")) == "logged":
+        return None
+    from runner.vehicle.uplink import MeasuredUplink
+
+    return MeasuredUplink(vehicle)
 
 
 def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]:
