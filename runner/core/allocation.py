@@ -71,11 +71,13 @@ def allocate_above_floors(
     together, it is shared in proportion to them.
 
     demands  kbit/s per camera, 0 for a camera that is off
-    floors   kbit/s per camera, 0: none; a floor above the demand counts as the demand
+    floors   kbit/s per camera, 0 or not given: none; a floor above the demand counts as the demand
     returns  kbit/s per camera; without floors the same as `allocate`
     """
-    lowest = {name: min(floors[name], own) for name, own in demands.items() if floors[name] and own}
-    if lowest and total <= _sum(lowest.values()):
+    lowest = {name: min(floor, demands[name]) for name, floor in floors.items() if floor and demands.get(name)}
+    if not lowest:
+        return allocate(demands, total, weights)
+    if total <= _sum(lowest.values()):
         return dict.fromkeys(demands, ZERO) | allocate(lowest, total, dict.fromkeys(lowest, Fraction(1)))
     held: dict[str, Kbps] = {}
     while True:
@@ -101,7 +103,7 @@ def shed(
     returns  the first part of `order`, without cameras that are off
     """
     given_up: list[str] = []
-    lowest = {name: min(floors[name], own) for name, own in demands.items()}
+    lowest = {name: min(floors.get(name, ZERO), own) for name, own in demands.items()}
     for name in (name for name in order if demands[name]):
         needed = _sum(floor for other, floor in lowest.items() if other not in given_up)
         if total >= needed * (RETURN if name in before else 1):

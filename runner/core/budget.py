@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from fractions import Fraction
+from functools import lru_cache
 
 from runner.core.model import Camera, Graph, Kbps
 
@@ -22,17 +23,18 @@ def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:
 
     cameras  a camera of which several copies are sent occurs as often
     """
-    fixed, factor = _overhead(list(cameras))
+    fixed, factor = _overhead(tuple(cameras))
     return video * factor + fixed
 
 
 def video_kbps(cameras: Iterable[Camera], wire: Kbps) -> Kbps:
     """kbit/s of video that so much on the wire carries, 0 if headers alone exceed it."""
-    fixed, factor = _overhead(list(cameras))
+    fixed, factor = _overhead(tuple(cameras))
     return max(Fraction(0), (wire - fixed) / factor)
 
 
-def _overhead(cameras: list[Camera]) -> tuple[Kbps, Fraction]:
+@lru_cache(maxsize=64)  # of a few sets of cameras that are on
+def _overhead(cameras: tuple[Camera, ...]) -> tuple[Kbps, Fraction]:
     """kbit/s of one more packet per access unit, and bytes on the wire per byte of full packets."""
     fixed = sum((_header(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
     factors = [1 + Fraction(_header(camera.graph), _payload(camera.graph)) for camera in cameras]

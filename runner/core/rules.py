@@ -149,18 +149,21 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
 
     Memory: the cameras given up.
     """
-    assert draft.total is not None
+    total = draft.total
+    assert total is not None
     given_up = _given_up(vehicle, state, draft, memory.get("share_above_floors", ()))
     if given_up != memory.get("share_above_floors", ()):
         memory = {**memory, "share_above_floors": given_up}
-    wanted = {name: allocation.ZERO if name in given_up else own for name, own in draft.demand.items()}
-    draft = draft.replaced(bitrate=_shared(vehicle, state, wanted, draft.total))
-    return (draft.noted(f"{', '.join(given_up)} given up for the floors of others") if given_up else draft), memory
+    wanted = draft.demand
+    if given_up:
+        wanted = {name: allocation.ZERO if name in given_up else own for name, own in wanted.items()}
+        draft = draft.noted(f"{', '.join(given_up)} given up for the floors of others")
+    return draft.replaced(bitrate=_shared(vehicle, state, wanted, total)), memory
 
 
 def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> dict[str, Kbps]:
     """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
-    floors = {name: camera.floor_kbps for name, camera in vehicle.cameras.items()}
+    floors = _floors(vehicle)
     if not state.copies:
         return allocation.allocate_above_floors(wanted, total, state.weights, floors)
     copies = {name: state.copies.get(name, 1) for name in wanted}
@@ -171,13 +174,24 @@ def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: K
 
 
 def _given_up(vehicle: Vehicle, state: State, draft: Draft, before: tuple[str, ...]) -> tuple[str, ...]:
-    numbers = {name: camera.shed for name, camera in vehicle.cameras.items() if camera.shed is not None}
-    if not numbers or draft.total is None:
+    order = _shed_order(vehicle)
+    if not order or draft.total is None:
         return ()
-    floors = {name: camera.floor_kbps * state.copies.get(name, 1) for name, camera in vehicle.cameras.items()}
-    order = sorted(numbers, key=lambda name: numbers[name])
+    floors = {name: floor * state.copies.get(name, 1) for name, floor in _floors(vehicle).items()}
     of_all = {name: own * state.copies.get(name, 1) for name, own in draft.demand.items()}
     return allocation.shed(of_all, draft.total, floors, order, before)
+
+
+@cache
+def _floors(vehicle: Vehicle) -> Mapping[str, Kbps]:
+    """kbit/s by camera, for those that have a floor."""
+    return {name: camera.floor_kbps for name, camera in vehicle.cameras.items() if camera.floor_kbps}
+
+
+@cache
+def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
+    numbers = {name: camera.shed for name, camera in vehicle.cameras.items() if camera.shed is not None}
+    return tuple(sorted(numbers, key=lambda name: numbers[name]))
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
@@ -305,6 +319,8 @@ def cap_by_link(
     Memory: the cap, `LinkCap`.
     """
     assert draft.total is not None
+    if state.link is None and "cap_by_link" not in memory:
+        return draft, memory  # never measured
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
     before, least = memory.get("cap_by_link", UNCAPPED), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
     cap, limit = before, wire_kbps(cameras, draft.total)
