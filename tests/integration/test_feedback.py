@@ -51,13 +51,13 @@ def test_the_total_follows_what_the_link_carries(drive):
     sides = read_drive(drive).sides
     decisions = [line for line in sides["vehicle"].of(DecisionMade) if line.t > SETTLED_S]
     assert decisions
-    assert max(line.total_kbps for line in decisions) < 2600
+    assert median(line.total_kbps for line in decisions) < 2200  # of 4000 predicted, over a link of 2000
     assert any("measured capacity of the link" in line.cameras["front"].reason for line in decisions)
     link = list(sides["link"].of(LinkSample))
     late = [line for line in link if line.t > SETTLED_S]
     carried = (late[-1].bytes - late[0].bytes) * 8 / 1000 / (late[-1].t - late[0].t)
     assert carried > 0.6 * 2000
-    assert late[-1].dropped - late[0].dropped < 0.02 * (late[-1].packets - late[0].packets)
+    assert late[-1].dropped - late[0].dropped < 0.05 * (late[-1].packets - late[0].packets)
 
 
 def test_a_replay_measures_the_link_again_bit_for_bit(drive):
