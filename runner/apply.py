@@ -18,13 +18,14 @@ from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.aside import settle
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.receiver import Arrival, OnPicture, OnUnit, Receiver, Reception
+from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
 from runner.gst.video_files import VideoFile, VideoFiles, captured_at
 from runner.gst.watched import WatchedSource
+from runner.records import Arrival
 
 if TYPE_CHECKING:
     from fractions import Fraction
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TYPELIBS",
-    "Arrival",
     "OnUnit",
     "OperatorSide",
     "Reception",

@@ -229,6 +229,18 @@ class Sample:
     clock_ahead_ms: float | None = None
 
 
+class Arrival(NamedTuple):
+    """An access unit as it arrived.
+
+    arrived   s, by this machine's monotonic clock
+    captured  s, by the vehicle's clock; since any time, if the transport carries the RTP timestamp only
+    """
+
+    arrived: float
+    captured: float
+    bytes: int
+
+
 class UnitReceived(NamedTuple):
     """An access unit as the operator's side received it; a list in JSON, since there are hundreds a second.
 

@@ -233,7 +233,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["total", "bitrate", "scaling"], gives=["bitrate", "scaling"], reads=["copies", "rois", "weights"])
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Mode S under a cap: all cameras times one factor, with weights and floors as in `share_above_floors`.
+    """Mode S under a cap: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
 
     Where the bitrate falls into a lower range of Eq. (4), the factor falls with it, never above the operator's own.
     What the operator has set stays stored, and returns with the total.
@@ -322,9 +322,8 @@ def cap_by_link(
     if state.link is None and "cap_by_link" not in memory:
         return draft, memory  # never measured
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
-    before, least = memory.get("cap_by_link", UNCAPPED), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
-    cap, limit = before, wire_kbps(cameras, draft.total)
-    link = _of_all_copies(vehicle, state)
+    limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
+    cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
     if draft.total < max(1, len(cameras)) or not cameras or state.operator_lost is not None:
         cap = idle(cap, state.t)
     else:

@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
 from runner.errors import UserError
-from runner.records import Began, Ended, Json, LinesDropped, Record, from_json, line_from_json
+from runner.records import KINDS, Began, Ended, Json, LinesDropped, ReceptionReported, Record, from_json, line_from_json
 from runner.schema import event_problem, log_problem, read_json
 
 T = TypeVar("T")
-REPORTS = "reception"
+REPORTS = KINDS[ReceptionReported]
 # Of a vehicle's log, the lines that are neither an event nor a reception report, nor the first.
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "dropped", "ended")
 

@@ -6,7 +6,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from gi.repository import GObject, Gst, GstSdp
 
@@ -17,6 +16,7 @@ from runner.gst.supervised import SupervisedPipeline
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
+from runner.records import Arrival
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
@@ -53,18 +53,6 @@ class Reception:
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
-class Arrival(NamedTuple):
-    """An access unit as it arrived.
-
-    arrived   s, by this machine's monotonic clock
-    captured  s, by the vehicle's clock; since any time, if the transport carries the RTP timestamp only
-    """
-
-    arrived: float
-    captured: float
-    bytes: int
-
-
 OnUnit = Callable[[str, AccessUnit], None]  # camera, what was received
 OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
 PICTURES = (
@@ -99,12 +87,12 @@ class Receiver:
         self._sampled = 0  # arrivals that have been read
         self._unread: deque[Arrival] = deque(maxlen=KEPT_ARRIVALS)
         self._packets = (0, 0)  # received and missing, as last read
-        self._depayloader = next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
+        # Without RTSP no element reads the capture time of a frame.
+        self._untimed = "" if plan.serves else next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
         self._media_clock = MediaClock(1 / RTP_HZ)
         self._jitter_buffers: list[Gst.Element] = []
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
-        self._serves = plan.serves
         self._codec = video_codec(plan.camera.graph)
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
@@ -176,7 +164,7 @@ class Receiver:
         if self._video:
             VideoFile(self._video, self._name, "operator", _came, self._on_report).follow(pipeline)
         self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
-        if not self._serves and (depayloader := pipeline.get_by_name(self._depayloader)):
+        if self._untimed and (depayloader := pipeline.get_by_name(self._untimed)):
             depayloader.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
@@ -249,7 +237,7 @@ class Receiver:
         return Gst.PadProbeReturn.OK
 
     def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """Without RTSP no element reads the capture time: note the RTP timestamp (RFC 3550, section 5.1)."""
+        """Note the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
         self._media_clock.tick(int.from_bytes(info.get_buffer().extract_dup(4, 4), "big"))
         return Gst.PadProbeReturn.OK
 

@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from runner.configuration import agreement
 from runner.core.model import Vehicle
@@ -26,6 +26,7 @@ from runner.mqtt.messages import (
 from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
 from runner.records import (
+    Arrival,
     CameraSample,
     CameraState,
     Note,
@@ -45,17 +46,6 @@ MOST_VEHICLES = 100  # whose names are remembered
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
 
 OnReply = Callable[[Outcome], None]
-
-
-class ArrivedUnit(Protocol):
-    """An access unit as it arrived: s by this machine's monotonic and by the vehicle's clock, and its bytes."""
-
-    @property
-    def arrived(self) -> float: ...
-    @property
-    def captured(self) -> float: ...
-    @property
-    def bytes(self) -> int: ...
 
 
 class Listener:
@@ -187,7 +177,7 @@ class Station:
         for listener in self.listeners:
             listener.on_sample(sample)
 
-    def report_reception(self, arrivals: Mapping[str, Iterable[ArrivedUnit]], packets: int, lost: int) -> None:
+    def report_reception(self, arrivals: Mapping[str, Iterable[Arrival]], packets: int, lost: int) -> None:
         """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread.
 
         packets, lost  RTP packets of all cameras received, and missing at first

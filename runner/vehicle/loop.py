@@ -341,9 +341,9 @@ class ControlLoop:
     def _publish_state(self) -> None:
         """Publish the decided and the applied values if either changed; answer requests that are applied now."""
         applied = self.applier.applied()
-        state = self._state(applied)
-        due = self._published is None or state.t - self._published.t >= STATE_S or bool(self._pending)
-        if (state != self._published and due) or self._publish_again:
+        due = self._published is None or self._now() - self._published.t >= STATE_S or bool(self._pending)
+        state = self._state(applied) if due or self._publish_again else self._published
+        if state is not None and (state != self._published or self._publish_again):
             self._publish_again = False
             self._published = state
             self.publish(state)

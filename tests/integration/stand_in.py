@@ -6,9 +6,10 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from runner.apply import Arrival, Reception
+from runner.apply import Reception
 from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
+from runner.records import Arrival
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
