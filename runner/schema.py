@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from runner.core.model import suggest
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 Path = tuple[str | int, ...]
 DEEPEST_JSON = 32  # levels; a composed configuration has ten
+MOST_ERRORS = 50  # of a message or a line that are explained; each takes time
 LONGEST_SHOWN = 80  # characters of a value in a message
 _BASE = "json-schema:///"
 LONGEST_WHOLE = 300  # digits; a number that is written out again as a float must fit into one
@@ -260,8 +262,8 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:
-    """All problems of a document; None if it is valid."""
-    found = _explained(_errors(reference, document))
+    """The problems of a document, MOST_ERRORS at most: it may come from an attacker; None if it is valid."""
+    found = _explained(islice(_errors(reference, document), MOST_ERRORS))
     return None if not found else "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 
 

@@ -17,6 +17,7 @@ from runner.core.events import LinkMeasured
 from runner.core.uplink import LinkState
 from runner.mqtt.messages import MqttMessage, read_reception, topic
 from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_from_json, line_to_json, to_json
+from runner.schema import MOST_ERRORS
 from runner.vehicle.uplink import MeasuredUplink
 
 ROBOT = vehicle("vehicle=delivery_robot")
@@ -348,3 +349,10 @@ def test_numbers_out_of_range_are_refused() -> None:
     for key in ("at", "as_of"):
         with pytest.raises(ValueError, match=f"{key}: 1e.308: must be at most"):
             read_reception(message(to_json(REPORT) | {key: 1e308}))
+
+
+def test_few_of_many_mistakes_are_explained() -> None:
+    """A flood of long invalid reports must not keep the vehicle from hearing its operator."""
+    with pytest.raises(ValueError) as raised:
+        read_reception(message(to_json(REPORT) | {"units": [[]] * 1900}))
+    assert str(raised.value).count("must have at least 4 entries") == MOST_ERRORS
