@@ -287,6 +287,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
     return replace(vehicle, modes={mode: tuple(map(call, calls)) for mode, calls in vehicle.modes.items()})
 
 
+@pytest.mark.slow  # simulates many drives
 @pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
 @settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))

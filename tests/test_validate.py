@@ -43,6 +43,7 @@ def test_what_is_packaged_is_valid() -> None:
     assert all(note.startswith(("not checked: ", "nothing was checked against the GStreamer")) for note in notes)
 
 
+@pytest.mark.slow  # composes many configurations
 @pytest.mark.parametrize(
     "words",
     [
