@@ -46,6 +46,7 @@ def demo():
         f"page.port={port}",
         f"media.port={free_port()}",
         f"control.port={free_port()}",
+        "modes=open_loop",  # a busy machine delays packets, which would lower the measured link and with it the total
         "duration_s=1200",
         "source.render.seconds=6",
         "fps_max=5",  # so that counts mean something on two cores that also run the tests
@@ -162,23 +163,18 @@ def test_a_camera_that_is_off_frees_its_share(page, mode):
 
 
 def test_collective_the_slider_changes_all(page):
-    choose(page, "collective")
-    before = state_when(page, _not_capped)
+    before = choose(page, "collective")
     slider = page.locator("[data-control=total-slider]")
     slider.focus()
     for _ in range(3):
         slider.press("PageDown")
-    state_when(page, lambda now: now["asked_kbps"] < before["asked_kbps"] / 2)
-    number = "+document.querySelector('#total-kbps').value"
-    after = state_when(page, lambda now: _not_capped(now) and now["total_kbps"] == page.evaluate(number))
+    state_when(page, lambda now: now["total_kbps"] < before["total_kbps"] / 2)
+    after = state_when(
+        page, lambda now: now["total_kbps"] == page.evaluate("+document.querySelector('#total-kbps').value")
+    )
     assert all(after["cameras"][name]["kbps"] < before["cameras"][name]["kbps"] for name in TUM)
     state_when(page, lambda now: all(c["applied"].get("bitrate") == c["kbps"] for c in now["cameras"].values()))
     shot(page, "collective")
-
-
-def _not_capped(now):
-    """A busy machine delays packets: the measured link then caps the total for a while."""
-    return now["total_kbps"] == now["asked_kbps"]
 
 
 def test_automatic_the_drop_of_the_map_lowers_factors(page):
