@@ -173,6 +173,21 @@ class Reply(Outcome):
 
 
 @dataclass(frozen=True, slots=True)
+class ClockAnswer:
+    """The vehicle's clock, for an operator that compares it with its own, see `runner.system.clocks`.
+
+    sent                of the report that is answered
+    received, answered  s since 1970, by the vehicle's clock
+    error_s             by how much that may differ from UTC, by the kernel's own account; None: not synchronised
+    """
+
+    sent: float
+    received: float
+    answered: float
+    error_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """Settings on which both sides' configurations must agree, by path; `run` distinguishes vehicles of one name."""
 
@@ -192,6 +207,8 @@ class CameraSample:
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
     arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
+
+    Latencies are right to within the sample's `clock_bound_ms`.
     """
 
     fps: float
@@ -215,7 +232,9 @@ class Sample:
     """What the operator's side measures a few times a second.
 
     dropped         invalid messages on the control link
-    clock_ahead_ms  how far the vehicle's clock is ahead, at least; None: not detected
+    clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
+    clock_bound_ms  by how much that may be wrong, and with it each latency; None: unknown. Older logs lack it: there
+                    `clock_ahead_ms` is what a negative latency showed, and latencies are the difference of both clocks
     """
 
     t: float
@@ -227,6 +246,7 @@ class Sample:
     cameras: Mapping[str, CameraSample]
     dropped: int = 0
     clock_ahead_ms: float | None = None
+    clock_bound_ms: float | None = None
 
 
 class Arrival(NamedTuple):
@@ -263,6 +283,7 @@ class ReceptionReport:
     as_of          s, the vehicle's time that the operator assumed, see `runner.vehicle.operators`
     units          in order of arrival
     packets, lost  RTP packets of all cameras received, and missing at first: some may have been repaired
+    sent           s since 1970, by the operator's clock; given where the vehicle is to answer with a `ClockAnswer`
     """
 
     at: float
@@ -270,6 +291,7 @@ class ReceptionReport:
     units: tuple[UnitReceived, ...]
     packets: int
     lost: int
+    sent: float | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)

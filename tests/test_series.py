@@ -15,6 +15,8 @@ from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
 from runner.drive.read import read_drive
 from runner.drive.series import TimeSeries, counted, held, mean_held, panels, rate, sending_spans, series, spans
+from runner.drive.statistics import statistics
+from runner.drive.tables import camera_rows
 from runner.errors import UserError
 
 NAN = float("nan")
@@ -120,6 +122,42 @@ def test_when_a_camera_was_to_be_sent(tmp_path: Path) -> None:
     assert sending_spans(drive.cameras["front_left"].decided, drive.end) == [(0.0, 20.0)]
     switched = [(each.t, each.reason) for each in drive.reasons if each.camera == "rear_center"]
     assert (5.0, "switched off") in switched
+
+
+def test_compared_clocks_align_the_sides_and_bound_the_latencies(tmp_path: Path) -> None:
+    """As if the operator's clock had been 3.7 s behind; one latency is below 0, within the bound of 0.4 ms."""
+
+    def behind(side: str, lines: Lines) -> Lines:
+        for entry in lines:
+            if entry.get("log") == "sample":
+                entry |= {"clock_ahead_ms": 3700.0, "clock_bound_ms": 0.4}
+        first = next(entry for entry in lines if entry.get("log") == "sample") if side == "operator" else None
+        if first:
+            first["cameras"]["front_left"]["arrivals"].append([1.0, -0.3])
+        return lines
+
+    path = write_drive(tmp_path / "drive", seconds=20, change=behind)
+    began, *rest = (path / "operator.jsonl").read_text().splitlines(keepends=True)
+    moved = json.loads(began)
+    moved["time"] -= 3.7
+    (path / "operator.jsonl").write_text("".join([json.dumps(moved) + "\n", *rest]))
+    drive = series(read_drive(path))
+    plain = series(read_drive(write_drive(tmp_path / "plain", seconds=20)))
+    assert drive.warnings == ()
+    assert drive.began == plain.began
+    for name, camera in drive.cameras.items():
+        received, expected = camera.received, plain.cameras[name].received
+        assert received is not None
+        assert expected is not None
+        assert received.t == pytest.approx(expected.t)
+        assert set(received.bound_ms) == {0.4}
+        assert np.isnan(expected.bound_ms).all()
+        assert np.isfinite(received.arrival_ms).all()
+        assert received.arrival_ms.min() >= 0
+    found = statistics(drive)
+    assert (found.arrival.bound, found.cameras["front_left"].decode.bound) == (0.4, 0.4)
+    _, (row, *_) = camera_rows(found)
+    assert any(cell.endswith(" ± 0.4") for cell in row)
 
 
 def test_clocks_that_differ_are_reported(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def _streams(
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
-    began = round(side.began.time * SECOND_NS)
+    began = round(side.began_s * SECOND_NS)
     for line in side.lines:
         ns = began + round(line.t * SECOND_NS)
         for write in _writers(name, line, channels, positions, ns):
@@ -278,7 +278,7 @@ def _captures(side: Side, camera: str) -> list[int]:
     """Capture times of a camera's received frames, ns since 1970, increasing; empty if they were not logged."""
     samples = (sample.cameras[camera] for sample in side.of(Sample) if camera in sample.cameras)
     arrivals = (arrival for sample in samples for arrival in sample.arrivals)
-    began = side.began.time
+    began = side.began_s
     return sorted(
         round((began + t - latency_ms / 1000) * SECOND_NS) for t, latency_ms in arrivals if latency_ms is not None
     )
@@ -307,8 +307,8 @@ def _cameras(drive: Drive) -> list[str]:
 
 def _span(drive: Drive) -> tuple[int, int]:
     """Start and end of the drive, ns since 1970."""
-    began = [side.began.time for side in drive.sides.values()]
-    ended = [side.began.time + line.t for side in drive.sides.values() for line in side.lines[-1:]]
+    began = [side.began_s for side in drive.sides.values()]
+    ended = [side.began_s + line.t for side in drive.sides.values() for line in side.lines[-1:]]
     return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)
 
 

@@ -5,13 +5,26 @@ from __future__ import annotations
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from statistics import median
 from typing import Any, TypeVar
 
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
 from runner.errors import UserError
-from runner.records import KINDS, Began, Ended, Json, LinesDropped, ReceptionReported, Record, from_json, line_from_json
+from runner.records import (
+    KINDS,
+    Began,
+    Ended,
+    Json,
+    LinesDropped,
+    ReceptionReported,
+    Record,
+    Sample,
+    from_json,
+    line_from_json,
+)
 from runner.schema import event_problem, log_problem, read_json
 
 T = TypeVar("T")
@@ -35,6 +48,13 @@ class Side:
     def of(self, kind: type[T]) -> Iterator[T]:
         """Its lines of a kind."""
         return (line for line in self.lines if isinstance(line, kind))
+
+    @cached_property
+    def began_s(self) -> float:
+        """Its beginning, s since 1970 by the vehicle's clock; by its own where their difference was not measured."""
+        measured = (sample for sample in self.of(Sample) if sample.clock_bound_ms is not None)
+        ahead_ms = [sample.clock_ahead_ms for sample in measured if sample.clock_ahead_ms is not None]
+        return self.began.time + (median(ahead_ms) / 1000 if ahead_ms else 0.0)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """From the lines of a drive to quantities over time: one time axis for all sides, arrays for figures. Pure.
 
 The axis is s since the vehicle's log began, or the operator's if the vehicle kept none; sides are aligned by the
-epoch time in their first lines, so that clocks that differ shift the sides against each other. Bitrates are kbit/s.
-`nan` stands for a value unknown at a time.
+epoch time in their first lines and the difference of their clocks, if it was measured. Bitrates are kbit/s. `nan`
+stands for a value unknown at a time.
 """
 
 from __future__ import annotations
@@ -76,10 +76,11 @@ class ReceivedSeries:
     kbps                     over the second before
     width, height            px of the picture, 0 before the first
     latency_ms               capture to decode of the last sampled frame, nan if unknown
+    bound_ms                 by how much latencies may be wrong, nan if unknown; older logs did not measure it
     frames, bytes            counters at each sample
     lost, rebuilt            packets, counters at each sample
     arrival_t, arrival_ms    arrival of each access unit, s, and its latency from capture to arrival, likewise
-    clocks_ms                time of arrival by the operator's clock minus time of capture by the vehicle's
+    clocks_ms                as logged: in older logs arrival by the operator's clock minus capture by the vehicle's
     """
 
     t: FloatSeries
@@ -87,6 +88,7 @@ class ReceivedSeries:
     width: FloatSeries
     height: FloatSeries
     latency_ms: FloatSeries
+    bound_ms: FloatSeries
     frames: FloatSeries
     bytes: FloatSeries
     lost: FloatSeries
@@ -256,10 +258,10 @@ class _Shifted(NamedTuple):
 
 def _series(drive: Drive, label: str) -> Series:
     leading = drive.sides.get("vehicle") or drive.sides["operator"]
-    began, end = leading.began.time, max((line.t for line in leading.lines), default=0.0)
+    began, end = leading.began_s, max((line.t for line in leading.lines), default=0.0)
     if end <= 0:
         raise UserError(str(drive.path), "", None, "is empty: only the first line was logged")
-    sides = {name: _Shifted(side.lines, side.began.time - began) for name, side in drive.sides.items()}
+    sides = {name: _Shifted(side.lines, side.began_s - began) for name, side in drive.sides.items()}
     vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
     decisions: Sequence[tuple[float, DecisionMade | VehicleState]]
     decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
@@ -300,6 +302,8 @@ def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mappin
     if {"vehicle", "operator"} <= sides.keys() and not samples:
         yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
     received = [camera.received for camera in cameras.values() if camera.received]
+    if _compared(received):
+        return
     lowest = min((float(np.nanmin(got.clocks_ms)) for got in received if np.isfinite(got.clocks_ms).any()), default=0.0)
     reported_ms = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
     ahead_ms = max(-lowest, reported_ms)
@@ -386,7 +390,7 @@ def _camera(
     described = (config.get("cameras") or {}).get(name, {})
     full = described.get("width_px", 0) * described.get("height_px", 0)
     decided = [(t, line.cameras[name]) for t, line in decisions if name in line.cameras]
-    received = [(t, t - line.t, line.cameras[name]) for t, line in samples if name in line.cameras]
+    received = [(t, line, line.cameras[name]) for t, line in samples if name in line.cameras]
     sent = [(t, line.cameras[name]) for t, line in telemetry if name in line.cameras]
     return CameraSeries(
         name, _decided(decided, full), _received(received) if received else None, _sent(sent) if sent else None
@@ -410,11 +414,11 @@ def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> Deci
     )
 
 
-def _received(received: Sequence[tuple[float, float, CameraSample]]) -> ReceivedSeries:
+def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> ReceivedSeries:
     def column(key: str) -> FloatSeries:
         return np.array([getattr(camera, key) for *_, camera in received], dtype=float)
 
-    came = [(t + shift, ms) for _, shift, camera in received for t, ms in camera.arrivals]
+    came = [(at + t - line.t, ms) for t, line, camera in received for at, ms in camera.arrivals]
     arrivals = np.array(came, dtype=float).reshape(-1, 2)
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
@@ -425,6 +429,7 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
         kbps=_settled(t, column("kbps"), frames),
         **{key: column(key) for key in ("width", "height")},
         latency_ms=np.where(moved, column("latency_ms"), np.nan),
+        bound_ms=np.array([line.clock_bound_ms for _, line, _ in received], dtype=float),
         frames=frames,
         **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
         arrival_t=arrivals[:, 0],
@@ -434,17 +439,26 @@ def _received(received: Sequence[tuple[float, float, CameraSample]]) -> Received
 
 
 def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, CameraSeries]:
-    """Without the latencies around negative ones: all cameras of a vehicle share its clock."""
+    """Without negative latencies; in older logs without those around them: all cameras of a vehicle share its clock."""
     received = {name: camera.received for name, camera in cameras.items() if camera.received}
+    compared = _compared(received.values())
     ahead = [got.arrival_t[got.clocks_ms < CLOCKS_APART_MS] for got in received.values()]
     ahead += [got.t[got.latency_ms < CLOCKS_APART_MS] for got in received.values()]
     apart = np.sort(np.concatenate([np.empty(0), *ahead]))
     known = dict(cameras)
     for name, got in received.items():
-        arrival_ms = _known(got.arrival_t, got.arrival_ms, apart)
-        latency_ms = _known(got.t, got.latency_ms, apart)
+        if compared:
+            arrival_ms, latency_ms = np.maximum(got.arrival_ms, 0.0), got.latency_ms
+        else:
+            arrival_ms = _known(got.arrival_t, got.arrival_ms, apart)
+            latency_ms = _known(got.t, got.latency_ms, apart)
         known[name] = replace(cameras[name], received=replace(got, arrival_ms=arrival_ms, latency_ms=latency_ms))
     return known
+
+
+def _compared(received: Iterable[ReceivedSeries]) -> bool:
+    """Whether the operator's side compared its clock with the vehicle's."""
+    return any(bool(np.isfinite(got.bound_ms).any()) for got in received)
 
 
 def _known(t: FloatSeries, ms: FloatSeries, apart: FloatSeries) -> FloatSeries:

@@ -34,6 +34,7 @@ FREEZE_STALLED_S = 2.0  # a stream that stops for this long before the criterion
 FREEZE_FIRST = 5  # gaps before a gap can be judged; the specification leaves it open, libwebrtc uses the same
 SECOND_S = 1.0
 NAN = float("nan")
+UNKNOWN: FloatSeries = np.empty(0)
 
 
 class Freeze(NamedTuple):
@@ -44,11 +45,15 @@ class Freeze(NamedTuple):
 
 
 class Latency(NamedTuple):
-    """Percentiles of latencies, ms."""
+    """Percentiles of latencies, ms.
+
+    bound  by how much each may be wrong, for 95 % of the time; nan in older logs, which did not measure it
+    """
 
     median: float = NAN
     p95: float = NAN
     p99: float = NAN
+    bound: float = NAN
 
 
 class PerSecond(NamedTuple):
@@ -165,6 +170,7 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Driv
     cameras = {name: camera_statistics(c, drive.end, models.get(name)) for name, c in drive.cameras.items()}
     each = list(cameras.values())
     received = [c.received for c in drive.cameras.values() if c.received]
+    clock_bound = received[0].bound_ms if received else UNKNOWN  # of all: they share the vehicle's clock
     estimates = [camera.quality for camera in each if camera.quality]
     metrics = {estimate.metric for estimate in estimates}
     known = drive.predicted.y[np.isfinite(drive.predicted.y)]
@@ -179,8 +185,8 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Driv
         share=ratio(kbps, allocated),
         predicted_min=float(known.min()) if known.size else NAN,
         predicted_max=float(known.max()) if known.size else NAN,
-        arrival=latency(together(got.arrival_ms for got in received)),
-        decode=latency(together(got.latency_ms for got in received)),
+        arrival=latency(together(got.arrival_ms for got in received), clock_bound),
+        decode=latency(together(got.latency_ms for got in received), clock_bound),
         freezes=len(frozen) if watched else None,
         frozen_s=sum(freeze.seconds for freeze in frozen) if watched else None,
         frozen=ratio(sum(freeze.seconds for freeze in frozen), sum(c.sending_s for c in each if c.freezes is not None)),
@@ -212,8 +218,8 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         share=ratio(kbps, allocated),
         factors=factor_shares(camera, begin, until),
         sizes=size_shares(camera, begin, until),
-        arrival=latency(received.arrival_ms) if received else Latency(),
-        decode=latency(received.latency_ms) if received else Latency(),
+        arrival=latency(received.arrival_ms, received.bound_ms) if received else Latency(),
+        decode=latency(received.latency_ms, received.bound_ms) if received else Latency(),
         freezes=frozen_spans,
         frozen=NAN if frozen_spans is None else ratio(sum(freeze.seconds for freeze in frozen_spans), sending_s),
         lost=int(received.lost[-1]) if received else None,
@@ -256,10 +262,16 @@ def _part(share: float) -> str:
 # --- latency and freezes ----------------------------------------------------------------------------------------------
 
 
-def latency(values: FloatSeries) -> Latency:
-    """Median, 95th and 99th percentile by linear interpolation; nan if there are none."""
-    known = values[np.isfinite(values)]
-    return Latency(*map(float, np.percentile(known, (50, 95, 99)))) if known.size else Latency()
+def latency(values: FloatSeries, bounds: FloatSeries = UNKNOWN) -> Latency:
+    """Median, 95th and 99th percentile by linear interpolation; nan if there are none.
+
+    bounds  by how much they may be wrong, at the times of the samples
+    """
+    known, measured = values[np.isfinite(values)], bounds[np.isfinite(bounds)]
+    if not known.size:
+        return Latency()
+    median, p95, p99 = map(float, np.percentile(known, (50, 95, 99)))
+    return Latency(median, p95, p99, float(np.percentile(measured, 95)) if measured.size else NAN)
 
 
 def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> list[Freeze]:

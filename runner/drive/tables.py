@@ -11,7 +11,8 @@ TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
 MEANING = (
-    "Arrival and decode: latency since capture. Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
+    "Arrival and decode: latency since capture; ±: by how much it may be wrong, since two clocks measure it."
+    " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
     " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
     " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
 )
@@ -84,7 +85,10 @@ def _drive(drive: DriveStatistics) -> TableRow:
 
 
 def _latency(latency: Latency) -> str:
-    return " / ".join(shown(value) for value in latency) if not math.isnan(latency.median) else NOTHING
+    if math.isnan(latency.median):
+        return NOTHING
+    percentiles = " / ".join(shown(value) for value in (latency.median, latency.p95, latency.p99))
+    return percentiles if math.isnan(latency.bound) else f"{percentiles} ± {shown(latency.bound, 1)}"
 
 
 def shown(value: float | None, digits: int = 0) -> str:

@@ -22,6 +22,7 @@ NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
 KEPT_ARRIVALS = 1024  # not read yet; the oldest are dropped
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
+CURRENT_S = 1.0  # an older picture has no current latency
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -35,7 +36,8 @@ class Reception:
     lost        RTP packets that never arrived
     foreign     RTP and RTCP packets from hosts other than the vehicle, dropped
     width, height  px of the decoded picture, 0 before the first
-    latency_ms  capture to decode of the last sampled frame; None before the first
+    latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
+                first, and where it is older than CURRENT_S
     rebuilt     how often a pipeline that had received frames was rebuilt
     arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
                 by this machine's and by the vehicle's clock
@@ -97,7 +99,7 @@ class Receiver:
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
-        self._latency_ms: float | None = None
+        self._latency: tuple[float, float] | None = None  # ms, and when
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
@@ -201,7 +203,7 @@ class Receiver:
             self._filter = None
 
     def _count(self) -> Reception:
-        before = self._before
+        before, now = self._before, time.monotonic()
         frames, size = counted(self._received)
         caps = self._sink.get_static_pad("sink").get_current_caps()
         picture = caps.get_structure(0) if caps else None
@@ -213,14 +215,14 @@ class Receiver:
             lost=before.lost + sum(b.get_property("stats").get_value("num-lost") for b in self._jitter_buffers),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
-            latency_ms=self._latency_ms,
+            latency_ms=self._latency[0] if self._latency and now - self._latency[1] <= CURRENT_S else None,
             rebuilt=self._supervised.rebuilt,
         )
 
     def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         captured = capture_time(info.get_buffer())
         if captured is not None:
-            self._latency_ms = 1000 * (time.time() - captured)
+            self._latency = (1000 * (time.time() - captured), time.monotonic())
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:

@@ -19,7 +19,7 @@ LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh per
 class AccessUnit(NamedTuple):
     """One encoded picture, H.264 or H.265, Annex B.
 
-    captured  capture time, s since 1970 by the vehicle's clock; None if the transport does not carry it
+    captured  capture time, s since 1970 by the vehicle's clock, on the page by this machine's; None if it is unknown
     arrived   arrival time, s since 1970 by this machine's clock
     key       whether a decoder can start with it (IDR; of H.265 any IRAP picture)
     recovery  frames after which a decoder that starts here is exact, if a refresh wave begins here; otherwise None

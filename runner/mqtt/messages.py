@@ -6,7 +6,8 @@ Topics of a vehicle, below tod/<vehicle>/:
                          retained. The vehicle stamps it on receipt.
     reply/<operator>     to that operator: the same id, and applied (read back from the elements), refused, expired or
                          timed out
-    reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never answered or retained
+    reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never retained
+    clock/<operator>     to that operator, five times a second: when a report came, by the vehicle's clock
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
@@ -21,7 +22,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from runner.records import ReceptionReport, Reply, Settings, Telemetry, VehicleState, from_json
+from runner.records import ClockAnswer, ReceptionReport, Reply, Settings, Telemetry, VehicleState, from_json
 from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
@@ -74,7 +75,7 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
 
 
 def read_state(payload: bytes) -> VehicleState | None:
-    """A vehicle's state; None: it is offline. Like the three below, raises ValueError with the problem."""
+    """A vehicle's state; None: it is offline. Like the four below, raises ValueError with the problem."""
     document = _checked("state", payload)
     return from_json(VehicleState, document) if document["online"] else None
 
@@ -89,6 +90,10 @@ def read_settings(payload: bytes) -> Settings:
 
 def read_reply(payload: bytes) -> Reply:
     return from_json(Reply, _checked("reply", payload))
+
+
+def read_clock(payload: bytes) -> ClockAnswer:
+    return from_json(ClockAnswer, _checked("clock", payload, MAX_REQUEST_BYTES))
 
 
 def read_reception(message: MqttMessage) -> ReceptionReport:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
 from runner.records import CameraSample, Note, Offline, Sample, VehicleState
+from runner.system.clocks import latency
 
 
 class DriveLog(Listener):
@@ -30,12 +30,10 @@ class DriveLog(Listener):
 
     def _with_arrivals(self, name: str, camera: CameraSample) -> CameraSample:
         received: Any = self._station.samples[name]
-        return replace(camera, arrivals=_arrivals(received.arrivals, self._log.time))
+        arrivals = tuple(self._arrival(*arrival) for arrival in received.arrivals)
+        return replace(camera, arrivals=arrivals)
 
-
-def _arrivals(arrivals: Iterable[tuple[float, float | None]], began: float) -> tuple[tuple[float, float | None], ...]:
-    """Arrival time of each unit, s since the beginning, and its delay since capture, ms."""
-    return tuple(
-        (round(arrived - began, 4), None if captured is None else round(1000 * (arrived - captured), 2))
-        for arrived, captured in arrivals
-    )
+    def _arrival(self, arrived: float, captured: float | None) -> tuple[float, float | None]:
+        """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
+        ms = latency(None if captured is None else 1000 * (arrived - captured), self._station.clock)
+        return round(arrived - self._log.time, 4), None if ms is None else round(ms, 2)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from runner.configuration import agreement
 from runner.core.model import Vehicle
@@ -17,6 +19,7 @@ from runner.mqtt.messages import (
     OPERATOR_GONE,
     JsonObject,
     MqttMessage,
+    read_clock,
     read_reply,
     read_settings,
     read_state,
@@ -38,10 +41,12 @@ from runner.records import (
     VehicleState,
     to_json,
 )
-from runner.system.clocks import Clocks
+from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange, latency
+from runner.system.kernel_clock import clock_error_s
 
 SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
+CLOCK_S = 0.2  # between two comparisons of the clocks
 MOST_VEHICLES = 100  # whose names are remembered
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
 
@@ -101,13 +106,17 @@ class Station:
         self._pending: dict[str, _PendingRequest] = {}
         self._lock = threading.Lock()
         self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
-        self.clocks = Clocks()
+        self.clock: ClockDifference | None = None  # the vehicle's against this machine's; None: unknown
+        self._clocks = ClockComparison()
+        self._clock_asked: deque[float] = deque(maxlen=round(KEPT_S / CLOCK_S))  # `sent` of reports without an answer
+        self._clock_due = 0.0  # time.monotonic of the next
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         listen = {
             topic("+", "state"): self._on_any_state,
             topic(vehicle.name, "reply", self.identity): self._on_reply,
+            topic(vehicle.name, "clock", self.identity): self._on_clock,
             topic(vehicle.name, "telemetry"): self._on_telemetry,
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
@@ -153,6 +162,11 @@ class Station:
         """An event of a camera, as `OperatorSide` reports it."""
         self.note(f"{camera}: {what}")
 
+    def captured_here(self, captured: float | None) -> float | None:
+        """A capture time by the vehicle's clock, s since 1970, as this machine's clock shows it; None: unknown."""
+        clock = self.clock  # another thread may replace it
+        return None if captured is None or clock is None else captured - clock.ahead_s
+
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
 
@@ -169,7 +183,8 @@ class Station:
         self._time_out(now)
         self._look_for_vehicle(now)
         self.ask({"event": "operator_connected"})  # the heartbeat
-        samples = self._with_known_ages(now, samples)
+        self._compare_clocks(now)
+        samples = {name: self._with_latency(received) for name, received in samples.items()}
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, self._camera(name))
         self.samples = samples
@@ -191,9 +206,16 @@ class Station:
             UnitReceived(name, round(now - at, 4), round(at - unit.captured - base, 4), unit.bytes)
             for at, name, unit in units
         )
-        if self.state is not None:
-            report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
-            self._link.publish(self._receptions, to_json(report))
+        if self.state is None:
+            return
+        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
+        if now >= self._clock_due:
+            self._clock_due = now + CLOCK_S
+            sent = time.time()
+            with self._lock:
+                self._clock_asked.append(sent)
+            report = replace(report, sent=sent)
+        self._link.publish(self._receptions, to_json(report))
 
     def rows(self) -> list[CameraRow]:
         return [
@@ -204,25 +226,24 @@ class Station:
         state = self.state  # another thread may replace it
         if state is None:
             return f"{self._vehicle.name}: offline"
-        ahead = self.clocks.ahead_ms
-        clock = "" if ahead is None else f"; its clock is ahead by at least {ahead:.0f} ms: latencies are unknown"
-        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s{clock}"
+        clock = self.clock
+        latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies unknown: its clock is"
+        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
 
-    def _with_known_ages(self, now: float, samples: Mapping[str, StreamCounters]) -> Mapping[str, StreamCounters]:
-        before = self.clocks.ahead_ms
-        samples = self.clocks.checked(now, samples)
-        after = self.clocks.ahead_ms
-        if before is None and after is not None:
-            rule = "synchronise both clocks (NTP, PTP)"
-            self.note(f"the vehicle's clock is ahead by at least {after:.0f} ms: picture ages are unknown; {rule}")
-        elif before is not None and after is None:
-            self.note("the vehicle's clock is no longer ahead: picture ages are known")
-        return samples
+    def _compare_clocks(self, now: float) -> None:
+        before, self.clock = self.clock, self._clocks.difference(now)
+        if self.clock is None and before is not None and self.state:
+            self.note(f"the vehicle has not stated its clock for {KEPT_S:g} s: latencies are unknown")
+
+    def _with_latency(self, received: Any) -> StreamCounters:
+        """Counters whose latency is by both clocks, made one by this machine's; None if their difference is unknown."""
+        latency_ms = latency(received.latency_ms, self.clock)
+        counters: StreamCounters = replace(received, latency_ms=latency_ms)
+        return counters
 
     def _sample(self) -> Sample:
         cameras = {row.name: _camera_sample(row) for row in self.rows()}
         telemetry = self._telemetry if self.state else None
-        ahead = self.clocks.ahead_ms
         return Sample(
             t=time.time(),
             predicted_kbps=telemetry.predicted_kbps if telemetry else None,
@@ -232,7 +253,8 @@ class Station:
             refused=telemetry.refused if telemetry else 0,
             cameras=cameras,
             dropped=self._link.dropped,
-            clock_ahead_ms=None if ahead is None else round(ahead, 1),
+            clock_ahead_ms=round(1000 * self.clock.ahead_s, 3) if self.clock else None,
+            clock_bound_ms=round(1000 * self.clock.bound_s, 3) if self.clock else None,
         )
 
     def _camera(self, name: str) -> CameraState | None:
@@ -285,6 +307,16 @@ class Station:
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         self._vehicle_online()
+
+    def _on_clock(self, message: MqttMessage) -> None:
+        returned, now, answer = time.time(), time.monotonic(), read_clock(message.payload)
+        with self._lock:
+            if message.retained or answer.sent not in self._clock_asked:
+                return
+            self._clock_asked.remove(answer.sent)
+        own_s = clock_error_s()
+        errors_s = None if own_s is None or answer.error_s is None else own_s + answer.error_s
+        self._clocks.add(now, Exchange(answer.sent, answer.received, answer.answered, returned, errors_s))
 
     def _on_configuration(self, message: MqttMessage) -> None:
         """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""

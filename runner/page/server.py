@@ -157,7 +157,7 @@ class PageServer(Listener):
             viewer.tell(kind, message)
 
     def _show(self, camera: int, unit: AccessUnit) -> None:
-        unit = self._recent[camera].add(unit)
+        unit = self._recent[camera].add(unit._replace(captured=self._station.captured_here(unit.captured)))
         for viewer in self._viewers:
             viewer.show(camera, unit)
 

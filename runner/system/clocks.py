@@ -1,49 +1,95 @@
-"""Whether the clocks of two machines agree well enough to determine the age of a picture. Pure."""
+"""The difference between the clocks of two machines, bounded by the messages that they exchange. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections import deque
+from typing import NamedTuple
 
-CLOCKS_APART_MS = -1.0  # an age below it shows that the vehicle's clock is ahead; a negative age above it is noise
-TRUSTED_AGAIN_S = 10.0  # time without a negative age before ages are known again
-CURRENT_S = 1.0  # an older picture has no current age
+MOST_DRIFT = 5e-4  # by which two clocks drift apart: two crystals by 100 ppm; Linux slews a clock by 500 ppm
+KEPT_S = 10.0  # that an exchange counts; without a newer one nothing is known
+CLOCKS_APART_MS = -1.0  # in logs without exchanges: a negative age above it is noise, below it the clocks are apart
+TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age in which ages are unknown
 
 
-@dataclass
-class Clocks:
-    """Whether the ages of pictures are known: each is the difference of two machines' clocks.
+class Exchange(NamedTuple):
+    """A message to the other machine and its answer, as in RFC 5905, figure 15; s since 1970.
 
-    A negative age shows that the vehicle's clock is ahead, by at least as much. All ages are then too small, and
-    treated as unknown. A clock that is behind makes them too large; this is not detectable.
-
-    ahead_ms  by how much the vehicle's clock is ahead at least; None: not detected
+    sent, returned      by this machine's clock
+    received, answered  by the other's
+    errors_s            sum of the errors that both kernels state against a common time; None if one is not synchronised
     """
 
-    ahead_ms: float | None = None
-    _negative: float = field(default=float("-inf"))  # when an age was last negative
-    _frames: dict[str, tuple[int, float]] = field(default_factory=dict)  # by camera, the count and when it last rose
+    sent: float
+    received: float
+    answered: float
+    returned: float
+    errors_s: float | None = None
 
-    def checked(self, t: float, samples: Mapping[str, Any]) -> dict[str, Any]:
-        """Samples with `frames` and `latency_ms` at time t, s: an age is None where unknown or no longer current."""
-        risen = {name for name, sample in samples.items() if self._rose(name, sample.frames, t)}
-        lowest = min((samples[name].latency_ms or 0.0 for name in risen), default=0.0)
-        if lowest < CLOCKS_APART_MS:
-            self.ahead_ms, self._negative = max(-lowest, self.ahead_ms or 0.0), t
-        elif t - self._negative > TRUSTED_AGAIN_S:
-            self.ahead_ms = None
-        return {
-            name: sample if self._known(name, sample, t) else replace(sample, latency_ms=None)
-            for name, sample in samples.items()
-        }
 
-    def _rose(self, name: str, frames: int, t: float) -> bool:
-        before = self._frames.get(name, (0, t))[0]
-        if frames != before:
-            self._frames[name] = (frames, t)
-        return frames != before
+class ClockDifference(NamedTuple):
+    """How far the other machine's clock is ahead of this one's, s, and by how much that may be wrong."""
 
-    def _known(self, name: str, sample: Any, t: float) -> bool:
-        current = name in self._frames and t - self._frames[name][1] <= CURRENT_S
-        return current and self.ahead_ms is None and (sample.latency_ms or 0.0) >= 0
+    ahead_s: float
+    bound_s: float
+
+
+def latency(apart_ms: float | None, clock: ClockDifference | None) -> float | None:
+    """A latency, ms, right to within the bound of `clock`; None if either is unknown.
+
+    apart_ms  time of the later event by this machine's clock minus that of the earlier by the other's, ms
+    """
+    return None if apart_ms is None or clock is None else max(0.0, apart_ms + 1000 * clock.ahead_s)
+
+
+class _Interval(NamedTuple):
+    """What the difference lay between at a time, s."""
+
+    at: float
+    least: float
+    most: float
+
+
+class ClockComparison:
+    """Compares two clocks by exchanged messages.
+
+    No message arrives before it was sent: the one there bounds the difference from above, the answer from below. Each
+    exchange yields such an interval, whatever the delay in either direction, and the truth lies in all of them. An
+    exchange of t seconds ago counts with its interval widened by what the clocks may have drifted apart since.
+    """
+
+    def __init__(self) -> None:
+        self._intervals: deque[_Interval] = deque()
+
+    def add(self, at: float, exchange: Exchange) -> None:
+        """Take an exchange that was completed at time `at`, s, by a clock that is never set.
+
+        raises  ValueError if the other machine answered before it received, by its own clock
+        """
+        if exchange.answered < exchange.received:
+            raise ValueError(f"answered {exchange.received - exchange.answered:g} s before it was received")
+        self._intervals.append(_interval(at, exchange))
+
+    def difference(self, now: float) -> ClockDifference | None:
+        """The difference at a time, by the same clock; None if nothing was exchanged for KEPT_S."""
+        while self._intervals and now - self._intervals[0].at > KEPT_S:
+            self._intervals.popleft()
+        if not self._intervals:
+            return None
+        least, most = float("-inf"), float("inf")
+        for interval in reversed(self._intervals):
+            drift = MOST_DRIFT * abs(now - interval.at)  # answers may overtake each other
+            low, high = max(least, interval.least - drift), min(most, interval.most + drift)
+            if low > high:  # a clock has been set in between: only what came after counts
+                break
+            least, most = low, high
+        return ClockDifference((least + most) / 2, (most - least) / 2)
+
+
+def _interval(at: float, exchange: Exchange) -> _Interval:
+    """Bounds of the difference by one exchange, and by both kernels where these are synchronised and agree with it."""
+    drift = MOST_DRIFT * max(0.0, exchange.returned - exchange.sent)
+    least = exchange.answered - exchange.returned - drift
+    most = exchange.received - exchange.sent + drift
+    if exchange.errors_s is not None and -exchange.errors_s <= most and least <= exchange.errors_s:
+        least, most = max(least, -exchange.errors_s), min(most, exchange.errors_s)
+    return _Interval(at, least, most)

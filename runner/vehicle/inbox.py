@@ -48,10 +48,14 @@ class Request(NamedTuple):
 
 
 class Reported(NamedTuple):
-    """A reception report of an operator. None supersedes another: each holds what arrived since the one before."""
+    """A reception report of an operator. None supersedes another: each holds what arrived since the one before.
+
+    state_clock  states the vehicle's clock to the operator; None: it did not ask
+    """
 
     sender: str
     report: ReceptionReport
+    state_clock: Callable[[], None] | None = None
 
     @property
     def queue(self) -> str:

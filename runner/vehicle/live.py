@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec import UNSET
+
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress, Vehicle
@@ -35,7 +37,8 @@ from runner.mqtt.messages import (
     topic,
 )
 from runner.plans import compile_plans, render_missing
-from runner.records import Outcome, Settings, Telemetry, VehicleState, to_json
+from runner.records import ClockAnswer, Outcome, Settings, Telemetry, VehicleState, to_json
+from runner.system.kernel_clock import clock_error_s
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
 
@@ -213,6 +216,7 @@ class _VehicleControl:
             self._live.loop.take(request)
 
     def _on_reception(self, message: MqttMessage) -> None:
+        received = time.time()
         if self._live.loop.overrun(message.sender, reports=True):
             return
         try:
@@ -220,7 +224,13 @@ class _VehicleControl:
         except ValueError:
             self._live.loop.reject(message.sender)
             raise
-        self._live.loop.take(Reported(message.sender, report))
+        asked = self._topic("clock", message.sender)
+
+        def state_clock() -> None:
+            assert report.sent is not UNSET
+            self._link.publish(asked, to_json(ClockAnswer(report.sent, received, time.time(), clock_error_s())))
+
+        self._live.loop.take(Reported(message.sender, report, None if report.sent is UNSET else state_clock))
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         """Before this vehicle has published anything, live telemetry is another vehicle's."""

@@ -45,6 +45,7 @@ from runner.vehicle.uplink import MeasuredUplink
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
+CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
 
@@ -100,6 +101,7 @@ class ControlLoop:
     _cause: str = ""  # the event that the decision in force came from
     _position: PositionReported | None = None
     _reported: dict[str, float] = field(default_factory=dict)  # by fault, when it was last reported
+    _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, when
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
@@ -254,10 +256,19 @@ class ControlLoop:
         self._update_presence(item.sender, t, None)
         if item.sender not in self._operators.present:
             return
+        self._state_clock(item, t)
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
+
+    def _state_clock(self, item: Reported, t: float) -> None:
+        """Answer an operator that compares clocks; not a flood of such reports, whose answers would fill the uplink."""
+        if item.state_clock and t - self._clock_stated.get(item.sender, -CLOCK_S) >= CLOCK_S:
+            present = self._operators.present
+            self._clock_stated = {name: at for name, at in self._clock_stated.items() if name in present}
+            self._clock_stated[item.sender] = t
+            item.state_clock()
 
     def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
         """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""

@@ -7,6 +7,7 @@ import json
 import os
 import queue
 import random
+import shutil
 import socket
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from runner.operator.station import Listener
 from runner.records import Note, Sample, VehicleState, state_to_json, to_json
@@ -34,6 +37,56 @@ CHROMIUM_FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+
+
+SHIFTED = """\
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <fcntl.h>
+#include <string.h>
+#include <sys/time.h>
+#include <time.h>
+#include <unistd.h>
+static long ahead_ns; /* 0 in a process whose command line lacks SIDE */
+__attribute__((constructor)) static void look(void) {
+  char line[4096];
+  int file = open("/proc/self/cmdline", O_RDONLY), size = (int)read(file, line, sizeof line);
+  close(file);
+  for (int at = 0; at < size; at += (int)strlen(line + at) + 1)
+    if (!strcmp(line + at, SIDE)) ahead_ns = AHEAD_MS * 1000000L;
+}
+int clock_gettime(clockid_t id, struct timespec *t) {
+  static int (*own)(clockid_t, struct timespec *);
+  if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
+  int failed = own(id, t);
+  if (failed || id != CLOCK_REALTIME) return failed;
+  long ns = t->tv_nsec + ahead_ns;
+  t->tv_sec += ns / 1000000000, t->tv_nsec = ns % 1000000000;
+  return 0;
+}
+int gettimeofday(struct timeval *t, void *zone) {
+  struct timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  t->tv_sec = now.tv_sec, t->tv_usec = now.tv_nsec / 1000;
+  return 0;
+}
+time_t time(time_t *at) {
+  struct timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  if (at) *at = now.tv_sec;
+  return now.tv_sec;
+}
+"""
+needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+
+
+def clock_ahead(directory: Path, seconds: float, verb: str = "vehicle") -> dict[str, str]:
+    """The environment in which CLOCK_REALTIME of one verb, alone or in a demo, is ahead."""
+    (directory / "shifted.c").write_text(SHIFTED)
+    values = (f'-DSIDE="{verb}"', f"-DAHEAD_MS={round(1000 * seconds)}")
+    command = ["cc", "-shared", "-fPIC", *values, "-o", "shifted.so", "shifted.c", "-ldl"]
+    subprocess.run(command, cwd=directory, check=True)
+    return {"LD_PRELOAD": str(directory / "shifted.so")}
 
 
 # Below the ephemeral range of Linux: a client might take one of those before a side under test has bound it.

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
 import signal
-import subprocess
 import time
 from contextlib import contextmanager
 from functools import partial
@@ -15,9 +13,11 @@ from functools import partial
 import pytest
 
 from browser import all_live, luma, measure, opened, send, shot, state_when, until
-from rig import CHECKOUT, answers, free_port, process
+from rig import CHECKOUT, answers, clock_ahead, free_port, needs_compiler, process
 from runner.core.model import Endpoint
+from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
+from runner.records import Sample
 
 pytestmark = [
     pytest.mark.gst,
@@ -143,57 +143,27 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
             assert drawn > 0.9 * received
 
 
-SHIFTED = """\
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <sys/time.h>
-#include <time.h>
-#define AHEAD_S 4
-int clock_gettime(clockid_t id, struct timespec *t) {
-  static int (*own)(clockid_t, struct timespec *);
-  if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
-  int failed = own(id, t);
-  if (!failed && id == CLOCK_REALTIME) t->tv_sec += AHEAD_S;
-  return failed;
-}
-int gettimeofday(struct timeval *t, void *zone) {
-  struct timespec now;
-  clock_gettime(CLOCK_REALTIME, &now);
-  t->tv_sec = now.tv_sec, t->tv_usec = now.tv_nsec / 1000;
-  return 0;
-}
-time_t time(time_t *at) {
-  struct timespec now;
-  clock_gettime(CLOCK_REALTIME, &now);
-  if (at) *at = now.tv_sec;
-  return now.tv_sec;
-}
-"""
-
-
-@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-def test_a_vehicle_whose_clock_is_ahead_is_warned_of_and_no_age_is_shown(chromium, tmp_path):
-    (tmp_path / "shifted.c").write_text(SHIFTED)
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", "shifted.so", "shifted.c", "-ldl"], cwd=tmp_path, check=True)
-    ahead = {"LD_PRELOAD": str(tmp_path / "shifted.so")}
+@needs_compiler
+def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
     log = f"log={tmp_path / 'drive'}"
+    ahead = clock_ahead(tmp_path, seconds=3.7)
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
         all_live(page)
-        page.wait_for_selector("#warning:not([hidden])", timeout=10_000)
-        expected = r"▲ The vehicle's clock is ahead by at least [34]\.\d s: the age of its pictures is unknown; LATE .*"
-        assert re.fullmatch(expected, page.locator("#warning").inner_text())
-        until(lambda: "– ms" in page.locator("[data-camera=front] .form").inner_text())
-        assert {camera["latency_ms"] for camera in page.evaluate("tod.sample")["cameras"].values()} == {None}
+        shown = partial(page.locator("[data-camera=front] .form").inner_text)
+        age = until(lambda: re.search(r" (\d+) ± (\d+) ms", shown()))
+        assert 0 < int(age[1]) < 500, age  # and not 3700
+        assert int(age[2]) < 100, age
+        time.sleep(2.5)  # by then a clock that was not compared is warned of
+        assert page.locator("#warning").is_hidden()
         assert "late" not in {status for _, _, status in page.evaluate("tod.measure()")["status_log"]}
         shot(page, "clock-ahead")
         operator.terminate()
-        output, _ = operator.communicate(timeout=20)
-    assert "the vehicle's clock is ahead by at least " in output
-    lines = [json.loads(line) for line in (tmp_path / "drive" / "operator.jsonl").read_text().splitlines()]
-    samples = [line for line in lines if line.get("log") == "sample"]
-    assert 3500 < samples[-1]["clock_ahead_ms"] < 4001
-    known = {camera["latency_ms"] for sample in samples for camera in sample["cameras"].values()}
-    assert known == {None}
+        operator.communicate(timeout=20)
+    samples = list(read_drive(tmp_path / "drive").sides["operator"].of(Sample))
+    known = [sample for sample in samples if sample.clock_bound_ms is not None]
+    assert len(known) > len(samples) / 2
+    right = [abs(sample.clock_ahead_ms - 3700) <= sample.clock_bound_ms for sample in known]
+    assert sum(right) >= 0.99 * len(right)
 
 
 def test_nothing_old_is_shown_of_a_camera_that_is_off_or_lost(chromium):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import pytest
 
@@ -44,8 +45,13 @@ class Vehicle:
 
     def __init__(self, broker):
         self.requests = []
-        self.operator = ""  # sender of the last request
-        listen = {topic("delivery_robot", "request", "+"): self._on_request}
+        self.operator = ""  # sender of the last message
+        self.clock_ahead_s, self.states_clock = 0.0, True
+        self.answers = []  # about its clock
+        listen = {
+            topic("delivery_robot", "request", "+"): self._on_request,
+            topic("delivery_robot", "reception", "+"): self._on_reception,
+        }
         self.link = ControlLink(broker, (topic("delivery_robot", "state"), OFFLINE), listen, lambda here: None, print)
         self.link.connect()
         assert self.link.wait_connected(15)
@@ -54,8 +60,15 @@ class Vehicle:
         self.operator = message.sender
         self.requests.append(json.loads(message.payload))
 
+    def _on_reception(self, message):
+        report, now = json.loads(message.payload), time.time() + self.clock_ahead_s
+        self.operator = message.sender
+        if self.states_clock and "sent" in report:
+            self.answers.append({"sent": report["sent"], "received": now, "answered": now, "error_s": None})
+            self.publish("clock", self.answers[-1])
+
     def publish(self, kind, message):
-        parts = (kind, self.operator) if kind == "reply" else (kind,)
+        parts = (kind, self.operator) if kind in ("reply", "clock") else (kind,)
         self.link.publish(topic("delivery_robot", *parts), message)
 
     def live_until(self, done):
@@ -88,6 +101,10 @@ def results(replies):
 
 def samples():
     return dict.fromkeys(("front", "rear", "mast"), Reception())
+
+
+# 40 ms from capture to decode, if the vehicle's clock is 3.7 s ahead of this machine's
+FRESH = dict.fromkeys(("front", "rear", "mast"), Reception(frames=9, latency_ms=-3660.0))
 
 
 def test_a_new_station_announces_itself_and_is_answered(both):
@@ -144,14 +161,52 @@ def test_a_silent_vehicle_is_offline_until_its_next_message(both):
     assert (sample.predicted_kbps, sample.allocated_kbps) == (2000, 1500)
 
 
-def test_a_vehicle_whose_clock_is_ahead_is_warned_of_in_place_of_its_ages(both):
-    station, _, listener = both
-    station.take({name: Reception(frames=9, latency_ms=-500.4) for name in samples()})
-    warning = "delivery_robot, mode automatic, total 1500 kbit/s; its clock is ahead by at least 500 ms: "
-    assert station.headline() == f"{warning}latencies are unknown"
+def report_until(station, done):
+    """Report reception repeatedly, as an operator's side does."""
+    until(lambda: [station.report_reception({}, 0, 0), station.take(FRESH), done()][-1], every_s=0.04)
+
+
+def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
+    station, vehicle, listener = both
+    station.take(FRESH)
     assert {row.received.latency_ms for row in station.rows()} == {None}
-    assert listener.received[-1][1].clock_ahead_ms == 500.4
-    assert listener.notes[1].startswith("the vehicle's clock is ahead by at least 500 ms: picture ages are unknown; ")
+    assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies unknown: its clock is"
+    assert station.captured_here(1000.0) is None
+    vehicle.clock_ahead_s = 3.7
+    report_until(station, lambda: station.clock)
+    clock = station.clock
+    assert abs(clock.ahead_s - 3.7) <= clock.bound_s
+    sample = listener.received[-1][1]
+    for camera in sample.cameras.values():
+        assert abs(camera.latency_ms - 40) <= sample.clock_bound_ms + 1
+    assert abs(station.captured_here(1003.7) - 1000) <= clock.bound_s
+    expected = f", latencies ± {1000 * station.clock.bound_s:.1f} ms"
+    assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
+
+
+def test_a_clock_that_is_stated_twice_or_unasked_is_not_believed(both):
+    station, vehicle, _ = both
+    report_until(station, lambda: station.clock)
+    before, answer = station.clock, vehicle.answers[-1]
+    vehicle.publish("clock", {**answer, "received": answer["received"] + 9, "answered": answer["answered"] + 9})
+    vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "error_s": None})
+    dropped = station._link.dropped
+    vehicle.publish("clock", {**answer, "sent": "yesterday"})
+    until(lambda: station._link.dropped > dropped)  # the last of three, in order
+    station.take(FRESH)
+    assert abs(station.clock.ahead_s - before.ahead_s) < 1
+
+
+def test_a_vehicle_that_stops_stating_its_clock_is_reported_once(both, monkeypatch):
+    monkeypatch.setattr("runner.system.clocks.KEPT_S", 0.3)
+    station, vehicle, listener = both
+    report_until(station, lambda: station.clock)
+    vehicle.states_clock = False
+    until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(FRESH), not station.clock][-1])
+    station.take(FRESH)
+    assert listener.received[-1][1].clock_bound_ms is None
+    assert {row.received.latency_ms for row in station.rows()} == {None}
+    assert listener.notes[1:] == ["the vehicle has not stated its clock for 10 s: latencies are unknown"]
 
 
 def test_a_decision_is_one_note_however_many_cameras_it_changes(both):

@@ -12,6 +12,7 @@ export const now = () => performance.timeOrigin + performance.now();
 export class Clock {
   echoes = [];
   offset = 0;
+  bound = Infinity; // by how much the offset may be wrong, ms
 
   /** @param {number} sent when the page asked (page clock)  @param {number} server the station's clock */
   heard(sent, server) {
@@ -19,6 +20,7 @@ export class Clock {
     this.echoes.push({ delay: received - sent, offset: server - (sent + received) / 2 });
     if (this.echoes.length > KEPT) this.echoes.shift();
     const best = this.echoes.reduce((a, b) => (b.delay < a.delay ? b : a));
+    this.bound = best.delay / 2;
     this.offset = Math.min(Math.max(this.offset, best.offset - best.delay / 2), best.offset + best.delay / 2);
   }
 

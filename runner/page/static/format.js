@@ -10,6 +10,9 @@ export const factor = (value) => (Number.isFinite(value) ? String(Math.round(val
 
 export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
 
+/** A latency in ms and by how much it may be wrong: 48 ± 6 ms. */
+export const latency = (ms, bound) => (Number.isFinite(ms) && Number.isFinite(bound) ? `${whole(ms)} ± ${whole(Math.ceil(bound))} ms` : "– ms");
+
 export const region = (roi) => (roi ? `${size(roi.width, roi.height)} at ${roi.x}, ${roi.y}` : "–");
 
 export const sameRegion = (a, b) => ["x", "y", "width", "height"].every((key) => a?.[key] === b?.[key]);

@@ -6,7 +6,11 @@ import { send } from "./link.js";
 import { by, mark, whole, write } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
+const COMPARE_MS = 2000;
+const UNKNOWN = "▲ The vehicle does not state its clock: the age of its pictures is unknown; LATE is not shown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
+
+let compared = performance.now(); // when the clocks were last known to be compared, or could not be
 
 const buttons = [...by("modes").querySelectorAll("button")];
 
@@ -66,13 +70,12 @@ function refreshBanner() {
   mark(by("connection"), "data-state", words === "connected" ? "fine" : "bad");
 }
 
+/** Warn once the difference of the clocks has been unknown for a while: it takes a moment to measure. */
 function refreshWarning() {
-  const ahead = store.connected && store.state?.online ? store.sample?.clock_ahead_ms : null;
-  const known = ahead === null || ahead === undefined;
-  const by_s = known ? "" : (ahead / 1000).toFixed(1);
-  const text = `▲ The vehicle's clock is ahead by at least ${by_s} s: the age of its pictures is unknown; LATE is not shown`;
-  by("warning").hidden = known;
-  write(by("warning"), known ? "" : text);
+  const online = store.connected && store.state?.online && store.sample;
+  if (!online || Number.isFinite(store.sample?.clock_bound_ms)) compared = performance.now();
+  by("warning").hidden = performance.now() - compared < COMPARE_MS;
+  write(by("warning"), by("warning").hidden ? "" : UNKNOWN);
 }
 
 function refreshTotals() {

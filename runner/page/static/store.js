@@ -44,7 +44,7 @@ const listeners = new Map();
  * @property {number} allocated_kbps
  * @property {number} actual_kbps
  * @property {{lat: number, lon: number}|null} position
- * @property {number|null} clock_ahead_ms
+ * @property {number|null} clock_bound_ms by how much latencies may be wrong; null: they are unknown
  * @property {Record<string, CameraSample>} cameras
  * @typedef {{time: number, text: string, level: string}} Note
  */
@@ -63,7 +63,7 @@ const listeners = new Map();
  * @property {ReturnType<typeof emptySeries>} series
  * @property {Record<string, string>} status
  * @property {Record<string, string>} refused
- * @property {Record<string, {age_ms: number|null}>} ages
+ * @property {Record<string, {age_ms: number|null, bound_ms: number}>} ages
  * @property {string|null} selected
  * @property {string|null} enlarged
  */
@@ -79,7 +79,7 @@ export const store = {
   series: emptySeries([]),
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
-  ages: {}, // by camera, capture to drawing
+  ages: {}, // by camera, capture to drawing, and by how much that may be wrong
   selected: null,
   enlarged: null,
 };

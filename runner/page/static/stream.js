@@ -232,9 +232,9 @@ export class Stream {
   }
 
   age({ captured }, time) {
-    const { clock, limits, clock_ahead } = this.station;
-    const age = clock.server(time) - captured;
-    if (!clock_ahead && age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
+    const { clock, limits, bound } = this.station;
+    const age = clock.server(time) - captured + bound + clock.bound; // at most; NaN if the capture time is unknown
+    if (age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
   }
 
   note(meta, drawn) {

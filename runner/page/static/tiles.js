@@ -6,13 +6,15 @@ import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion } from "./roi.js";
 import { heightsOf, rowsOf } from "./layout.js";
 import { colourOf } from "./colours.js";
-import { by, factor, make, mark, size, spoken, whole, write } from "./format.js";
+import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
 
 export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
 const ALARMS = ["late", "frozen", "lost", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 const THIN = "\u2009"; // space
+const NO_AGE = { age_ms: undefined, bound_ms: undefined };
+const UNCERTAIN_MS = 20; // a latency that may be wrong by more is marked
 const CHROME = 66; // header and caption of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
@@ -150,7 +152,7 @@ function refreshCaption(name, { rates, form, reason }) {
   const now = decided(name);
   const silent = !store.connected || SILENT.includes(store.status[name]);
   const sample = silent ? undefined : store.sample?.cameras[name];
-  const age = silent ? undefined : (store.ages[name]?.age_ms ?? sample?.latency_ms);
+  const { age_ms, bound_ms } = silent ? NO_AGE : ageOf(name, sample);
   const differs = now ? unapplied(now) : [];
   const bitrate = differs.includes("bitrate") || differs.includes("sending");
   const region = differs.includes("size") || differs.includes("ROI");
@@ -159,8 +161,15 @@ function refreshCaption(name, { rates, form, reason }) {
   caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
-  caption(form, region, `${shape} · ${whole(age)} ms${lost}`, `received size · scaling factor · capture to drawing; ${wire}`);
+  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · capture to drawing, and by how much that may be wrong; ${wire}`);
+  mark(form, "data-uncertain", bound_ms > UNCERTAIN_MS ? "" : null);
   write(reason, now?.reason ?? "");
+}
+
+/** Capture to drawing; in a page that shows no video, capture to decoding at the station. */
+function ageOf(name, sample) {
+  const drawn = store.ages[name];
+  return Number.isFinite(drawn?.age_ms) ? drawn : { age_ms: sample?.latency_ms, bound_ms: store.sample?.clock_bound_ms };
 }
 
 /** One line of a caption; marked if a decided value was not yet read back. */

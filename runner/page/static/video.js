@@ -24,7 +24,7 @@ const station = {
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
   online: true,
-  clock_ahead: false, // the vehicle's: the ages of pictures are then unknown
+  bound: 0, // by how much capture times may be wrong on the station's clock, ms
   video: true,
   resync: (name) => send({ resync: name }),
   wake,
@@ -100,7 +100,7 @@ function heard(message) {
   if (message.kind === "clock") return station.clock.heard(message.page_ms, message.server_ms);
   if (message.kind === "hello") hello(message);
   if (message.kind === "state") decided(message);
-  if (message.kind === "sample") station.clock_ahead = message.clock_ahead_ms !== null;
+  if (message.kind === "sample") station.bound = message.clock_bound_ms ?? 0;
   tell({ kind: "server", message });
 }
 
@@ -169,7 +169,7 @@ function tellAges() {
   for (const { name, stages, status } of streams) {
     const last = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured).sort((a, b) => a - b);
     const age_ms = last.length ? last[last.length >> 1] : NaN;
-    ages[name] = { age_ms: age_ms >= 0 && !station.clock_ahead ? age_ms : null, status };
+    ages[name] = { age_ms: Number.isFinite(age_ms) ? Math.max(0, age_ms) : null, bound_ms: station.bound + station.clock.bound, status };
   }
   tell({ kind: "ages", ages });
 }

@@ -1,0 +1,75 @@
+"""Latency between two machines whose clocks differ: always known, and right to within its bound."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from rig import Operator, clock_ahead, free_port, needs_compiler, process, run, until
+from runner.drive.read import read_drive
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import topic
+from runner.records import Sample
+
+AHEAD_MS, ONE_WAY_MS = 3700, 80
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=3000")
+SLOW = ("link=relay", "link.share=3", "link.delay_ms=80", "link.reverse=null")  # from the vehicle; none back
+
+
+@needs_compiler
+@pytest.mark.parametrize(("verb", "sign"), [("vehicle", 1), ("operator", -1)])
+def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, verb, sign):
+    """One side's clock is set 3.7 s ahead; both are the same clock, so that the true difference is known."""
+    env = clock_ahead(tmp_path, AHEAD_MS / 1000, verb)
+    path, report = tmp_path / "drive", tmp_path / "report"
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    done = run("demo", *ROBOT, *SLOW, *ports, f"log={path}", "duration_s=10", env=env)
+    assert done.returncode == 0, done.stdout + done.stderr
+    drive = read_drive(path)
+    samples = [sample for sample in drive.sides["operator"].of(Sample) if sample.t > 2]
+    assert len(samples) > 15
+    known = [sample for sample in samples if sample.clock_bound_ms is not None]
+    assert len(known) >= 0.99 * len(samples)
+    for camera in ("front", "rear", "mast"):
+        shown = [sample.cameras[camera].latency_ms is not None for sample in samples]
+        assert sum(shown) >= 0.99 * len(shown)
+    # What a latency shows too much is what the difference of the clocks is wrong by.
+    wrong = [abs(sample.clock_ahead_ms - sign * AHEAD_MS) for sample in known]
+    assert sum(w <= sample.clock_bound_ms for w, sample in zip(wrong, known, strict=True)) >= 0.99 * len(known)
+    assert max(wrong) > ONE_WAY_MS / 4  # of a delay in one direction, half is shown as difference of the clocks
+    assert min(sample.clock_bound_ms for sample in known) < ONE_WAY_MS
+    assert drive.sides["vehicle"].began.time - drive.sides["operator"].began.time == pytest.approx(sign * 3.7, abs=3)
+    aligned = drive.sides["vehicle"].began_s - drive.sides["operator"].began_s
+    assert abs(aligned) < 3  # one of the two starts some time after the other
+    assert run("report", str(path), f"output={report}").returncode == 0
+    (found,) = json.loads((report / "report.json").read_text())["drives"]
+    assert ONE_WAY_MS / 4 < found["latency_arrival_ms"]["bound"] < 2 * ONE_WAY_MS
+    assert found["latency_arrival_ms"]["median"] > 0
+
+
+def test_a_flood_of_reports_is_not_answered_with_a_flood(broker):
+    """Answers would fill the uplink."""
+    words = (*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}")
+    with process("vehicle", *words):
+        operator = Operator(broker)
+        operator.state(lambda state: state["online"])
+        operator.ask("1", event="operator_connected")
+        answers = []
+        link = ControlLink(
+            broker, ("tod/test", {}), {topic("delivery_robot", "clock", "+"): answers.append}, lambda here: None, print
+        )
+        link.connect()
+        assert link.wait_connected(15)
+        report = {"at": 1.0, "as_of": operator.as_of(), "units": [], "packets": 0, "lost": 0}
+        began = time.monotonic()
+        for sender in (operator.name, "stranger"):
+            for number in range(300):
+                operator.link.publish(topic("delivery_robot", "reception", sender), report | {"sent": number})
+        until(lambda: answers)
+        operator.ask("2", event="operator_connected")
+        took = time.monotonic() - began
+        link.close(("tod/test", {}))
+    assert len(answers) <= 1 + took / 0.1
+    assert {answer.topic for answer in answers} == {topic("delivery_robot", "clock", operator.name)}
