@@ -430,7 +430,7 @@ def test_a_viewer_that_answers_no_ping_is_dropped(demo):
         with suppress(ConnectionResetError):
             while viewer.recv(65_536):  # reads, and sends nothing
                 pass
-        assert 1 < time.monotonic() - began < 6
+        assert 1 < time.monotonic() - began < 20
 
 
 def test_a_viewer_that_reads_slowly_and_answers_stays(demo):
