@@ -203,6 +203,7 @@ class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
     lost        RTP packets that never arrived
+    damaged     frames whose picture shows that packets were lost, until it is healed
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
@@ -224,6 +225,7 @@ class CameraSample:
     foreign: int = 0
     frames: int = 0
     bytes: int = 0
+    damaged: int = 0
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 

@@ -18,6 +18,7 @@ class Counters:
     latency_ms: float | None = 12.0
     lost: int = 0
     foreign: int = 0
+    damaged: int = 0
     rebuilt: int = 0
 
 

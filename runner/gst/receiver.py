@@ -16,6 +16,7 @@ from runner.gst.supervised import SupervisedPipeline
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
+from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records import Arrival
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
@@ -33,6 +34,7 @@ class Reception:
     frames      access units received
     bytes       their payload
     decoded     frames that reached the sink
+    damaged     frames whose picture shows that packets were lost, see `runner.h264.damage`
     lost        RTP packets that never arrived
     foreign     RTP and RTCP packets from hosts other than the vehicle, dropped
     width, height  px of the decoded picture, 0 before the first
@@ -46,6 +48,7 @@ class Reception:
     frames: int = 0
     bytes: int = 0
     decoded: int = 0
+    damaged: int = 0
     lost: int = 0
     foreign: int = 0
     width: int = 0
@@ -96,6 +99,7 @@ class Receiver:
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
+        self._damage, self._damaged = Damage(self._codec), 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
@@ -156,6 +160,7 @@ class Receiver:
         self._sink = pipeline.get_by_name(self._sink_name)
         self._received = pipeline.get_by_name("received")
         self._begun = False
+        self._damage = Damage(self._codec)
         self._jitter_buffers = []
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
@@ -210,6 +215,7 @@ class Receiver:
         return Reception(
             frames=before.frames + frames,
             bytes=before.bytes + size,
+            damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
             lost=before.lost + sum(b.get_property("stats").get_value("num-lost") for b in self._jitter_buffers),
@@ -234,21 +240,21 @@ class Receiver:
             self._unread.append(Arrival(monotonic, sampled, buffer.get_size()))
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
+        # The depayloader marks the very first unit, and each unit with missing packets.
+        incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
+        damaged = self._damage.add(incomplete, lambda: bytes(buffer.extract_dup(0, HEAD_BYTES)))
+        self._damaged += damaged
         if self._on_unit:
-            self._pass_on(buffer, captured, arrived, self._on_unit)
+            data = buffer.extract_dup(0, buffer.get_size())
+            unit = read_unit(data, captured, arrived, damaged=incomplete, codec=self._codec)
+            if unit:
+                self._on_unit(self._name, unit._replace(damaged=damaged))
         return Gst.PadProbeReturn.OK
 
     def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         """Note the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
         self._media_clock.tick(int.from_bytes(info.get_buffer().extract_dup(4, 4), "big"))
         return Gst.PadProbeReturn.OK
-
-    def _pass_on(self, buffer: Gst.Buffer, captured: float | None, arrived: float, on_unit: OnUnit) -> None:
-        data = buffer.extract_dup(0, buffer.get_size())
-        # The depayloader marks the very first unit, and each unit with missing packets.
-        damaged, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
-        if unit := read_unit(data, captured, arrived, damaged=damaged, codec=self._codec):
-            on_unit(self._name, unit)
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
         """Arrivals since the last call, only of frames already counted; more may come meanwhile."""

@@ -12,6 +12,7 @@ SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
 PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, wherever the first one began
+CODECS = ("h264", "h265")
 LATE = 4  # factor by which a wave may take longer than stated
 LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh period is unknown
 
@@ -24,6 +25,7 @@ class AccessUnit(NamedTuple):
     key       whether a decoder can start with it (IDR; of H.265 any IRAP picture)
     recovery  frames after which a decoder that starts here is exact, if a refresh wave begins here; otherwise None
     exact     False: the decoded picture still shows content that was never sent
+    damaged   the decoded picture still shows that earlier packets were lost
     """
 
     data: bytes
@@ -32,6 +34,7 @@ class AccessUnit(NamedTuple):
     key: bool
     recovery: int | None = None
     exact: bool = True
+    damaged: bool = False
 
 
 def read_unit(
@@ -59,6 +62,12 @@ def read_unit(
         if kind == SEI:
             recovery = _recovery(data[at : at + 16]) if recovery is None else recovery
     return None
+
+
+def starts(data: bytes, codec: str) -> tuple[bool, int | None]:
+    """Whether a decoder can start with an access unit; and recovery_frame_cnt, where a refresh wave begins."""
+    unit = read_unit(data, None, 0.0, codec=codec)
+    return (unit.key, unit.recovery) if unit else (False, None)
 
 
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:

@@ -385,4 +385,5 @@ def _camera_sample(row: CameraRow) -> CameraSample:
         foreign=received.foreign,
         frames=received.frames,
         bytes=received.bytes,
+        damaged=received.damaged,
     )

@@ -15,6 +15,7 @@ from runner.h264.access_unit import AccessUnit
 
 HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
 KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but do not draw; reset the decoder first
+DAMAGED = 8  # flag: the picture shows that packets were lost
 WAITING_UNITS = 30  # of one camera; a viewer that is further behind restarts from the last IDR
 WAITING_TEXTS = 500
 
@@ -89,7 +90,7 @@ class PageViewer:
 
     def _packed(self, camera: int, flags: int, unit: AccessUnit) -> bytes:
         self._sequence = (self._sequence + 1) % 2**32
-        flags |= (KEY if unit.key else 0) | (0 if unit.exact else CATCH_UP)
+        flags |= (KEY if unit.key else 0) | (0 if unit.exact else CATCH_UP) | (DAMAGED if unit.damaged else 0)
         captured = math.nan if unit.captured is None else unit.captured * 1000
         return HEADER.pack(camera, flags, 0, self._sequence, captured, unit.arrived * 1000) + unit.data
 

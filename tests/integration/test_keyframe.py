@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from runner.h264.access_unit import Recent, read_unit
+from runner.h264.damage import Damage
 from runner.h264.keyframe import grey_idr
 
 pytestmark = pytest.mark.gst
@@ -72,3 +73,20 @@ def test_data_without_a_parameter_set_makes_no_picture():
     assert grey_idr(b"\0\0\0\1\x67") is None
     _, high444 = encoded(64, 48), encoded(64, 48, "-pix_fmt", "yuv444p")
     assert grey_idr(high444[0]) is None
+
+
+@pytest.mark.parametrize("lost", [[13], [3, 17], [10, 11, 12]])
+def test_a_picture_that_is_not_marked_as_damaged_is_exact(lost):
+    """However a decoder conceals what is missing."""
+    units = encoded(480, 260)
+    whole, _ = decoded(units, 480, 260)
+    came = [number for number in range(len(units)) if number not in lost]
+    pictures, _ = decoded([units[number] for number in came], 480, 260)
+    damage = Damage("h264")
+    marked = {number: damage.add(number - 1 in lost, lambda n=number: units[n]) for number in came}
+    after = [number for number in came if number > lost[-1]]
+    exact = {n: bool((pictures[n - len(units)] == whole[n]).all()) for n in after}  # counted from the end
+    assert not any(not exact[number] and not marked[number] for number in after)
+    assert not exact[after[0]]
+    assert not marked[after[-1]]
+    assert sum(marked[number] for number in after) <= 20  # two waves

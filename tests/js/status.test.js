@@ -8,7 +8,7 @@ import { judge, words } from "../../runner/page/static/status.js";
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
 const LIVE = {
-  connected: true, online: true, on: true, sending: true, refused: "", drawn: true,
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, damaged: false,
   arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
@@ -33,6 +33,9 @@ const CASES = [
   ["late", { late_until: NOW + 1 }],
   ["live", { late_until: NOW }],
   ["frozen", { late_until: NOW + 1, arrived: NOW - 500 }],
+  ["damaged", { damaged: true }],
+  ["damaged", { damaged: true, late_until: NOW + 1 }],
+  ["frozen", { damaged: true, arrived: NOW - 500 }],
 ];
 for (const [status, more] of CASES) test(`${status}: ${JSON.stringify(more)}`, () => assert.equal(judged(more), status));
 

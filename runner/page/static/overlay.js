@@ -1,6 +1,6 @@
 /**
  * Alarms, drawn by the worker into the picture itself: they appear even when the page's main thread is busy.
- * Colour, word and shape agree: LOST a cross, FROZEN a hatch, LATE a dashed frame.
+ * Colour, word and shape agree: LOST a cross, FROZEN a hatch, DAMAGED and LATE a dashed frame: the picture below it moves.
  */
 
 const RED = "#e01b24";
@@ -10,7 +10,7 @@ const AMBER = "#ffb000";
 export function drawOverlay(context, status, text) {
   const { width, height } = context.canvas;
   const side = Math.min(width, height);
-  if (status === "late") return drawLate(context, width, height, side, text);
+  if (status === "late" || status === "damaged") return drawWarning(context, width, height, side, text);
   if (status === "frozen" || status === "lost") return drawAlarm(context, width, height, side, status, text);
   dim(context, width, height, 0.72);
   plate(context, width / 2, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
@@ -24,7 +24,7 @@ function drawAlarm(context, width, height, side, status, text) {
   plate(context, width / 2, height / 2, side * 0.17, text, RED, "#fff");
 }
 
-function drawLate(context, width, height, side, text) {
+function drawWarning(context, width, height, side, text) {
   frame(context, width, height, side * 0.06, AMBER, [side * 0.16, side * 0.08]);
   plate(context, width / 2, height - side * 0.15, side * 0.13, text, AMBER, "#000");
 }

@@ -11,6 +11,7 @@ const INTERVALS = 1.3; // this many frame intervals without a picture are more t
  * @property {boolean|null} sending
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
+ * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream
  * @property {number} decoded likewise
  * @property {number} late_until page time
@@ -19,7 +20,7 @@ const INTERVALS = 1.3; // this many frame intervals without a picture are more t
  * @param {Times} s
  * @param {{frozen_ms: number}} limits
  * @param {number} now page time
- * @returns {"off"|"paused"|"lost"|"unsupported"|"frozen"|"late"|"synchronising"|"live"}
+ * @returns {"off"|"paused"|"lost"|"unsupported"|"frozen"|"damaged"|"late"|"synchronising"|"live"}
  */
 export function judge(s, limits, now) {
   const reachable = s.connected && s.online;
@@ -30,6 +31,7 @@ export function judge(s, limits, now) {
   if (!s.drawn) return "synchronising";
   const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
   if (now - Math.min(s.arrived, s.decoded) > limit) return "frozen";
+  if (s.damaged) return "damaged";
   return now < s.late_until ? "late" : "live";
 }
 

@@ -9,6 +9,7 @@ import { drawOverlay } from "./overlay.js";
 export const KEY = 1;
 export const CATCH_UP = 2;
 export const RESTART = 4;
+export const DAMAGED = 8;
 
 const QUEUE = 40; // units waiting in the decoder: beyond this, restarting from a burst is faster
 const LAG_MS = 2000; // delay beyond the usual one: as long as the burst that would come instead
@@ -25,6 +26,7 @@ export class Stream {
   arrived = now(); // page times of the newest unit and of the newest picture, or of the start of the stream
   decoded = this.arrived;
   drawn = false;
+  damaged = false; // the picture drawn shows that packets were lost
   late_until = 0;
 
   /**
@@ -69,7 +71,7 @@ export class Stream {
   /** The stream starts or restarts: silence counts from now. */
   started() {
     this.arrived = this.decoded = now();
-    this.drawn = false;
+    this.drawn = this.damaged = false;
     this.late_until = 0;
   }
 
@@ -224,6 +226,7 @@ export class Stream {
     this.shown = this.waiting;
     this.waiting = null;
     this.drawn = true;
+    this.damaged = Boolean(this.shown.meta.flags & DAMAGED);
     this.age(this.shown.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
     this.paint(now());
@@ -247,8 +250,8 @@ export class Stream {
 
   times() {
     const { connected, online } = this.station;
-    const { on, sending, refused, drawn, arrived, decoded, late_until } = this;
-    return { connected, online, on, sending, refused, drawn, arrived, decoded, late_until, fps: this.camera.fps };
+    const { on, sending, refused, drawn, damaged, arrived, decoded, late_until } = this;
+    return { connected, online, on, sending, refused, drawn, damaged, arrived, decoded, late_until, fps: this.camera.fps };
   }
 
   /** Judge the status; returns whether it has changed. Called by a timer. */

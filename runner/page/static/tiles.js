@@ -8,9 +8,9 @@ import { heightsOf, rowsOf } from "./layout.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
 
-export const SHAPES = { live: "●", late: "▲", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
+export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
-const ALARMS = ["late", "frozen", "lost", "unsupported"];
+const ALARMS = ["late", "damaged", "frozen", "lost", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
@@ -162,7 +162,7 @@ function refreshCaption(name, { rates, form, reason }) {
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · capture to drawing, and by how much that may be wrong; ${wire}`);
-  mark(form, "data-uncertain", bound_ms > UNCERTAIN_MS ? "" : null);
+  mark(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
   write(reason, now?.reason ?? "");
 }
 

@@ -1,0 +1,44 @@
+"""How long the loss of packets shows in the decoded pictures of a stream. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from runner.h264.access_unit import CODECS, starts
+
+HEAD_BYTES = 2048  # of an access unit: parameter sets, SEI and the header of its first slice
+
+
+class Damage:
+    """Follows the access units of a stream: those that depend on lost packets are damaged until the picture is healed.
+
+    A picture is healed by an IDR picture (of H.265: IRAP), or after a whole refresh wave: `recovery_frame_cnt` frames
+    after a recovery point (ITU-T H.264, D.2.8). A loss within the wave damages what the wave has already painted.
+    Of other codecs it is unknown what heals; only incomplete units count as damaged.
+    """
+
+    def __init__(self, codec: str) -> None:
+        self._codec = codec
+        self._damaged = False
+        self._left: int | None = None  # frames of the wave that heals; None: none has begun since the loss
+
+    def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:
+        """Whether the picture of the next access unit is damaged.
+
+        incomplete  packets of it, or between it and the one before, were lost
+        head        returns its first HEAD_BYTES; called only while the picture is damaged
+        """
+        if incomplete:
+            self._damaged, self._left = self._codec in CODECS, None
+            return True
+        if self._damaged and self._heals(head()):
+            self._damaged, self._left = False, None
+        return self._damaged
+
+    def _heals(self, head: bytes) -> bool:
+        key, recovery = starts(head, self._codec)
+        if self._left is not None:
+            self._left -= 1
+        elif recovery is not None:
+            self._left = recovery
+        return key or self._left == 0
