@@ -60,6 +60,7 @@ __all__ = [
 ]
 
 CALL_S = 10.0  # a call into GLib's thread takes milliseconds; after this long it hangs
+TAILS_MS = 10  # how often receivers look for frames that do not end
 STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
@@ -302,6 +303,7 @@ class OperatorSide:
         def start() -> None:
             for receiver in self._receivers.values():
                 receiver.start()
+            self._tails = GLib.timeout_add(TAILS_MS, self._request_tails)
 
         self._glib.call("starting the receivers", start)
 
@@ -321,6 +323,11 @@ class OperatorSide:
         self._glib.call("reading the receivers' counters", sample)
         return samples
 
+    def _request_tails(self) -> bool:
+        for receiver in self._receivers.values():
+            receiver.request_tails()
+        return True
+
     def take_arrivals(self) -> dict[str, list[Arrival]]:
         """By camera, the access units that have arrived since the last call; to be called from one thread."""
         return {name: receiver.take_arrivals() for name, receiver in self._receivers.items()}
@@ -332,6 +339,7 @@ class OperatorSide:
 
     def stop(self) -> None:
         def stop() -> None:
+            GLib.source_remove(self._tails)
             for receiver in self._receivers.values():
                 receiver.stop()
 

@@ -204,6 +204,7 @@ class CameraSample:
 
     lost        RTP packets that never arrived
     damaged     frames whose picture shows that packets were lost, until it is healed
+    buffer_ms   how long a picture waits for packets that are sent again; None: they are not
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
@@ -226,6 +227,7 @@ class CameraSample:
     frames: int = 0
     bytes: int = 0
     damaged: int = 0
+    buffer_ms: int | None = None
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 

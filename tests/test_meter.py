@@ -19,6 +19,7 @@ class Counters:
     lost: int = 0
     foreign: int = 0
     damaged: int = 0
+    buffer_ms: int | None = None
     rebuilt: int = 0
 
 

@@ -11,6 +11,7 @@ from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.pipeline import counted
+from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
 from runner.gst.video_files import VideoFile, VideoFiles
@@ -40,6 +41,7 @@ class Reception:
     width, height  px of the decoded picture, 0 before the first
     latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
                 first, and where it is older than CURRENT_S
+    buffer_ms   how long a picture waits for packets that are sent again; None: they are not, or the transport does it
     rebuilt     how often a pipeline that had received frames was rebuilt
     arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
                 by this machine's and by the vehicle's clock
@@ -54,6 +56,7 @@ class Reception:
     width: int = 0
     height: int = 0
     latency_ms: float | None = None
+    buffer_ms: int | None = None
     rebuilt: int = 0
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
@@ -95,7 +98,11 @@ class Receiver:
         # Without RTSP no element reads the capture time of a frame.
         self._untimed = "" if plan.serves else next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
         self._media_clock = MediaClock(1 / RTP_HZ)
-        self._jitter_buffers: list[Gst.Element] = []
+        settings = plan.camera.graph.settings
+        self._reorder_ms = int(settings.get("jitter_buffer_ms", 0))
+        self._repairs = bool(settings.get("retransmission_ms"))
+        self._buffers: list[RepairBuffer] = []
+        self._over_udp = False
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
@@ -120,8 +127,9 @@ class Receiver:
 
     def sample(self) -> Reception:
         """What was received so far; requests the latency of the next frame."""
+        waits = [buffer.adapt() for buffer in self._buffers if self._repairs and self._over_udp]
         received = self._count()
-        received = replace(received, arrivals=self._arrived(received.frames))
+        received = replace(received, buffer_ms=max(waits, default=None), arrivals=self._arrived(received.frames))
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
             self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
@@ -146,10 +154,16 @@ class Receiver:
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
         before = self._packets
-        stats = [buffer.get_property("stats") for buffer in self._jitter_buffers]
+        stats = [buffer.stats for buffer in self._buffers]
         lost = sum(s.get_value("num-lost") + s.get_value("rtx-success-count") for s in stats)
         now = self._packets = (sum(s.get_value("num-pushed") for s in stats), lost)
         return (max(0, now[0] - before[0]), max(0, now[1] - before[1]))  # a new pipeline counts from 0
+
+    def request_tails(self) -> None:
+        """Request packets whose loss no later packet shows; to be called a hundred times a second."""
+        if self._over_udp and self._repairs:
+            for buffer in self._buffers:
+                buffer.request_tail()
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
@@ -161,7 +175,7 @@ class Receiver:
         self._received = pipeline.get_by_name("received")
         self._begun = False
         self._damage = Damage(self._codec)
-        self._jitter_buffers = []
+        self._buffers, self._over_udp = [], False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
         if GObject.signal_lookup("select-stream", self._client):
@@ -182,10 +196,10 @@ class Receiver:
         self._moved = (self._moved[0], time.monotonic())
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
-        if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
-            # Frames come in bursts: the packet expected next belongs to the next frame and is not missing.
-            element.set_property("rtx-next-seqnum", False)
-            self._jitter_buffers.append(element)
+        factory = element.get_factory().get_name() if element.get_factory() else ""
+        if factory == "rtpjitterbuffer":
+            self._buffers.append(RepairBuffer(element, self._reorder_ms))
+        self._over_udp |= factory == "udpsrc"
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
 
@@ -218,7 +232,7 @@ class Receiver:
             damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
-            lost=before.lost + sum(b.get_property("stats").get_value("num-lost") for b in self._jitter_buffers),
+            lost=before.lost + sum(buffer.stats.get_value("num-lost") for buffer in self._buffers),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
             latency_ms=self._latency[0] if self._latency and now - self._latency[1] <= CURRENT_S else None,

@@ -478,8 +478,8 @@ def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element) -> Non
         element.set_property("max-size-time", 0)
         element.set_property("max-size-bytes", QUEUE_BYTES)
     if element.find_property("processing-deadline"):
-        # Sinks of a live pipeline delay packets by 20 ms: here pure latency.
-        element.set_property("processing-deadline", 0)
+        # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
+        element.set_property("sync", False)
     if element.find_property("rtcp-sync-send-time"):
         # Packets state when their frame was captured, not when they leave.
         element.set_property("rtcp-sync-send-time", False)

@@ -386,4 +386,5 @@ def _camera_sample(row: CameraRow) -> CameraSample:
         frames=received.frames,
         bytes=received.bytes,
         damaged=received.damaged,
+        buffer_ms=received.buffer_ms,
     )

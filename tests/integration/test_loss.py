@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import subprocess
 import time
+from statistics import median
 
 import pytest
 
@@ -75,7 +76,7 @@ def test_lost_packets_are_sent_again(monkeypatch):
             return Gst.PadProbeReturn.DROP
 
     monkeypatch.setattr("runner.apply.Receiver", Lossy)
-    with streaming("graph.retransmission_ms=200", "fps_max=15") as (side, _, plans, _):
+    with streaming("fps_max=15") as (side, _, plans, _):
         knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
         side.turn([Command("front_left", *knob) for knob in knobs.items()])
         operator = OperatorSide(plans, lambda *_: None)
@@ -88,3 +89,46 @@ def test_lost_packets_are_sent_again(monkeypatch):
     retransmitted = sum(buffer.get_property("stats").get_value("rtx-success-count") for buffer in buffers)
     assert retransmitted > len(dropped) / 2
     assert lost < len(dropped) / 2
+
+
+@pytest.mark.parametrize("by_time", [True, False])
+def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeypatch, by_time):
+    from runner.apply import OperatorSide
+    from runner.gst import Gst, repair
+
+    dropped = []
+
+    class Lossy(receiver.Receiver):
+        def _on_element(self, pipeline, parent, element):
+            super()._on_element(pipeline, parent, element)
+            if element.get_factory() and element.get_factory().get_name() == "udpsrc":
+                element.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._lose)
+
+        def _lose(self, _pad, info):
+            buffer = info.get_buffer()
+            kind = buffer.extract_dup(1, 1)[0]
+            if kind != repair.MARKER | 96 or len(dropped) > 25:
+                return Gst.PadProbeReturn.OK
+            dropped.append(kind)
+            return Gst.PadProbeReturn.DROP
+
+    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+    if not by_time:  # as if only later packets showed what is missing
+        monkeypatch.setattr(repair.RepairBuffer, "request_tail", lambda self: None)
+    with streaming("fps_max=3") as (side, _, plans, _):
+        knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
+        side.turn([Command("front_left", *knob) for knob in knobs.items()])
+        operator = OperatorSide(plans, lambda *_: None, arrivals=True)
+        arrivals = []
+        try:
+            until(
+                lambda: (
+                    arrivals.extend(operator.sample({"front_left": True})["front_left"].arrivals) or len(dropped) > 15
+                )
+            )
+            received = operator.sample({"front_left": True})["front_left"]
+        finally:
+            operator.stop()
+    assert received.buffer_ms
+    assert len(arrivals) > 5
+    assert (median(arrived - captured for arrived, captured in arrivals) < 1 / 3 / 2) is by_time

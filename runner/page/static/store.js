@@ -37,7 +37,7 @@ const listeners = new Map();
  * @property {Applied} applied
  * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>}} State
  * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
- *   latency_ms: number|null, lost: number, rebuilt: number}} CameraSample
+ *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null}} CameraSample
  * @typedef {object} Sample
  * @property {number} time s since 1970
  * @property {number|null} predicted_kbps

@@ -157,11 +157,12 @@ function refreshCaption(name, { rates, form, reason }) {
   const bitrate = differs.includes("bitrate") || differs.includes("sending");
   const region = differs.includes("size") || differs.includes("ROI");
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
+  const repair = sample?.buffer_ms ? `; a picture waits up to ${sample.buffer_ms} ms for packets that are sent again` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
   caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
-  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · capture to drawing, and by how much that may be wrong; ${wire}`);
+  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · capture to drawing, and by how much that may be wrong; ${wire}${repair}`);
   mark(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
   write(reason, now?.reason ?? "");
 }

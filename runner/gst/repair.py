@@ -1,0 +1,75 @@
+"""Repair of lost packets at the operator: requested soon, and waited for as long as a round trip takes."""
+
+from __future__ import annotations
+
+import time
+
+from gi.repository import GObject, Gst
+
+REORDER_MS = 5  # a packet that is missing for longer was lost, not overtaken
+TAIL_S = 0.01  # likewise for the last packets of a frame, of which no later packet tells
+GAPS = 2  # and this many times the longest recent gap between packets of a frame: a slow link spreads them
+FORGET = 0.99  # what is left of that gap at each packet
+ATTEMPTS = 3  # of retransmission that the buffer waits for
+UNKNOWN_MS = 100  # taken for the round trip until the first packet was sent again
+LONGEST_MS = 300  # a picture that is later is of no use for driving
+RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
+MARKER, HALF = 0x80, 0x8000  # of the RTP header (RFC 3550, section 5.1); half of all sequence numbers
+
+
+class RepairBuffer:
+    """An rtpjitterbuffer whose missing packets are sent again (RFC 4585, 4588).
+
+    The buffer itself notices a loss when the next packet comes. After the last packet of a frame that is the next
+    frame's, up to 66 ms later; so a frame that does not end is noticed here by time.
+
+    reorder_ms  how long it waits at least
+    """
+
+    def __init__(self, buffer: Gst.Element, reorder_ms: int) -> None:
+        self._buffer, self._reorder_ms = buffer, reorder_ms
+        # Frames come in bursts: the packet expected next belongs to the next frame and is not missing.
+        buffer.set_property("rtx-next-seqnum", False)
+        buffer.set_property("rtx-delay", REORDER_MS)
+        self._pad = buffer.get_static_pad("sink")
+        self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
+        self._newest = -1  # sequence number
+        self._stamp = b""  # of its frame
+        self._at = 0.0
+        self._open = self._asked = False  # the frame has not ended; its next packet was requested
+        self._gap = 0.0
+
+    @property
+    def stats(self) -> Gst.Structure:
+        """The statistics of the element."""
+        return self._buffer.get_property("stats")
+
+    def adapt(self) -> int:
+        """Wait for missing packets as long as their retransmission takes; returns that, ms."""
+        round_trip_ms = self.stats.get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
+        wait_ms = min(LONGEST_MS, self._reorder_ms + round(ATTEMPTS * round_trip_ms))
+        if self._buffer.get_property("latency") != wait_ms:
+            self._buffer.set_property("latency", wait_ms)
+        return wait_ms
+
+    def request_tail(self) -> None:
+        """Request the next packet of a frame that should have ended by now; to be called a hundred times a second."""
+        if self._open and not self._asked and time.monotonic() - self._at > max(TAIL_S, GAPS * self._gap):
+            self._asked = True
+            request = Gst.Structure.new_empty("GstRTPRetransmissionRequest")
+            request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, (self._newest + 1) % (2 * HALF)))
+            self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
+
+    def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        packet, now = info.get_buffer(), time.monotonic()
+        header = packet.extract_dup(1, 7)
+        number, stamp = int.from_bytes(header[1:3], "big"), header[3:]
+        if self._newest >= 0 and (number - self._newest - 1) % (2 * HALF) >= HALF:
+            return Gst.PadProbeReturn.OK  # an older one: overtaken, or sent again
+        if self._asked:
+            packet.unset_flags(RETRANSMITTED)  # the buffer drops those that it has not requested itself
+        elif stamp == self._stamp:
+            self._gap = max(now - self._at, FORGET * self._gap)
+        self._newest, self._stamp, self._at = number, stamp, now
+        self._open, self._asked = not header[0] & MARKER, False
+        return Gst.PadProbeReturn.OK
