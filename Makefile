@@ -3,6 +3,7 @@
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
 # make soak   long repeats of what a drive must survive, 45 minutes; SOAK=0.1 make soak is a tenth of it
+# make deadspot  two drives over a recorded uplink: the picture of the README
 # make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +11,7 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
-.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench soak clean
+.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -60,6 +61,11 @@ bench: $(TEST_READY)
 	$(BIN)/python bench/replay.py
 	$(BIN)/python bench/validate.py
 	$(BIN)/python bench/pqos_map.py
+
+# A drive over a recorded uplink, twice, as the operator's page showed it: make deadspot UPLINK=uplink.csv
+UPLINK ?= ../shared/data/traces/tidy/orange-4G-traces-A-up_uplink_1s.csv
+deadspot: $(TEST_READY)
+	$(BIN)/python bench/deadspot.py $(UPLINK) docs/images/deadspot.png
 
 soak: $(TEST_READY)
 	$(if $(PARTS),,$(BIN)/pytest -m soak)

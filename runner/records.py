@@ -203,7 +203,7 @@ class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
     lost        RTP packets that never arrived
-    damaged     frames whose picture shows that packets were lost, until it is healed
+    damaged     frames whose picture shows that packets were lost, until it is healed; None in older logs
     buffer_ms   how long a picture waits for packets that are sent again; None: they are not
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
@@ -226,7 +226,7 @@ class CameraSample:
     foreign: int = 0
     frames: int = 0
     bytes: int = 0
-    damaged: int = 0
+    damaged: int | None = None
     buffer_ms: int | None = None
     arrivals: tuple[tuple[float, float | None], ...] = ()
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from simulated_link import Link, drive, stalls, steps, utilisation
+from soak import reports
 
 from runner.core.events import LinkMeasured
 from runner.core.link_cap import LEAST, LinkCap, advanced
@@ -111,3 +112,8 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
         t += 0.1
         cap = advanced(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
     assert cap.kbps is None or cap.kbps >= 5000
+
+
+def test_no_sequence_of_reports_breaks_the_cap() -> None:
+    """`make soak` runs 200 000."""
+    assert [wrong for seed in range(1000) if (wrong := reports.sequence(seed))] == []

@@ -75,6 +75,7 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, An
         "freezes": drive.freezes,
         "frozen_s": number(drive.frozen_s, 3),
         "lost": drive.lost,
+        "damaged_share": number(drive.damaged),
         "rebuilt": drive.rebuilt,
         "refused": series.refused,
         "link": _link(series.link) if series.link else None,
@@ -131,6 +132,7 @@ def _camera(camera: CameraStatistics) -> dict[str, Any]:
             "each": [{"t": number(f.t, 3), "seconds": number(f.seconds, 3)} for f in freezes],
         },
         "lost": camera.lost,
+        "damaged_share": number(camera.damaged),
         "rebuilt": camera.rebuilt,
         "quality": quality
         and {

@@ -79,6 +79,7 @@ class ReceivedSeries:
     bound_ms                 by how much latencies may be wrong, nan if unknown; older logs did not measure it
     frames, bytes            counters at each sample
     lost, rebuilt            packets, counters at each sample
+    damaged                  counter of frames whose picture shows a loss, nan in older logs
     arrival_t, arrival_ms    arrival of each access unit, s, and its latency from capture to arrival, likewise
     clocks_ms                as logged: in older logs arrival by the operator's clock minus capture by the vehicle's
     """
@@ -93,6 +94,7 @@ class ReceivedSeries:
     bytes: FloatSeries
     lost: FloatSeries
     rebuilt: FloatSeries
+    damaged: FloatSeries
     arrival_t: FloatSeries
     arrival_ms: FloatSeries
     clocks_ms: FloatSeries
@@ -431,7 +433,7 @@ def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> Receive
         latency_ms=np.where(moved, column("latency_ms"), np.nan),
         bound_ms=np.array([line.clock_bound_ms for _, line, _ in received], dtype=float),
         frames=frames,
-        **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt")},
+        **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt", "damaged")},
         arrival_t=arrivals[:, 0],
         arrival_ms=arrivals[:, 1],
         clocks_ms=arrivals[:, 1],

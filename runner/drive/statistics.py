@@ -116,6 +116,7 @@ class CameraStatistics:
     freezes           None if arrivals were not logged
     frozen            share of `sending_s` in which the picture was frozen; nan if arrivals were not logged
     lost, rebuilt     packets, pipelines; None if no operator logged
+    damaged           share of the frames whose picture shows a loss; nan if unknown
     quality           None without a rate-quality model
     """
 
@@ -134,6 +135,7 @@ class CameraStatistics:
     frozen: float
     lost: int | None
     rebuilt: int | None
+    damaged: float
     quality: Estimate | None
 
 
@@ -154,6 +156,7 @@ class DriveStatistics:
     frozen_s: float | None
     lost: int | None
     rebuilt: int | None
+    damaged: float
     frozen: float
     metric: str
     quality: float
@@ -192,6 +195,7 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Driv
         frozen=ratio(sum(freeze.seconds for freeze in frozen), sum(c.sending_s for c in each if c.freezes is not None)),
         lost=_sum(camera.lost for camera in each),
         rebuilt=_sum(camera.rebuilt for camera in each),
+        damaged=ratio(sum(float(got.damaged[-1]) for got in received), sum(float(got.frames[-1]) for got in received)),
         metric=next(iter(metrics)) if len(metrics) == 1 else "",
         quality=mean(np.array([e.mean for e in estimates])) if len(metrics) == 1 else NAN,
         moving=mean(np.array([e.moving for e in estimates])) if len(metrics) == 1 else NAN,
@@ -224,6 +228,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         frozen=NAN if frozen_spans is None else ratio(sum(freeze.seconds for freeze in frozen_spans), sending_s),
         lost=int(received.lost[-1]) if received else None,
         rebuilt=int(received.rebuilt[-1]) if received else None,
+        damaged=ratio(float(received.damaged[-1]), float(received.frames[-1])) if received else NAN,
         quality=estimate(camera, model, frozen_spans or ()) if model else None,
     )
 

@@ -12,9 +12,10 @@ VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
 MEANING = (
     "Arrival and decode: latency since capture; ±: by how much it may be wrong, since two clocks measure it."
-    " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them:"
-    " gaps of 3 times the mean of the last 30, or of the mean and 150 ms, whichever is longer. Quality is estimated"
-    " from the bitrate: a frozen picture counts as what it was before, so look at the share of the time beside it."
+    " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
+    " or of the mean and 150 ms, whichever is longer. Damaged: the picture shows that packets were lost. Quality is"
+    " estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the time"
+    " beside it."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 
@@ -24,7 +25,8 @@ def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
     headings: TableRow = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
     headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
-    headings += ("freezes", "frozen s", "longest s", "lost", "rebuilt", kind, "of the time\nfrozen")
+    headings += ("freezes", "frozen s", "longest s", "lost", "of the frames\ndamaged", "rebuilt", kind)
+    headings += ("of the time\nfrozen",)
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
 
@@ -39,6 +41,7 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
         "freezes",
         "frozen s",
         "lost packets",
+        "of the frames damaged",
     )
     return (*headings, "of allocated", "mean kbit/s"), [_drive(drive) for drive in drives]
 
@@ -62,6 +65,7 @@ def _camera(camera: CameraStatistics) -> TableRow:
         shown(sum(frozen), 2) if known else NOTHING,
         shown(max(frozen), 2) if frozen else NOTHING,
         counted(camera.lost),
+        percent(camera.damaged),
         counted(camera.rebuilt),
         shown(camera.quality.mean, 3) if camera.quality else NOTHING,
         percent(camera.frozen),
@@ -79,6 +83,7 @@ def _drive(drive: DriveStatistics) -> TableRow:
         counted(drive.freezes),
         shown(drive.frozen_s, 2),
         counted(drive.lost),
+        percent(drive.damaged),
         percent(drive.share),
         shown(drive.kbps),
     )

@@ -1,5 +1,5 @@
 """Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage.
+new sizes, garbage, reports of any kind.
 
     make soak                           everything, at most 45 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
@@ -22,6 +22,7 @@ import ip_camera
 import kills
 import openings
 import readers
+import reports
 import signals
 import sizes
 import stalls
@@ -36,6 +37,7 @@ PARTS: dict[str, Part] = {
     "readers": readers.soak,
     "sizes": sizes.soak,
     "hostile": hostile.soak,
+    "reports": reports.soak,
 }
 
 

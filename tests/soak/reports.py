@@ -1,0 +1,85 @@
+"""Random sequences of reception reports: the cap stays a finite rate, and returns to the limit once all is well."""
+
+from __future__ import annotations
+
+import math
+import random
+from concurrent.futures import ProcessPoolExecutor
+from fractions import Fraction
+
+from runner.core.events import LinkMeasured
+from runner.core.link_cap import LEAST, REPORT_S, LinkCap, advanced, believed
+from runner.core.model import exact
+from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
+
+SEQUENCES, BATCH = 200_000, 500
+RECOVERED = 100  # one sequence in so many is followed until the link is clear again
+RECOVERY_S = 60.0
+CAMERAS = ("front", "left", "right")
+LIMIT, LEAST_TRUST = Fraction(4000), Fraction(1, 2)
+
+
+def soak(seed: int, scale: float) -> list[str]:
+    count = max(BATCH, round(SEQUENCES * scale))
+    batches = [seed * SEQUENCES + first for first in range(0, count, BATCH)]
+    with ProcessPoolExecutor() as pool:
+        problems = [problem for found in pool.map(_batch, batches) for problem in found]
+    print(f"{len(batches) * BATCH} sequences of reports", flush=True)
+    return problems
+
+
+def _batch(first: int) -> list[str]:
+    return [f"seed {seed}: {what}" for seed in range(first, first + BATCH) if (what := sequence(seed))]
+
+
+def sequence(seed: int) -> str:
+    """One random sequence; returns what is wrong, "" if nothing is."""
+    chance = random.Random(seed)
+    uplink, cap, t, at = UplinkMemory(), LinkCap(), 0.0, chance.uniform(-1e6, 1e6)
+    for _ in range(chance.randrange(1, 40)):
+        passed = chance.choice((REPORT_S, REPORT_S, chance.expovariate(5), 0.0))
+        t, at = t + passed, at + passed
+        if chance.random() < 0.02:  # another operator, with another clock
+            uplink, at = UplinkMemory(), chance.uniform(-1e6, 1e6)
+        uplink, cap, wrong = _step(uplink, cap, t, _report(chance, at))
+        if wrong:
+            return wrong
+    until = t + (0 if seed % RECOVERED else RECOVERY_S)
+    while t < until and (cap.kbps is not None or cap.trust < 1):
+        t, at = t + REPORT_S, at + REPORT_S
+        size = int(float(min(LIMIT, cap.kbps or LIMIT)) * REPORT_S * 125 / len(CAMERAS))
+        units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size, 3) for name in CAMERAS)
+        uplink, cap, wrong = _step(uplink, cap, t, LinkReport(at, units, 9, 0))
+        if wrong:
+            return wrong
+    return f"not recovered within {RECOVERY_S:g} s: {cap}" if seed % RECOVERED == 0 and t >= until else ""
+
+
+def _report(chance: random.Random, at: float) -> LinkReport:
+    units = sorted(
+        (at - chance.expovariate(20), chance.choice(CAMERAS), chance.uniform(-10, 10) ** chance.choice((1, 3)))
+        for _ in range(chance.choice((0, 1, 3, 8)))
+    )
+    return LinkReport(
+        at,
+        tuple(ReceivedUnit(name, came - delay, came, chance.randrange(10**5), 4) for came, name, delay in units),
+        chance.randrange(100),
+        chance.choice((0, 0, 1, 100)),
+    )
+
+
+def _step(uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport) -> tuple[UplinkMemory, LinkCap, str]:
+    """The next estimate and cap, and what is wrong with them."""
+    uplink, link = estimate(uplink, report)
+    if link is None:
+        return uplink, cap, ""
+    known = [value for value in (link.kbps, link.queue_ms, link.loss) if value is not None]
+    if not all(math.isfinite(value) and value >= 0 for value in known) or link.loss > 1:
+        return uplink, cap, f"estimate {link}"
+    kbps = None if link.kbps is None else exact(round(link.kbps, 1))
+    measured = LinkMeasured(t=t, kbps=kbps, queue_ms=link.queue_ms, loss=link.loss, state=link.state, rtt_ms=30.0)
+    cap = advanced(cap, measured, t, LIMIT, LEAST_TRUST)
+    total = min(believed(cap, LIMIT, LEAST_TRUST), cap.kbps or LIMIT)
+    if not LEAST <= total <= LIMIT or (cap.kbps is not None and cap.kbps < LEAST):
+        return uplink, cap, f"total {float(total)} under {cap}"
+    return uplink, cap, ""
