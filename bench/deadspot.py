@@ -61,9 +61,7 @@ class Watched(NamedTuple):
 
     def frozen(self, t: float) -> int:
         """How many pictures stood still at a time."""
-        return sum(
-            any(a <= t < b and status in STILL for a, b, status in self.spans(c)) for c in self.statuses
-        )
+        return sum(any(a <= t < b and status in STILL for a, b, status in self.spans(c)) for c in self.statuses)
 
 
 def main() -> None:

@@ -144,8 +144,9 @@ class CameraTelemetry:
 class Telemetry:
     """Measured on the vehicle, a few times a second: also its heartbeat.
 
-    refused  requests refused since the start
-    errors   exceptions that the control loop survived since the start
+    refused       requests refused since the start
+    errors        exceptions that the control loop survived since the start
+    speed_factor  as in `SpeedAdvice`; None: not advised
     """
 
     t: float
@@ -154,6 +155,22 @@ class Telemetry:
     cameras: Mapping[str, CameraTelemetry]
     refused: int
     errors: int = 0
+    speed_factor: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedAdvice:
+    """Share of full speed that the latency of the operator's pictures allows, ten times a second.
+
+    Whoever drives the vehicle takes 0 for it once `expires_s` have passed without a newer one.
+
+    latency_ms  from light to light, at most; None: unknown
+    """
+
+    t: float
+    speed_factor: float
+    latency_ms: float | None
+    expires_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +253,7 @@ class Sample:
     """What the operator's side measures a few times a second.
 
     dropped         invalid messages on the control link
+    speed_factor    as in `SpeedAdvice`; None: not advised
     clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
     clock_bound_ms  by how much that may be wrong, and with it each latency; None: unknown. Older logs lack it: there
                     `clock_ahead_ms` is what a negative latency showed, and latencies are the difference of both clocks
@@ -251,6 +269,7 @@ class Sample:
     dropped: int = 0
     clock_ahead_ms: float | None = None
     clock_bound_ms: float | None = None
+    speed_factor: float | None = None
 
 
 class Arrival(NamedTuple):
@@ -287,6 +306,7 @@ class ReceptionReport:
     as_of          s, the vehicle's time that the operator assumed, see `runner.vehicle.operators`
     units          in order of arrival
     packets, lost  RTP packets of all cameras received, and missing at first: some may have been repaired
+    latency_ms     age of the oldest picture on show, from capture to decoding, at most; absent: unknown
     sent           s since 1970, by the operator's clock; given where the vehicle is to answer with a `ClockAnswer`
     """
 
@@ -295,6 +315,7 @@ class ReceptionReport:
     units: tuple[UnitReceived, ...]
     packets: int
     lost: int
+    latency_ms: float | UnsetType = UNSET
     sent: float | UnsetType = UNSET
 
 

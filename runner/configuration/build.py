@@ -21,6 +21,7 @@ from runner.core.model import (
     Endpoint,
     Graph,
     KnobTarget,
+    LatencyLimit,
     Media,
     Mode,
     ModelError,
@@ -87,7 +88,7 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not all(map(self.fine, ("media", "control", "page", "log"))):
+        if not all(map(self.fine, ("media", "control", "page", "log", "latency"))):
             return None
         media = self.part(("media",), _media)
         if media is None:
@@ -115,6 +116,7 @@ class Builder:
             media=media,
             control=control,
             page=page,
+            latency=LatencyLimit(**document["latency"]),
             pqos=document["pqos"],
             recording=recording,
             log_video=document["log"]["video"],

@@ -358,6 +358,27 @@ class PageSettings:
         return Endpoint("127.0.0.1", self.port)
 
 
+@dataclass(frozen=True, slots=True)
+class LatencyLimit:
+    """What latency means for the speed.
+
+    limit_ms  from light at the camera to light at the display, at which the vehicle may go at full speed
+    fixed_ms  the part of it that is not measured: exposure to capture time, decoding to light; None: unknown
+    """
+
+    limit_ms: float = 200.0
+    fixed_ms: float | None = None
+
+    def speed_factor(self, measured_ms: float | None) -> float | None:
+        """Advised share of full speed: the limit over the total latency, at most 1; None without `fixed_ms`.
+
+        measured_ms  from capture to decoding, at most; None: unknown, which advises to stop
+        """
+        if self.fixed_ms is None:
+            return None
+        return 0.0 if measured_ms is None else min(1.0, self.limit_ms / max(measured_ms + self.fixed_ms, 1e-3))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicle:
     """Everything the runner needs to know, valid once built.
@@ -367,6 +388,7 @@ class Vehicle:
     recording  how `record` stores the frames of every camera
     expires_s  age from which the vehicle drops a request, in addition to the round trip
     log_video  whether the log of a drive holds the video of every camera
+    latency    what follows from latency for the speed
     """
 
     name: str
@@ -380,6 +402,7 @@ class Vehicle:
     recording: Recording
     expires_s: float
     log_video: bool = False
+    latency: LatencyLimit = LatencyLimit()
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

@@ -8,6 +8,7 @@ Topics of a vehicle, below tod/<vehicle>/:
                          timed out
     reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never retained
     clock/<operator>     to that operator, five times a second: when a report came, by the vehicle's clock
+    advice               from the vehicle, ten times a second, if it knows `latency.fixed_ms`: speed by latency
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 

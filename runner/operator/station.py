@@ -112,6 +112,7 @@ class Station:
         self._clock_due = 0.0  # time.monotonic of the next
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
+        self._arrived: dict[str, float] = {}  # by camera, time.monotonic of its newest access unit
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         listen = {
             topic("+", "state"): self._on_any_state,
@@ -199,6 +200,7 @@ class Station:
         """
         now = time.monotonic()
         units = sorted((unit.arrived, name, unit) for name, arrived in arrivals.items() for unit in arrived)
+        self._arrived |= {name: at for at, name, _ in units}
         if units and self._delay_s is None:
             self._delay_s = units[0][2].arrived - units[0][2].captured
         base = self._delay_s or 0.0
@@ -209,6 +211,8 @@ class Station:
         if self.state is None:
             return
         report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
+        if (latency_ms := self._worst_latency_ms(now)) is not None:
+            report = replace(report, latency_ms=round(latency_ms, 1))
         if now >= self._clock_due:
             self._clock_due = now + CLOCK_S
             sent = time.time()
@@ -216,6 +220,18 @@ class Station:
                 self._clock_asked.append(sent)
             report = replace(report, sent=sent)
         self._link.publish(self._receptions, to_json(report))
+
+    def _worst_latency_ms(self, now: float) -> float | None:
+        """Age of the oldest picture on show, at most, ms; None: unknown, or nothing is to be shown."""
+        clock, ages = self.clock, []
+        for name, sends in self.sending().items():
+            latency_ms = self.samples[name].latency_ms if sends and name in self.samples else None
+            if sends and (clock is None or latency_ms is None):
+                return None
+            if latency_ms is not None:
+                interval = 1 / float(self._vehicle.cameras[name].fps)
+                ages.append(latency_ms + 1000 * max(0.0, now - self._arrived.get(name, now) - interval))
+        return max(ages) + 1000 * clock.bound_s if ages and clock else None
 
     def rows(self) -> list[CameraRow]:
         return [
@@ -253,6 +269,7 @@ class Station:
             refused=telemetry.refused if telemetry else 0,
             cameras=cameras,
             dropped=self._link.dropped,
+            speed_factor=telemetry.speed_factor if telemetry else None,
             clock_ahead_ms=round(1000 * self.clock.ahead_s, 3) if self.clock else None,
             clock_bound_ms=round(1000 * self.clock.bound_s, 3) if self.clock else None,
         )

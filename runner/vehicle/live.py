@@ -37,7 +37,7 @@ from runner.mqtt.messages import (
     topic,
 )
 from runner.plans import compile_plans, render_missing
-from runner.records import ClockAnswer, Outcome, Settings, Telemetry, VehicleState, to_json
+from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetry, VehicleState, to_json
 from runner.system.kernel_clock import clock_error_s
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
@@ -50,7 +50,7 @@ WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
 NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none has come by then, the name is free
 CONSOLE_LINES = 1000
-TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration"}
+TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration", SpeedAdvice: "advice"}
 
 
 class LiveVehicle:
@@ -173,7 +173,7 @@ class _VehicleControl:
         self._live = live
         self._link.connect()
 
-    def publish(self, record: VehicleState | Telemetry | Settings) -> None:
+    def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice) -> None:
         if self._alone.is_set():
             self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
+from msgspec import UNSET
+
 from runner.core.commands import Command, KnobValues
 from runner.core.events import (
     NAMES,
@@ -33,6 +35,7 @@ from runner.records import (
     Outcome,
     Position,
     ReceptionReported,
+    SpeedAdvice,
     Telemetry,
     VehicleState,
     applied_to_json,
@@ -46,6 +49,7 @@ TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
 CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
+ADVICE_S = 0.2  # how long a reported latency, and what is advised because of it, counts
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
 
@@ -86,7 +90,7 @@ class ControlLoop:
     pqos: Pqos
     track: Track | None
     log: Log
-    publish: Callable[[VehicleState | Telemetry], None]
+    publish: Callable[[VehicleState | Telemetry | SpeedAdvice], None]
     on_report: Callable[[str], None]
     refused: int = 0
     errors: int = 0
@@ -102,6 +106,7 @@ class ControlLoop:
     _position: PositionReported | None = None
     _reported: dict[str, float] = field(default_factory=dict)  # by fault, when it was last reported
     _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, when
+    _seen: tuple[float, float | None] = (-ADVICE_S, None)  # when the operator reported a latency, and that, ms
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
@@ -222,6 +227,7 @@ class ControlLoop:
         if self._ticks % TELEMETRY_TICKS == 0:
             self._publish_measured(t)
         self._watch_operators(t)
+        self._advise(t)
         self._publish_state()
 
     def _take_request(self, request: Request) -> None:
@@ -258,9 +264,25 @@ class ControlLoop:
             return
         self._state_clock(item, t)
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
+        if reported.in_control:
+            latency_ms = item.report.latency_ms
+            self._seen = (t, None if latency_ms is UNSET else latency_ms)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
+
+    def _advise(self, t: float) -> None:
+        """Publish the speed that the latency of the operator's pictures allows: 0 if none was reported lately."""
+        if (factor := self._speed_factor(t)) is not None:
+            _, measured_ms = self._seen
+            limit = self.vehicle.latency
+            total_ms = None if not factor or measured_ms is None else round(measured_ms + (limit.fixed_ms or 0.0), 1)
+            self.publish(SpeedAdvice(t, factor, total_ms, ADVICE_S))
+
+    def _speed_factor(self, t: float) -> float | None:
+        at, measured_ms = self._seen
+        factor = self.vehicle.latency.speed_factor(measured_ms if t - at <= ADVICE_S else None)
+        return None if factor is None else round(factor, 3)
 
     def _state_clock(self, item: Reported, t: float) -> None:
         """Answer an operator that compares clocks; not a flood of such reports, whose answers would fill the uplink."""
@@ -395,6 +417,7 @@ class ControlLoop:
         prediction = self._run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
         position = Position.of(self._position) if self._position else None
-        telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors)
+        factor = self._speed_factor(t)
+        telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors, factor)
         self.log.record(telemetry)
         self.publish(telemetry)

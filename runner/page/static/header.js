@@ -82,6 +82,9 @@ function refreshTotals() {
   refreshWarning();
   const current = store.connected && store.state?.online;
   for (const key of ["predicted", "allocated", "actual"]) write(by(key), whole(current ? store.sample?.[`${key}_kbps`] : NaN));
+  const factor = current ? store.sample?.speed_factor : null;
+  by("advice").hidden = !Number.isFinite(factor);
+  write(by("speed"), `${whole(100 * (factor ?? 0))} %`);
 }
 
 function moveFocus(event) {

@@ -45,6 +45,7 @@ const listeners = new Map();
  * @property {number} actual_kbps
  * @property {{lat: number, lon: number}|null} position
  * @property {number|null} clock_bound_ms by how much latencies may be wrong; null: they are unknown
+ * @property {number|null} speed_factor advised share of full speed
  * @property {Record<string, CameraSample>} cameras
  * @typedef {{time: number, text: string, level: string}} Note
  */
