@@ -24,7 +24,7 @@ import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
-from browser import all_live, opened
+from browser import measure, opened
 from rig import CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.drive.read import read_drive
 from runner.drive.series import Series, series
@@ -90,7 +90,7 @@ def watched(browser: Browser, modes: str, words: argparse.Namespace) -> Watched:
         with process("demo", *drive, *trace, *ports, f"duration_s={words.seconds + 5:g}") as child:
             until(lambda: answers(port) or child.poll() is not None, seconds=300)
             with opened(browser, f"http://127.0.0.1:{port}/", width=1280, height=760, refused=True) as page:
-                all_live(page)
+                until(lambda p=page: all(camera["drawn"] for camera in measure(p).values()))
                 began = time.time()
                 while time.time() - began < words.seconds:
                     shots.append((time.time(), page.locator("#tiles").screenshot()))

@@ -116,7 +116,7 @@ class Builder:
             media=media,
             control=control,
             page=page,
-            latency=LatencyLimit(**document["latency"]),
+            latency=LatencyLimit(**document.get("latency", {})),  # older drives lack it
             pqos=document["pqos"],
             recording=recording,
             log_video=document["log"]["video"],

@@ -11,6 +11,9 @@ TAIL_S = 0.01  # likewise for the last packets of a frame, of which no later pac
 GAPS = 2  # and this many times the longest recent gap between packets of a frame: a slow link spreads them
 FORGET = 0.99  # what is left of that gap at each packet
 ATTEMPTS = 3  # of retransmission that the buffer waits for
+FULL, CLEAR = 0.15, 0.05  # share of packets missing from which on nothing is sent again, and until when: a link that
+# drops so many is full, and what is sent again would fill it further
+MEMORY = 0.75  # of that share, from one look to the next
 UNKNOWN_MS = 100  # taken for the round trip until the first packet was sent again
 LONGEST_MS = 300  # a picture that is later is of no use for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
@@ -38,6 +41,9 @@ class RepairBuffer:
         self._at = 0.0
         self._open = self._asked = False  # the frame has not ended; its next packet was requested
         self._gap = 0.0
+        self._counted = (0, 0)  # packets that came, and that were missing
+        self._missing = 0.0  # share of packets, lately
+        self._full = False  # nothing is requested
 
     @property
     def stats(self) -> Gst.Structure:
@@ -45,16 +51,31 @@ class RepairBuffer:
         return self._buffer.get_property("stats")
 
     def adapt(self) -> int:
-        """Wait for missing packets as long as their retransmission takes; returns that, ms."""
-        round_trip_ms = self.stats.get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
-        wait_ms = min(LONGEST_MS, self._reorder_ms + round(ATTEMPTS * round_trip_ms))
+        """Wait for missing packets as long as their retransmission takes; returns that, ms. A few times a second."""
+        stats = self.stats
+        round_trip_ms = stats.get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
+        self._look(stats)
+        wait_ms = self._reorder_ms + (0 if self._full else round(ATTEMPTS * round_trip_ms))
+        wait_ms = min(LONGEST_MS, wait_ms)
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
         return wait_ms
 
+    def _look(self, stats: Gst.Structure) -> None:
+        """Whether the link is full."""
+        before = self._counted
+        missing = stats.get_value("num-lost") + stats.get_value("rtx-success-count")
+        self._counted = (stats.get_value("num-pushed"), missing)
+        if more := sum(self._counted) - sum(before):
+            self._missing = MEMORY * self._missing + (1 - MEMORY) * (missing - before[1]) / more
+        self._full = self._missing > (CLEAR if self._full else FULL)
+        if self._buffer.get_property("do-retransmission") is self._full:
+            self._buffer.set_property("do-retransmission", not self._full)
+
     def request_tail(self) -> None:
         """Request the next packet of a frame that should have ended by now; to be called a hundred times a second."""
-        if self._open and not self._asked and time.monotonic() - self._at > max(TAIL_S, GAPS * self._gap):
+        late = time.monotonic() - self._at > max(TAIL_S, GAPS * self._gap)
+        if late and self._open and not (self._asked or self._full):
             self._asked = True
             request = Gst.Structure.new_empty("GstRTPRetransmissionRequest")
             request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, (self._newest + 1) % (2 * HALF)))
