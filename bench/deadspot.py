@@ -29,6 +29,7 @@ from rig import CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.drive.read import read_drive
 from runner.drive.series import Series, series
 
+SETTLED_S = 8.0  # both drives have started by then
 EVERY_S = 1.0  # between two pictures of the page
 POLICIES = {"open_loop": "the prediction is trusted", "safe": "the link is measured"}
 COLOURS = {"live": "#2e8b57", "late": "#ffb000", "damaged": "#c77dff", "frozen": "#e01b24", "lost": "#7a0000"}
@@ -110,7 +111,7 @@ def watched(browser: Browser, modes: str, words: argparse.Namespace) -> Watched:
 def draw(drives: dict[str, Watched], words: argparse.Namespace) -> None:
     """The moment at which most pictures stood still in the first drive, and both drives over time."""
     first, second = drives.values()
-    pairs = [(a, min(second.shots, key=lambda b: abs(a.t - b.t))) for a in first.shots]
+    pairs = [(a, min(second.shots, key=lambda b: abs(a.t - b.t))) for a in first.shots if a.t > SETTLED_S]
     at = max(pairs, key=lambda pair: (first.frozen(pair[0].t), -abs(pair[0].t - pair[1].t)))
     matplotlib.use("Agg")
     figure, axes = plt.subplots(
@@ -122,8 +123,8 @@ def draw(drives: dict[str, Watched], words: argparse.Namespace) -> None:
         picture.imshow(plt.imread(io.BytesIO(shot.png)))
         picture.set_axis_off()
         picture.set_title(f"modes={modes}: {POLICIES[modes]}", fontsize=13, fontweight="bold")
-        picture.text(0.01, 0.985, f"t = {shot.t:.1f} s", transform=picture.transAxes, va="top", fontsize=13,
-                     color="white", bbox={"facecolor": "black", "pad": 4})  # fmt: skip
+        clock = {"facecolor": "black", "pad": 5}
+        picture.text(0.03, 0.52, f"t = {shot.t:.1f} s", transform=picture.transAxes, color="white", size=15, bbox=clock)
         draw_statuses(state, drive, shot.t)
         draw_rates(rate, drive.drive, shot.t, words.share)
     axes[2, 0].set_ylabel("Mbit/s")
