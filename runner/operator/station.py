@@ -247,7 +247,8 @@ class Station:
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
 
     def _compare_clocks(self, now: float) -> None:
-        before, self.clock = self.clock, self._clocks.difference(now)
+        with self._lock:
+            before, self.clock = self.clock, self._clocks.difference(now)
         if self.clock is None and before is not None and self.state:
             self.note(f"the vehicle has not stated its clock for {KEPT_S:g} s: latencies are unknown")
 
@@ -327,13 +328,12 @@ class Station:
 
     def _on_clock(self, message: MqttMessage) -> None:
         returned, now, answer = time.time(), time.monotonic(), read_clock(message.payload)
-        with self._lock:
-            if message.retained or answer.sent not in self._clock_asked:
-                return
-            self._clock_asked.remove(answer.sent)
         own_s = clock_error_s()
         errors_s = None if own_s is None or answer.error_s is None else own_s + answer.error_s
-        self._clocks.add(now, Exchange(answer.sent, answer.received, answer.answered, returned, errors_s))
+        with self._lock:
+            if not message.retained and answer.sent in self._clock_asked:
+                self._clock_asked.remove(answer.sent)
+                self._clocks.add(now, Exchange(answer.sent, answer.received, answer.answered, returned, errors_s))
 
     def _on_configuration(self, message: MqttMessage) -> None:
         """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""
