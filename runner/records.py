@@ -195,12 +195,14 @@ class ClockAnswer:
 
     sent                of the report that is answered
     received, answered  s since 1970, by the vehicle's clock
+    set_s               how far that is ahead of the vehicle's monotonic clock
     error_s             by how much that may differ from UTC, by the kernel's own account; None: not synchronised
     """
 
     sent: float
     received: float
     answered: float
+    set_s: float
     error_s: float | None
 
 

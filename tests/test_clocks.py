@@ -71,6 +71,19 @@ def test_a_clock_that_is_set_is_followed_at_the_next_exchange() -> None:
     assert all(abs(known.ahead_s - truth) <= known.bound_s for _, known, truth in found)
 
 
+def test_a_step_smaller_than_the_round_trip_is_followed_if_the_machine_tells_of_it() -> None:
+    clocks = ClockComparison()
+    for number in range(100):
+        t, ahead = number * EVERY_S, 0.0 if number < 50 else 0.058
+        clocks.add(t + 0.06, Exchange(t, t + 0.03 + ahead, t + 0.03 + ahead, t + 0.06, (7.0, 9.0 + ahead)))
+        known = clocks.difference(t + 0.06)
+        if number != 50:  # then nothing is known
+            assert known
+            assert abs(known.ahead_s - ahead) <= known.bound_s
+    assert known
+    assert known.ahead_s == pytest.approx(0.058, abs=0.001)
+
+
 def test_a_clock_that_linux_slews_stays_within_the_bound() -> None:
     found = list(compared(60, mobile(4), lambda t: 500e-6 * max(0.0, min(t, 40.0) - 20.0)))
     assert all(abs(known.ahead_s - truth) <= known.bound_s for _, known, truth in found)
@@ -95,7 +108,7 @@ def test_without_an_exchange_for_10_s_nothing_is_known() -> None:
 )
 def test_synchronised_kernels_bound_the_difference_too(errors_s: float | None, bound_s: float) -> None:
     clocks = ClockComparison()
-    clocks.add(0.0, Exchange(10.0, 10.08, 10.08, 10.08, errors_s))  # 80 ms there, none back
+    clocks.add(0.0, Exchange(10.0, 10.08, 10.08, 10.08, errors_s=errors_s))  # 80 ms there, none back
     known = clocks.difference(0.0)
     assert known
     assert known.bound_s == pytest.approx(bound_s, abs=SLACK_S)
@@ -108,6 +121,15 @@ def test_kernels_that_contradict_the_messages_are_not_believed() -> None:
     known = clocks.difference(0.0)
     assert known
     assert known.ahead_s == pytest.approx(3.7)
+
+
+@pytest.mark.parametrize(("answered", "returned"), [(100.03, 99.0), (5000.0, 100.06)])
+def test_an_answer_after_it_arrived_is_refused(answered: float, returned: float) -> None:
+    """This machine's clock was set back meanwhile, or the other states a wrong time."""
+    clocks = ClockComparison()
+    with pytest.raises(ValueError, match="answered after the answer arrived"):
+        clocks.add(0.0, Exchange(100.0, 100.03, answered, returned))
+    assert clocks.difference(0.0) is None
 
 
 def test_an_answer_before_the_question_is_refused() -> None:

@@ -13,7 +13,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Mode
 from runner.errors import ConfigError, Problem
 
-TOP_KEYS = "mode, fps_max, media, control, page, log, name, cameras, modes, graph, source, pqos, recording, ..."
+TOP_KEYS = "mode, fps_max, media, control, page, latency, log, name, cameras, modes, graph, source, pqos, ..."
 CAMERA_KEYS = (
     "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, shed, place, pose, device, ..."
 )

@@ -44,6 +44,15 @@ def test_of_a_codec_that_is_not_understood_only_incomplete_units_are_known_to_be
     assert damaged([(b"", False), (b"", True), (b"", False)], codec="vp8") == "-D-"
 
 
+def test_a_shorter_wave_that_begins_later_heals_first() -> None:
+    """And one of a negative length, from bytes that are no recovery point, does not count."""
+    wave_of_100 = AUD + SPS + PPS + SEI + bytes.fromhex("06030191") + b"\x80" + SLICE + b"\x9a"
+    wrong = AUD + SPS + PPS + SEI + bytes.fromhex("060100") + SLICE + b"\x9a"
+    units = [(DELTA, True), (wave_of_100, False), (DELTA, False), (WAVE_OF_4, False), *[(DELTA, False)] * 4]
+    assert damaged(units) == "DDDDDD--"
+    assert damaged([(DELTA, True), (wrong, False), (DELTA, False), (KEY, False)]) == "DDD-"
+
+
 def test_nothing_is_read_while_the_picture_is_whole() -> None:
     def fail() -> bytes:
         raise AssertionError

@@ -28,7 +28,7 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 @pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
     experiment, link = configuration([f"experiment={name}"], runnable=False).experiment()
-    assert (link is not None) == (name in ("bottleneck", "wrong_prediction"))
+    assert (link is not None) == (name in ("bottleneck", "loss", "wrong_prediction"))
     for words in ((), *experiment.runs.values()):
         configuration([f"experiment={name}", *words], runnable=False).pqos()
 

@@ -276,12 +276,14 @@ def _pictures(
 
 def _captures(side: Side, camera: str) -> list[int]:
     """Capture times of a camera's received frames, ns since 1970, increasing; empty if they were not logged."""
-    samples = (sample.cameras[camera] for sample in side.of(Sample) if camera in sample.cameras)
-    arrivals = (arrival for sample in samples for arrival in sample.arrivals)
-    began = side.began_s
-    return sorted(
-        round((began + t - latency_ms / 1000) * SECOND_NS) for t, latency_ms in arrivals if latency_ms is not None
+    came = (
+        (t - ms / 1000 + (0.0 if sample.clock_bound_ms is None else (sample.clock_ahead_ms or 0.0) / 1000))
+        for sample in side.of(Sample)
+        if camera in sample.cameras
+        for t, ms in sample.cameras[camera].arrivals
+        if ms is not None
     )
+    return sorted(round((side.began.time + t) * SECOND_NS) for t in came)
 
 
 def follow(known: Sequence[int], ns: int, offset: int) -> int:

@@ -26,6 +26,7 @@ from runner.records import (
     line_from_json,
 )
 from runner.schema import event_problem, log_problem, read_json
+from runner.system.clocks import KEPT_S
 
 T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
@@ -52,8 +53,9 @@ class Side:
     @cached_property
     def began_s(self) -> float:
         """Its beginning, s since 1970 by the vehicle's clock; by its own where their difference was not measured."""
-        measured = (sample for sample in self.of(Sample) if sample.clock_bound_ms is not None)
-        ahead_ms = [sample.clock_ahead_ms for sample in measured if sample.clock_ahead_ms is not None]
+        measured = [(s.t, s.clock_ahead_ms or 0.0) for s in self.of(Sample) if s.clock_bound_ms is not None]
+        # Its own `t` does not follow a clock that is set later.
+        ahead_ms = [ahead_ms for t, ahead_ms in measured if t - measured[0][0] <= KEPT_S]
         return self.began.time + (median(ahead_ms) / 1000 if ahead_ms else 0.0)
 
 

@@ -13,9 +13,9 @@ NOTHING = "-"
 MEANING = (
     "Arrival and decode: latency since capture; ±: by how much it may be wrong, since two clocks measure it."
     " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
-    " or of the mean and 150 ms, whichever is longer. Damaged: the picture shows that packets were lost. Quality is"
-    " estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the time"
-    " beside it."
+    " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
+    " Quality is estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the"
+    " time beside it."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 
@@ -24,8 +24,9 @@ def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     """Headings, and a row for each camera."""
     kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
     headings: TableRow = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
-    headings += ("arrival, ms\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
-    headings += ("freezes", "frozen s", "longest s", "lost", "of the frames\ndamaged", "rebuilt", kind)
+    bound = next((_bound(camera.arrival) for camera in drive.cameras.values()), "")  # of all: they share two clocks
+    headings += (f"arrival, ms{bound}\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
+    headings += ("freezes", "frozen s", "longest s", "lost\ndamaged", "rebuilt", kind)
     headings += ("of the time\nfrozen",)
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
@@ -41,7 +42,7 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
         "freezes",
         "frozen s",
         "lost packets",
-        "of the frames damaged",
+        "damaged",
     )
     return (*headings, "of allocated", "mean kbit/s"), [_drive(drive) for drive in drives]
 
@@ -64,8 +65,7 @@ def _camera(camera: CameraStatistics) -> TableRow:
         counted(len(frozen) if known else None),
         shown(sum(frozen), 2) if known else NOTHING,
         shown(max(frozen), 2) if frozen else NOTHING,
-        counted(camera.lost),
-        percent(camera.damaged),
+        f"{counted(camera.lost)}\n{percent(camera.damaged)}",
         counted(camera.rebuilt),
         shown(camera.quality.mean, 3) if camera.quality else NOTHING,
         percent(camera.frozen),
@@ -79,7 +79,7 @@ def _drive(drive: DriveStatistics) -> TableRow:
         shown(drive.series.end, 1),
         f"{shown(drive.quality, 3)} {drive.metric.upper()}" if drive.metric else NOTHING,
         percent(drive.frozen),
-        _latency(arrived),
+        _latency(arrived) + _bound(arrived),
         counted(drive.freezes),
         shown(drive.frozen_s, 2),
         counted(drive.lost),
@@ -92,8 +92,11 @@ def _drive(drive: DriveStatistics) -> TableRow:
 def _latency(latency: Latency) -> str:
     if math.isnan(latency.median):
         return NOTHING
-    percentiles = " / ".join(shown(value) for value in (latency.median, latency.p95, latency.p99))
-    return percentiles if math.isnan(latency.bound) else f"{percentiles} ± {shown(latency.bound, 1)}"
+    return " / ".join(shown(value) for value in (latency.median, latency.p95, latency.p99))
+
+
+def _bound(latency: Latency) -> str:
+    return "" if math.isnan(latency.bound) else f" ± {shown(latency.bound, 0 if latency.bound >= 10 else 1)}"
 
 
 def shown(value: float | None, digits: int = 0) -> str:

@@ -102,7 +102,7 @@ class Receiver:
         self._reorder_ms = int(settings.get("jitter_buffer_ms", 0))
         self._repairs = bool(settings.get("retransmission_ms"))
         self._buffers: list[RepairBuffer] = []
-        self._over_udp = False
+        self._over_udp = self._feedback = False  # transport and profile of the session
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
@@ -127,7 +127,7 @@ class Receiver:
 
     def sample(self) -> Reception:
         """What was received so far; requests the latency of the next frame."""
-        waits = [buffer.adapt() for buffer in self._buffers if self._repairs and self._over_udp]
+        waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
         received = self._count()
         received = replace(received, buffer_ms=max(waits, default=None), arrivals=self._arrived(received.frames))
         if received.foreign and not self._foreign_reported:
@@ -154,16 +154,22 @@ class Receiver:
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
         before = self._packets
-        stats = [buffer.stats for buffer in self._buffers]
-        lost = sum(s.get_value("num-lost") + s.get_value("rtx-success-count") for s in stats)
-        now = self._packets = (sum(s.get_value("num-pushed") for s in stats), lost)
+        counts = [buffer.packets for buffer in self._buffers]
+        now = self._packets = (sum(passed for passed, _, _ in counts), sum(missing for _, missing, _ in counts))
         return (max(0, now[0] - before[0]), max(0, now[1] - before[1]))  # a new pipeline counts from 0
 
     def request_tails(self) -> None:
         """Request packets whose loss no later packet shows; to be called a hundred times a second."""
-        if self._over_udp and self._repairs:
+        if self._is_repaired:
             for buffer in self._buffers:
                 buffer.request_tail()
+
+    @property
+    def _is_repaired(self) -> bool:
+        return self._repairs and self._over_udp and self._feedback
+
+    def _on_profile(self, profile: str) -> None:
+        self._feedback = profile.endswith("AVPF")
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
@@ -175,11 +181,11 @@ class Receiver:
         self._received = pipeline.get_by_name("received")
         self._begun = False
         self._damage = Damage(self._codec)
-        self._buffers, self._over_udp = [], False
+        self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
         if GObject.signal_lookup("select-stream", self._client):
-            take_feedback(self._client)
+            take_feedback(self._client, self._on_profile)
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
@@ -232,7 +238,7 @@ class Receiver:
             damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
-            lost=before.lost + sum(buffer.stats.get_value("num-lost") for buffer in self._buffers),
+            lost=before.lost + sum(lost for _, _, lost in (buffer.packets for buffer in self._buffers)),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
             latency_ms=self._latency[0] if self._latency and now - self._latency[1] <= CURRENT_S else None,
@@ -306,16 +312,19 @@ def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:
     return time.time() if captured is None else captured
 
 
-def take_feedback(client: Gst.Element) -> None:
+def take_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:
     """Let an RTSP client choose the profile with retransmission of lost packets (RFC 4585, 4588).
 
     A server that offers both profiles lists the stream twice; by default the client takes the first, without feedback.
+
+    on_profile  called with the profile chosen
     """
     chosen = [0]
 
     def on_sdp(_client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
         profiles = [sdp.get_media(number).get_proto() for number in range(sdp.medias_len())]
         chosen[0] = next((number for number, profile in enumerate(profiles) if profile.endswith("AVPF")), 0)
+        on_profile(profiles[chosen[0]] if profiles else "")
 
     client.connect("on-sdp", on_sdp)
     client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])

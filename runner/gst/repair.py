@@ -41,31 +41,32 @@ class RepairBuffer:
         self._at = 0.0
         self._open = self._asked = False  # the frame has not ended; its next packet was requested
         self._gap = 0.0
+        self._tails = 0  # packets that came because they were requested here
         self._counted = (0, 0)  # packets that came, and that were missing
         self._missing = 0.0  # share of packets, lately
         self._full = False  # nothing is requested
 
     @property
-    def stats(self) -> Gst.Structure:
-        """The statistics of the element."""
-        return self._buffer.get_property("stats")
+    def packets(self) -> tuple[int, int, int]:
+        """Packets passed on, missing at first, and missing for good."""
+        stats = self._buffer.get_property("stats")
+        lost = stats.get_value("num-lost")
+        return stats.get_value("num-pushed"), lost + stats.get_value("rtx-success-count") + self._tails, lost
 
     def adapt(self) -> int:
         """Wait for missing packets as long as their retransmission takes; returns that, ms. A few times a second."""
-        stats = self.stats
-        round_trip_ms = stats.get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
-        self._look(stats)
+        round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
+        self._look()
         wait_ms = self._reorder_ms + (0 if self._full else round(ATTEMPTS * round_trip_ms))
-        wait_ms = min(LONGEST_MS, wait_ms)
+        wait_ms = max(self._reorder_ms, min(LONGEST_MS, wait_ms))
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
         return wait_ms
 
-    def _look(self, stats: Gst.Structure) -> None:
+    def _look(self) -> None:
         """Whether the link is full."""
-        before = self._counted
-        missing = stats.get_value("num-lost") + stats.get_value("rtx-success-count")
-        self._counted = (stats.get_value("num-pushed"), missing)
+        before, (passed, missing, _) = self._counted, self.packets
+        self._counted = (passed, missing)
         if more := sum(self._counted) - sum(before):
             self._missing = MEMORY * self._missing + (1 - MEMORY) * (missing - before[1]) / more
         self._full = self._missing > (CLEAR if self._full else FULL)
@@ -87,8 +88,9 @@ class RepairBuffer:
         number, stamp = int.from_bytes(header[1:3], "big"), header[3:]
         if self._newest >= 0 and (number - self._newest - 1) % (2 * HALF) >= HALF:
             return Gst.PadProbeReturn.OK  # an older one: overtaken, or sent again
-        if self._asked:
+        if self._asked and packet.has_flags(RETRANSMITTED):
             packet.unset_flags(RETRANSMITTED)  # the buffer drops those that it has not requested itself
+            self._tails += 1
         elif stamp == self._stamp:
             self._gap = max(now - self._at, FORGET * self._gap)
         self._newest, self._stamp, self._at = number, stamp, now

@@ -26,7 +26,7 @@ LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
 FAULTS = 100  # distinct message faults that are reported; further ones are only counted
 LONGEST_FAULT = 1000  # characters of why
-REPEATED = {"telemetry", "reception"}  # the next message comes soon: without acknowledgement
+REPEATED = {"telemetry", "reception", "clock", "advice"}  # the next message comes soon: without acknowledgement
 RETAINED = ("state", "telemetry", "configuration")
 
 

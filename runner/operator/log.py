@@ -8,7 +8,6 @@ from typing import Any
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
 from runner.records import CameraSample, Note, Offline, Sample, VehicleState
-from runner.system.clocks import latency
 
 
 class DriveLog(Listener):
@@ -35,5 +34,8 @@ class DriveLog(Listener):
 
     def _arrival(self, arrived: float, captured: float | None) -> tuple[float, float | None]:
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
-        ms = latency(None if captured is None else 1000 * (arrived - captured), self._station.clock)
-        return round(arrived - self._log.time, 4), None if ms is None else round(ms, 2)
+        clock = self._station.clock
+        known = captured is not None and clock is not None
+        # Below 0 where the bound allows it: a reader gets the capture time back.
+        ms = round(1000 * (arrived + clock.ahead_s - captured), 2) if known else None  # type: ignore[union-attr, operator]
+        return round(arrived - self._log.time, 4), ms

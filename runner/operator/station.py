@@ -46,6 +46,7 @@ from runner.system.kernel_clock import clock_error_s
 
 SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
+CURRENT_S = 1.0  # an older sample has no current latency
 CLOCK_S = 0.2  # between two comparisons of the clocks
 MOST_VEHICLES = 100  # whose names are remembered
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
@@ -112,7 +113,8 @@ class Station:
         self._clock_due = 0.0  # time.monotonic of the next
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
-        self._arrived: dict[str, float] = {}  # by camera, time.monotonic of its newest access unit
+        self._newest: dict[str, Arrival] = {}  # by camera
+        self._sampled = 0.0  # time.monotonic of `samples`
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         listen = {
             topic("+", "state"): self._on_any_state,
@@ -188,7 +190,7 @@ class Station:
         samples = {name: self._with_latency(received) for name, received in samples.items()}
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, self._camera(name))
-        self.samples = samples
+        self.samples, self._sampled = samples, now
         sample = self._sample()
         for listener in self.listeners:
             listener.on_sample(sample)
@@ -200,7 +202,7 @@ class Station:
         """
         now = time.monotonic()
         units = sorted((unit.arrived, name, unit) for name, arrived in arrivals.items() for unit in arrived)
-        self._arrived |= {name: at for at, name, _ in units}
+        self._newest |= {name: unit for _, name, unit in units}
         if units and self._delay_s is None:
             self._delay_s = units[0][2].arrived - units[0][2].captured
         base = self._delay_s or 0.0
@@ -222,16 +224,23 @@ class Station:
         self._link.publish(self._receptions, to_json(report))
 
     def _worst_latency_ms(self, now: float) -> float | None:
-        """Age of the oldest picture on show, at most, ms; None: unknown, or nothing is to be shown."""
-        clock, ages = self.clock, []
-        for name, sends in self.sending().items():
-            latency_ms = self.samples[name].latency_ms if sends and name in self.samples else None
-            if sends and (clock is None or latency_ms is None):
+        """Latency of the slowest picture on show, at most, ms; None: unknown, or nothing is to be shown.
+
+        Of each camera the greater of its newest access unit's to arrival and the last sampled one's to decoding; and by
+        how much the next one is overdue.
+        """
+        clock, state, found = self.clock, self.state, []
+        wall = time.time() - now  # of the monotonic clock
+        for name, camera in (state.cameras if state else {}).items():
+            if not camera.sending:
+                continue
+            sampled, newest = self.samples.get(name), self._newest.get(name)
+            if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
                 return None
-            if latency_ms is not None:
-                interval = 1 / float(self._vehicle.cameras[name].fps)
-                ages.append(latency_ms + 1000 * max(0.0, now - self._arrived.get(name, now) - interval))
-        return max(ages) + 1000 * clock.bound_s if ages and clock else None
+            arrived_ms = latency(1000 * (wall + newest.arrived - newest.captured), clock) or 0.0
+            overdue_s = max(0.0, now - newest.arrived - 1 / float(self._vehicle.cameras[name].fps))
+            found.append(max(sampled.latency_ms, arrived_ms) + 1000 * overdue_s)
+        return max(found) + 1000 * clock.bound_s if found and clock else None
 
     def rows(self) -> list[CameraRow]:
         return [
@@ -333,7 +342,10 @@ class Station:
         with self._lock:
             if not message.retained and answer.sent in self._clock_asked:
                 self._clock_asked.remove(answer.sent)
-                self._clocks.add(now, Exchange(answer.sent, answer.received, answer.answered, returned, errors_s))
+                set_s = (returned - now, answer.set_s)
+                self._clocks.add(
+                    now, Exchange(answer.sent, answer.received, answer.answered, returned, set_s, errors_s)
+                )
 
     def _on_configuration(self, message: MqttMessage) -> None:
         """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""

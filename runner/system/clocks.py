@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-MOST_DRIFT = 5e-4  # by which two clocks drift apart: two crystals by 100 ppm; Linux slews a clock by 500 ppm
+MOST_DRIFT = 5e-4  # by which two clocks drift apart: crystals by 100 ppm; adjtime(3) slews a clock by 500 ppm
+SET_S = 5e-4  # a clock that moves by more than this and the drift, between two exchanges, was set
 KEPT_S = 10.0  # that an exchange counts; without a newer one nothing is known
 CLOCKS_APART_MS = -1.0  # in logs without exchanges: a negative age above it is noise, below it the clocks are apart
 TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age in which ages are unknown
+STEP_S = 5e-3  # likewise, and not by slewing
 
 
 class Exchange(NamedTuple):
@@ -16,6 +18,7 @@ class Exchange(NamedTuple):
 
     sent, returned      by this machine's clock
     received, answered  by the other's
+    set_s               how far each clock, this machine's and the other's, is ahead of one that is never set
     errors_s            sum of the errors that both kernels state against a common time; None if one is not synchronised
     """
 
@@ -23,6 +26,7 @@ class Exchange(NamedTuple):
     received: float
     answered: float
     returned: float
+    set_s: tuple[float, float] = (0.0, 0.0)
     errors_s: float | None = None
 
 
@@ -54,20 +58,31 @@ class ClockComparison:
 
     No message arrives before it was sent: the one there bounds the difference from above, the answer from below. Each
     exchange yields such an interval, whatever the delay in either direction, and the truth lies in all of them. An
-    exchange of t seconds ago counts with its interval widened by what the clocks may have drifted apart since.
+    exchange of t seconds ago counts with its interval widened by what the clocks may have drifted apart since. Once
+    either clock has been set, or slewed faster, only what comes after counts.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[_Interval] = deque()
+        self._set_s: tuple[float, float] | None = None
 
     def add(self, at: float, exchange: Exchange) -> None:
         """Take an exchange that was completed at time `at`, s, by a clock that is never set.
 
-        raises  ValueError if the other machine answered before it received, by its own clock
+        raises  ValueError if the times contradict each other
         """
         if exchange.answered < exchange.received:
             raise ValueError(f"answered {exchange.received - exchange.answered:g} s before it was received")
-        self._intervals.append(_interval(at, exchange))
+        interval = _interval(at, exchange)
+        if interval.least > interval.most:
+            raise ValueError("answered after the answer arrived: a clock was set meanwhile, or is stated wrongly")
+        before, self._set_s = self._set_s or exchange.set_s, exchange.set_s
+        allowed = SET_S + MOST_DRIFT * (at - self._intervals[-1].at if self._intervals else 0.0)
+        moved = max(abs(now - then) for now, then in zip(exchange.set_s, before, strict=True))
+        if moved > allowed:
+            self._intervals.clear()
+        if moved < STEP_S:  # otherwise perhaps in the middle of this exchange
+            self._intervals.append(interval)
 
     def difference(self, now: float) -> ClockDifference | None:
         """The difference at a time, by the same clock; None if nothing was exchanged for KEPT_S."""

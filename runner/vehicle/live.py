@@ -228,7 +228,9 @@ class _VehicleControl:
 
         def state_clock() -> None:
             assert report.sent is not UNSET
-            self._link.publish(asked, to_json(ClockAnswer(report.sent, received, time.time(), clock_error_s())))
+            now = time.time()
+            answer = ClockAnswer(report.sent, received, now, now - time.monotonic(), clock_error_s())
+            self._link.publish(asked, to_json(answer))
 
         self._live.loop.take(Reported(message.sender, report, None if report.sent is UNSET else state_clock))
 

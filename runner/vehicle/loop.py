@@ -266,7 +266,8 @@ class ControlLoop:
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
         if reported.in_control:
             latency_ms = item.report.latency_ms
-            self._seen = (t, None if latency_ms is UNSET else latency_ms)
+            overdue_s = self._operators.overdue_s(item.sender, t, item.report.as_of)
+            self._seen = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)

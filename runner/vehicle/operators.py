@@ -92,6 +92,10 @@ class Operators:
         limit = self._expires_s + min(round_trip, MAX_ROUND_TRIP_S)
         return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else None
 
+    def overdue_s(self, name: str, t: float, as_of: float) -> float:
+        """By how much a message took longer than the shortest round trip of its sender; see `expired`."""
+        return max(0.0, t - as_of - min(self._operator(name, t).delays, default=0.0))
+
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:
             if len(self._known) >= MOST:

@@ -155,7 +155,6 @@ def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
         assert int(age[2]) < 100, age
         time.sleep(2.5)  # by then a clock that was not compared is warned of
         assert page.locator("#warning").is_hidden()
-        assert "late" not in {status for _, _, status in page.evaluate("tod.measure()")["status_log"]}
         shot(page, "clock-ahead")
         operator.terminate()
         operator.communicate(timeout=20)

@@ -15,6 +15,7 @@ from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.station import SILENT_S, Station
+from runner.records import Arrival
 
 pytestmark = pytest.mark.gst
 
@@ -47,7 +48,7 @@ class Vehicle:
         self.requests = []
         self.operator = ""  # sender of the last message
         self.clock_ahead_s, self.states_clock = 0.0, True
-        self.answers = []  # about its clock
+        self.answers, self.reports = [], []  # about its clock; of reception
         listen = {
             topic("delivery_robot", "request", "+"): self._on_request,
             topic("delivery_robot", "reception", "+"): self._on_reception,
@@ -63,8 +64,11 @@ class Vehicle:
     def _on_reception(self, message):
         report, now = json.loads(message.payload), time.time() + self.clock_ahead_s
         self.operator = message.sender
+        self.reports.append(report)
         if self.states_clock and "sent" in report:
-            self.answers.append({"sent": report["sent"], "received": now, "answered": now, "error_s": None})
+            self.answers.append(
+                {"sent": report["sent"], "received": now, "answered": now, "set_s": 0.0, "error_s": None}
+            )
             self.publish("clock", self.answers[-1])
 
     def publish(self, kind, message):
@@ -184,12 +188,36 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
 
 
+def test_the_slowest_camera_that_should_send_is_reported_even_if_its_source_has_failed(both):
+    station, vehicle, _ = both
+    cameras = {
+        name: {**camera, "fault": "frozen" if name == "rear" else None} for name, camera in STATE["cameras"].items()
+    }
+    vehicle.publish("state", {**STATE, "t": 2.0, "cameras": cameras})
+    until(lambda: station.state.cameras["rear"].fault)
+    vehicle.clock_ahead_s = 3.7
+
+    def reported(silent=(), ms=40):
+        """The latency that is reported when all cameras but the silent ones have just sent a picture."""
+        now, captured = time.monotonic(), time.time() + 3.7 - ms / 1000
+        came = {name: [Arrival(now, captured, 1000)] for name in STATE["cameras"] if name not in silent}
+        station.report_reception(came, 0, 0)
+        station.take(FRESH)
+        vehicle.publish("telemetry", TELEMETRY)
+        return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0
+
+    until(lambda: 40 <= reported() < 60, every_s=0.05)
+    until(lambda: 130 <= reported(ms=130), every_s=0.05)  # at once, not with the next sample
+    until(lambda: 40 <= reported() < 60, every_s=0.05)
+    until(lambda: reported(silent=["rear"]) > 500, every_s=0.05)  # the longer it sends nothing
+
+
 def test_a_clock_that_is_stated_twice_or_unasked_is_not_believed(both):
     station, vehicle, _ = both
     report_until(station, lambda: station.clock)
     before, answer = station.clock, vehicle.answers[-1]
     vehicle.publish("clock", {**answer, "received": answer["received"] + 9, "answered": answer["answered"] + 9})
-    vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "error_s": None})
+    vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "set_s": 0.0, "error_s": None})
     dropped = station._link.dropped
     vehicle.publish("clock", {**answer, "sent": "yesterday"})
     until(lambda: station._link.dropped > dropped)  # the last of three, in order

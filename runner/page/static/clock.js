@@ -1,6 +1,7 @@
 /** The station's clock, seen from this page. */
 
 const KEPT = 20; // echoes; one a second
+const DRIFT_MS = 2; // between two clocks in that time
 
 /** Milliseconds since the epoch, by the page's own steady clock. */
 export const now = () => performance.timeOrigin + performance.now();
@@ -17,11 +18,14 @@ export class Clock {
   /** @param {number} sent when the page asked (page clock)  @param {number} server the station's clock */
   heard(sent, server) {
     const received = now();
-    this.echoes.push({ delay: received - sent, offset: server - (sent + received) / 2 });
+    const echo = { delay: received - sent, offset: server - (sent + received) / 2 };
+    this.echoes.push(echo);
     if (this.echoes.length > KEPT) this.echoes.shift();
-    const best = this.echoes.reduce((a, b) => (b.delay < a.delay ? b : a));
-    this.bound = best.delay / 2;
+    // An older echo that the newest one contradicts is from before a clock was set.
+    const agreeing = this.echoes.filter((e) => Math.abs(e.offset - echo.offset) <= (e.delay + echo.delay) / 2 + DRIFT_MS);
+    const best = agreeing.reduce((a, b) => (b.delay < a.delay ? b : a));
     this.offset = Math.min(Math.max(this.offset, best.offset - best.delay / 2), best.offset + best.delay / 2);
+    this.bound = best.delay / 2 + Math.abs(this.offset - best.offset);
   }
 
   /** A page time converted to the station's clock. */

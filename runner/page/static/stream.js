@@ -236,8 +236,8 @@ export class Stream {
 
   age({ captured }, time) {
     const { clock, limits, bound } = this.station;
-    const age = clock.server(time) - captured + bound + clock.bound; // at most; NaN if the capture time is unknown
-    if (age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
+    const age = clock.server(time) - captured + bound + clock.bound; // at most; not finite if a clock is unknown
+    if (Number.isFinite(age) && age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
   }
 
   note(meta, drawn) {
@@ -267,7 +267,8 @@ export class Stream {
 
   overlay(time) {
     if (this.status === "live") return "";
-    return words(this.status, time - this.arrived, this.late_age);
+    const late = this.status === "damaged" && time < this.late_until ? `, ${words("late", 0, this.late_age)}` : "";
+    return words(this.status, time - this.arrived, this.late_age) + late;
   }
 
   paint(time) {

@@ -24,7 +24,7 @@ const station = {
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
   online: true,
-  bound: 0, // by how much capture times may be wrong on the station's clock, ms
+  bound: NaN, // by how much capture times may be wrong on the station's clock, ms
   video: true,
   resync: (name) => send({ resync: name }),
   wake,
@@ -100,7 +100,7 @@ function heard(message) {
   if (message.kind === "clock") return station.clock.heard(message.page_ms, message.server_ms);
   if (message.kind === "hello") hello(message);
   if (message.kind === "state") decided(message);
-  if (message.kind === "sample") station.bound = message.clock_bound_ms ?? 0;
+  if (message.kind === "sample") station.bound = message.clock_bound_ms ?? NaN;
   tell({ kind: "server", message });
 }
 
@@ -167,7 +167,8 @@ function judgeAll() {
 function tellAges() {
   const ages = {};
   for (const { name, stages, status } of streams) {
-    const last = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured).sort((a, b) => a - b);
+    const drawn_ms = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured);
+    const last = Number.isFinite(drawn_ms.at(-1)) ? drawn_ms.filter(Number.isFinite).sort((a, b) => a - b) : [];
     const age_ms = last.length ? last[last.length >> 1] : NaN;
     ages[name] = { age_ms: Number.isFinite(age_ms) ? Math.max(0, age_ms) : null, bound_ms: station.bound + station.clock.bound, status };
   }
