@@ -162,7 +162,7 @@ class Telemetry:
 class SpeedAdvice:
     """Share of full speed that the latency of the operator's pictures allows, ten times a second.
 
-    Whoever drives the vehicle takes 0 for it once `expires_s` have passed without a newer one.
+    The driving function must assume 0 as soon as `expires_s` have passed without a newer one.
 
     latency_ms  from light to light, at most; None: unknown
     """
