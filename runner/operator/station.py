@@ -252,7 +252,7 @@ class Station:
         if state is None:
             return f"{self._vehicle.name}: offline"
         clock = self.clock
-        latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies unknown: clocks not compared yet"
+        latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
 
     def _compare_clocks(self, now: float) -> None:

@@ -174,7 +174,7 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     station, vehicle, listener = both
     station.take(FRESH)
     assert {row.received.latency_ms for row in station.rows()} == {None}
-    assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies unknown: clocks not compared yet"
+    assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies still unknown"
     assert station.captured_here(1000.0) is None
     vehicle.clock_ahead_s = 3.7
     report_until(station, lambda: station.clock)
