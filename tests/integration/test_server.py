@@ -342,7 +342,7 @@ def test_a_reader_that_stops_is_closed_and_does_not_delay_others(neighbour, smal
 
 @pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
 def test_a_viewer_that_joins_while_the_only_other_has_stopped_gets_the_picture(udp):
-    with serving() as vehicle:
+    with serving("media.session_timeout_s=600") as vehicle:  # it does not keep its session alive
         vehicle.turn(size=(960, 520), bitrate=6000)
         with RtspClient(vehicle.url(), small=True) as stopped:
             assert stopped.open() == [200, 200, 200]
