@@ -26,6 +26,16 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "data"))
 CLIPS = sorted((SHARED / "video").glob("*")) if SHARED.is_dir() else []
 
+# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
+ROBOT = (
+    "vehicle=delivery_robot",
+    "source=test",
+    "fps_max=15",
+    "modes=open_loop",
+    "pqos=constant",
+    "pqos.kbps=3000",
+    "page.serve=false",
+)
 
 # No sandbox inside containers; no background traffic to hosts that a closed network refuses anyway.
 CHROMIUM_FLAGS = [

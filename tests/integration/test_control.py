@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from rig import CHECKOUT, Operator, RecordingListener, free_port, process, run, until
+from rig import CHECKOUT, ROBOT, Operator, RecordingListener, free_port, process, run, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import find_mosquitto, private_broker
@@ -20,17 +20,6 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.station import Station
 from runner.vehicle.operators import SILENT_S
-
-# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
-ROBOT = (
-    "vehicle=delivery_robot",
-    "source=test",
-    "fps_max=15",
-    "modes=open_loop",
-    "pqos=constant",
-    "pqos.kbps=3000",
-    "page.serve=false",
-)
 
 
 @pytest.fixture

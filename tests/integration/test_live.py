@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rig import CLIPS, SHARED, Operator, free_port, process, run, until
+from rig import CLIPS, ROBOT, SHARED, Operator, free_port, process, run, until
 from runner.core.events import BitratePredicted
 from runner.core.model import Endpoint
 from runner.drive.read import read_drive
@@ -17,18 +17,6 @@ from runner.errors import RunError
 from runner.mqtt.broker import private_broker
 from runner.operator.frames import live_frames
 from runner.records import Sample
-
-# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
-ROBOT = (
-    "vehicle=delivery_robot",
-    "source=test",
-    "fps_max=15",
-    "modes=open_loop",
-    "pqos=constant",
-    "pqos.kbps=3000",
-    "page.serve=false",
-)
-
 
 NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'
 HUGE = b'{"id": "h", "event": "total_set", "kbps": 1e999}'
