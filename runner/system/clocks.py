@@ -6,11 +6,11 @@ from collections import deque
 from typing import NamedTuple
 
 MOST_DRIFT = 5e-4  # by which two clocks drift apart: crystals by 100 ppm; adjtime(3) slews a clock by 500 ppm
-SET_S = 5e-4  # a clock that moves by more than this and the drift, between two exchanges, was set
+SET_S = 5e-4  # a clock that moves by more than this and the drift, between two exchanges, was set or slewed faster
+STEP_S = 5e-3  # one that moves by this much was set, perhaps in the middle of an exchange
 KEPT_S = 10.0  # that an exchange counts; without a newer one nothing is known
 CLOCKS_APART_MS = -1.0  # in logs without exchanges: a negative age above it is noise, below it the clocks are apart
 TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age in which ages are unknown
-STEP_S = 5e-3  # likewise, and not by slewing
 
 
 class Exchange(NamedTuple):
