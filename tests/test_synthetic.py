@@ -234,7 +234,7 @@ def test_side_view_needs_more_bits(tmp_path: Path) -> None:
     from runner.synthetic.world import build_world
 
     build_world(12, tmp_path / "world")
-    ahead = replace(FORWARD, width=480, height=260, fps=Fraction(10))
+    ahead = replace(FORWARD, width=320, height=174, fps=Fraction(10))
     sizes = []
     for yaw in (0.0, 55.0, -55.0):
         view = replace(ahead, pose=replace(ahead.pose, yaw_deg=yaw))

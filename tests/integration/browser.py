@@ -40,12 +40,14 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
 
 def take_control(page):
     def taken():
-        """A user would click again if the page was still connecting."""
-        if (holder := page.evaluate("tod.control")) == "you":
+        """A user would click again if the page was still connecting, and may be asked for confirmation or not."""
+        if page.evaluate("tod.control") == "you":
             return True
-        page.locator("#take-control").click()
-        if holder == "another":  # asks for confirmation
-            page.locator("#confirm-yes").click()
+        confirm = page.locator("#confirm-yes")
+        if not confirm.is_visible():  # it may have opened late: the holder became known between two clicks
+            page.locator("#take-control").click()
+        if confirm.is_visible():
+            confirm.click()
         return rig.passes(lambda: page.evaluate("tod.control === 'you'"), seconds=2)
 
     until(taken)

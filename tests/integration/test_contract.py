@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from rig import Operator, RecordingListener, free_port, process, until
+from rig import SMALL_ROBOT, Operator, RecordingListener, free_port, process, until
 from runner import apply
 from runner.operator.frames import live_frames
 from runner.operator.live import live_operator
@@ -15,7 +15,7 @@ from runner.vehicle.live import live_vehicle
 from stand_in import RecordingOperator, RecordingVehicle
 
 # Not the measured link: a busy machine delays packets, which would lower it and with it the total.
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=10", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
+ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=10", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 CAMERAS = ("front", "rear", "mast")
 
 
@@ -113,7 +113,7 @@ def test_a_camera_that_is_switched_off_stops_and_resumes_as_it_was(operator, veh
 def test_a_region_of_interest_is_applied_whole(operator, vehicle):
     vehicle.watch("rear")
     operator.ask("1", event="mode_selected", mode="single")
-    roi = {"x": 100, "y": 50, "width": 320, "height": 240}
+    roi = {"x": 100, "y": 50, "width": 160, "height": 120}
     assert operator.ask("2", event="roi_set", camera="rear", **roi)["result"] == "applied"
     applied(operator, "rear", roi=roi)
     rear = operator.reach(lambda state: fits(state["cameras"]["rear"]))["cameras"]["rear"]

@@ -13,7 +13,7 @@ import pytest
 from drives import write_drive
 from helpers import Command
 
-from rig import CHECKOUT, answers, free_port, process, run, until
+from rig import CHECKOUT, SMALL_ROBOT, answers, free_port, process, run, until
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
@@ -102,8 +102,8 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     rest = [word for word in rest if not word.startswith("duration_s=")]
     robot = "vehicle=delivery_robot" in rest
     own = [word for word in SHORT[verb] if not any(given.startswith(word.partition("=")[0]) for given in rest)]
-    if robot:  # its pictures are large
-        own = ["fps_max=5" if word.startswith("fps_max=") else word for word in own]
+    if robot:
+        own += SMALL_ROBOT[1:]
     if "source=synthetic" in rest:
         own.append(LOOP)
     elif verb != "model" and not any(word.startswith("source=") for word in rest):

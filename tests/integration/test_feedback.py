@@ -6,7 +6,7 @@ from statistics import median
 
 import pytest
 
-from rig import Operator, free_port, process, run
+from rig import SMALL_ROBOT, Operator, free_port, process, run
 from runner.core.events import LinkMeasured
 from runner.core.uplink import LinkState
 from runner.drive.read import read_drive
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.gst
 
 NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
 RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
-ROBOT = ("vehicle=delivery_robot", "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
+ROBOT = (*SMALL_ROBOT, "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
 SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs all of its bitrate
 SECONDS, SETTLED_S = 14, 6
 

@@ -119,7 +119,7 @@ def test_its_camera_is_mounted_and_drives(tod, measured, tmp_path):
     assert printed["decision"]["demand_kbps"] == document["b_full_kbps"]
     ladder = list(zip(document["b_min_kbps"], document["scaling"], strict=True))
     assert printed["decision"]["scaling"] == max(pair for pair in ladder if pair[0] <= printed["decision"]["kbps"])[1]
-    drive = ("source=test", "page.serve=false", "fps_max=5", "duration_s=6", "pqos=constant", "pqos.kbps=9000")
+    drive = ("source=test", "page.serve=false", "fps_max=5", "duration_s=2", "pqos=constant", "pqos.kbps=9000")
     done = run("demo", *words, *drive)
     assert done.returncode == 0, done.stderr
     assert "front_center" in done.stdout

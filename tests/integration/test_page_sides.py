@@ -13,7 +13,7 @@ from functools import partial
 import pytest
 
 from browser import all_live, luma, measure, opened, send, shot, state_when, until
-from rig import CHECKOUT, answers, clock_ahead, free_port, needs_compiler, process
+from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_compiler, process
 from runner.core.model import Endpoint
 from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
@@ -26,7 +26,7 @@ pytestmark = [
 
 
 # Not the measured link: a busy machine delays packets, which would lower it and with it the total.
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
+ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=15", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 
 
 @contextmanager
