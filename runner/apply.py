@@ -16,6 +16,7 @@ from runner.errors import RunError
 from runner.graph import Plan, launch
 from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.aside import settle
+from runner.gst.clocks import captured_at
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
@@ -23,7 +24,7 @@ from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
-from runner.gst.video_files import VideoFile, VideoFiles, captured_at
+from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records import Arrival
 
@@ -223,6 +224,14 @@ class VehicleSide:
         """By camera, frames and bytes that its encoder has output since its pipeline was built."""
         return {name: p.counters() if (p := self._pipeline(name)) else (0, 0) for name in self._wanted}
 
+    def stages(self) -> dict[str, tuple[float, float]]:
+        """By camera, ms that a picture took from its capture to the encoder, and through it; unknown ones are left out.
+
+        To be called a few times a second, from one thread: each call also looks at the next picture of each source.
+        """
+        pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
+        return {name: stages for name, pipeline in pipelines.items() if (stages := pipeline.stages())}
+
     def faults(self) -> list[str]:
         """Values that elements refused since the last call; each is a bug or a wrong graph."""
         faults = []
@@ -234,7 +243,7 @@ class VehicleSide:
         return faults
 
     def sources(self) -> dict[str, str]:
-        """By camera, the fault of a source that has failed and is being replaced; the others are left out."""
+        """By camera, the fault of its source: it has failed and is being replaced, or repeats a picture."""
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
 
@@ -256,7 +265,9 @@ class VehicleSide:
             source.take_place(pipeline, plan)
         if self._video:
             VideoFile(self._video, name, "vehicle", captured_at, self._on_report).follow(pipeline)
-        return CameraPipeline(pipeline, plan, self._wanted_of(name), self._turned, source)
+        return CameraPipeline(
+            pipeline, plan, self._wanted_of(name), self._turned, lambda what: self._on_report(name, what), source
+        )
 
     def _turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built

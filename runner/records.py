@@ -133,11 +133,16 @@ class Offline:
 
 @dataclass(frozen=True, slots=True)
 class CameraTelemetry:
-    """Values read back as applied, and the encoder's output since its pipeline was built."""
+    """Values read back as applied, and the encoder's output since its pipeline was built.
+
+    capture_ms, encode_ms  of the last sampled picture, from its capture to the encoder, and through it; None: unknown
+    """
 
     applied: Applied
     frames: int
     bytes: int
+    capture_ms: float | None = None
+    encode_ms: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +223,25 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
+class LatencyStages:
+    """Parts of the latency from capture to decoding, ms, each of a picture sampled lately; None: unknown.
+
+    capture  to the encoder's input on the vehicle, with conversion, cropping and scaling
+    encode   through the encoder
+    link     from there to the operator's side: all that the other stages do not account for. The only one that depends
+             on the clocks, and right to within their `clock_bound_ms`
+    buffer   in the jitter buffer
+    decode   from the whole access unit to its picture
+    """
+
+    capture: float | None = None
+    encode: float | None = None
+    link: float | None = None
+    buffer: float | None = None
+    decode: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
@@ -227,6 +251,7 @@ class CameraSample:
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
+    stages_ms   the parts of it; None in older logs
     arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
 
     Latencies are right to within the sample's `clock_bound_ms`.
@@ -247,6 +272,7 @@ class CameraSample:
     bytes: int = 0
     damaged: int | None = None
     buffer_ms: int | None = None
+    stages_ms: LatencyStages | None = None
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 

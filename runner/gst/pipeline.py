@@ -10,6 +10,8 @@ from gi.repository import Gst, GstRtp
 from runner.core.commands import KnobValue
 from runner.graph import Plan
 from runner.gst.knobs import KnobPanel
+from runner.gst.repeats import RepeatedPicture
+from runner.gst.sender_stages import EncoderWatch, SenderStages
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
@@ -22,6 +24,7 @@ class CameraPipeline:
 
     wanted     the wanted knob values
     on_turned  called, from any thread, after knobs were set
+    on_report  called, from a streaming thread, with a fault of the source, and when it has passed
     source     the source, if it is watched
     """
 
@@ -31,6 +34,7 @@ class CameraPipeline:
         plan: Plan,
         wanted: Mapping[str, KnobValue],
         on_turned: Callable[[], None],
+        on_report: Callable[[str], None],
         source: WatchedSource | None = None,
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
@@ -40,6 +44,8 @@ class CameraPipeline:
             loop_clip(pipeline, plan)
         self._started = False
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
+        self._encoder = EncoderWatch(self._elements)
+        self._repeats = RepeatedPicture(self._elements[0].get_static_pad("sink"), on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._stamp(last.get_parent_element())
         self.knobs.set_now(self._allowed(wanted))
@@ -48,8 +54,9 @@ class CameraPipeline:
 
     @property
     def source_fault(self) -> str | None:
-        """The fault of a source that delivers nothing and is being replaced; None while it delivers."""
-        return self._source.outage.reason if self._source else None
+        """The fault of a source that delivers nothing and is being replaced, or repeats a picture; None: it is fine."""
+        failed = self._source.outage.reason if self._source else None
+        return failed or self._repeats.outage.reason
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
         """Set the knobs to the wanted values; `changed` holds those that are new."""
@@ -93,6 +100,14 @@ class CameraPipeline:
         """Frames and bytes that the encoder has output so far, counted in C."""
         sent = self._pipeline.get_by_name("sent")
         return counted(sent) if sent else (0, 0)
+
+    def stages(self) -> SenderStages | None:
+        """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.
+
+        None: unknown, as while nothing is sent
+        """
+        self._repeats.look()
+        return self._encoder.take()
 
     def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._started = True

@@ -42,6 +42,8 @@ class Reception:
     latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
                 first, and where it is older than CURRENT_S
     buffer_ms   how long a picture waits for packets that are sent again; None: they are not, or the transport does it
+    waited_ms   how long a sampled frame was in the jitter buffer; None: unknown, as without RTP
+    decode_ms   from a sampled access unit to its picture; None: unknown
     rebuilt     how often a pipeline that had received frames was rebuilt
     arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
                 by this machine's and by the vehicle's clock
@@ -57,6 +59,8 @@ class Reception:
     height: int = 0
     latency_ms: float | None = None
     buffer_ms: int | None = None
+    waited_ms: float | None = None
+    decode_ms: float | None = None
     rebuilt: int = 0
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
@@ -111,6 +115,8 @@ class Receiver:
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
         self._latency: tuple[float, float] | None = None  # ms, and when
+        self._decode: tuple[float, float] | None = None  # likewise
+        self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
@@ -129,7 +135,13 @@ class Receiver:
         """What was received so far; requests the latency of the next frame."""
         waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
         received = self._count()
-        received = replace(received, buffer_ms=max(waits, default=None), arrivals=self._arrived(received.frames))
+        waited = [ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None]
+        received = replace(
+            received,
+            buffer_ms=max(waits, default=None),
+            waited_ms=max(waited, default=None),
+            arrivals=self._arrived(received.frames),
+        )
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
             self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
@@ -241,20 +253,25 @@ class Receiver:
             lost=before.lost + sum(lost for _, _, lost in (buffer.packets for buffer in self._buffers)),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
-            latency_ms=self._latency[0] if self._latency and now - self._latency[1] <= CURRENT_S else None,
+            latency_ms=_current(self._latency, now),
+            decode_ms=_current(self._decode, now),
             rebuilt=self._supervised.rebuilt,
         )
 
     def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        captured = capture_time(info.get_buffer())
+        buffer, now = info.get_buffer(), time.monotonic()
+        captured, (pts, arrived) = capture_time(buffer), self._entered
         if captured is not None:
-            self._latency = (1000 * (time.time() - captured), time.monotonic())
+            self._latency = (1000 * (time.time() - captured), now)
+        if buffer.pts == pts:
+            self._decode = (1000 * (now - arrived), now)
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         """An access unit has arrived: page and log share its times; the vehicle receives them in a report."""
         arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
         captured = capture_time(buffer)
+        self._entered = (buffer.pts, monotonic)
         sampled = self._media_clock.seconds if captured is None else captured
         if sampled is not None:
             self._unread.append(Arrival(monotonic, sampled, buffer.get_size()))
@@ -304,6 +321,11 @@ class MediaClock:
         ahead = (counter - self._last) & 0xFFFFFFFF
         self._ticks += ahead - (ahead >> 31 << 32)  # of two directions the shorter
         self._last, self.seconds = counter, self._ticks * self._tick_s
+
+
+def _current(measured: tuple[float, float] | None, now: float) -> float | None:
+    """A figure in ms that was measured lately."""
+    return measured[0] if measured and now - measured[1] <= CURRENT_S else None
 
 
 def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 
 from gi.repository import GObject, Gst
 
@@ -17,6 +18,8 @@ MEMORY = 0.75  # of that share, from one look to the next
 UNKNOWN_MS = 100  # taken for the round trip until the first packet was sent again
 LONGEST_MS = 300  # a picture that is later is of no use for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
+FRAMES = 64  # whose end is remembered
+CURRENT_S = 1.0  # an older figure is not current
 MARKER, HALF = 0x80, 0x8000  # of the RTP header (RFC 3550, section 5.1); half of all sequence numbers
 
 
@@ -42,6 +45,9 @@ class RepairBuffer:
         self._open = self._asked = False  # the frame has not ended; its next packet was requested
         self._gap = 0.0
         self._tails = 0  # packets that came because they were requested here
+        self._ends: deque[tuple[bytes, float]] = deque(maxlen=FRAMES)  # of frames whose last packet came: stamp, when
+        self._waited: tuple[float, float] | None = None  # ms that a frame waited here lately, and when
+        self._timing = False
         self._counted = (0, 0)  # packets that came, and that were missing
         self._missing = 0.0  # share of packets, lately
         self._full = False  # nothing is requested
@@ -62,6 +68,22 @@ class RepairBuffer:
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
         return wait_ms
+
+    def waited_ms(self) -> float | None:
+        """How long the end of a frame waited here lately; requests that of the next. A few times a second."""
+        if not self._timing:
+            self._timing = True
+            self._buffer.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_passed)
+        waited = self._waited
+        return waited[0] if waited and time.monotonic() - waited[1] <= CURRENT_S else None
+
+    def _on_passed(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        header, now = info.get_buffer().extract_dup(1, 7), time.monotonic()
+        came = next((at for stamp, at in self._ends if stamp == header[3:]), None)
+        if not header[0] & MARKER or came is None:
+            return Gst.PadProbeReturn.OK
+        self._waited, self._timing = (1000 * (now - came), now), False
+        return Gst.PadProbeReturn.REMOVE
 
     def _look(self) -> None:
         """Whether the link is full."""
@@ -93,6 +115,8 @@ class RepairBuffer:
             self._tails += 1
         elif stamp == self._stamp:
             self._gap = max(now - self._at, FORGET * self._gap)
+        if header[0] & MARKER:
+            self._ends.append((stamp, now))
         self._newest, self._stamp, self._at = number, stamp, now
         self._open, self._asked = not header[0] & MARKER, False
         return Gst.PadProbeReturn.OK

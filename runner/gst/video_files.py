@@ -11,8 +11,6 @@ from pathlib import Path
 
 from gi.repository import Gst
 
-from runner.gst.clocks import unix_time
-
 DIRECTORY = "video"  # below the drive's directory
 _MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
@@ -113,16 +111,6 @@ class VideoFile:
 def concerns_file(message: Gst.Message) -> bool:
     """Whether a message comes from an element that only serves the file."""
     return bool(message.src) and message.src.get_name().startswith(_MARK)
-
-
-def captured_at(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
-    """Capture time of a frame on this machine, s since 1970, from its running time."""
-    element = pad.get_parent_element()
-    segment, clock = pad.get_sticky_event(Gst.EventType.SEGMENT, 0), element.get_clock()
-    if segment is None or clock is None:
-        return time.time()
-    running = segment.parse_segment().to_running_time(Gst.Format.TIME, buffer.pts)
-    return unix_time(clock, element.get_base_time(), running)
 
 
 def _new_file(directory: Path, camera: str, side: str) -> Path:

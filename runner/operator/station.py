@@ -32,6 +32,8 @@ from runner.records import (
     Arrival,
     CameraSample,
     CameraState,
+    CameraTelemetry,
+    LatencyStages,
     Note,
     Outcome,
     ReceptionReport,
@@ -226,14 +228,16 @@ class Station:
     def _worst_latency_ms(self, now: float) -> float | None:
         """Latency of the slowest picture on show, at most, ms; None: unknown, or nothing is to be shown.
 
-        Of each camera the greater of its newest access unit's to arrival and the last sampled one's to decoding; and by
-        how much the next one is overdue.
+        Unknown as soon as the source of one has a fault. Of each camera the greater of its newest access unit's to
+        arrival and the last sampled one's to decoding; and by how much the next one is overdue.
         """
         clock, state, found = self.clock, self.state, []
         wall = time.time() - now  # of the monotonic clock
         for name, camera in (state.cameras if state else {}).items():
             if not camera.sending:
                 continue
+            if camera.fault:  # it may repeat a picture, so that the age of what arrives says nothing
+                return None
             sampled, newest = self.samples.get(name), self._newest.get(name)
             if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
                 return None
@@ -268,8 +272,9 @@ class Station:
         return counters
 
     def _sample(self) -> Sample:
-        cameras = {row.name: _camera_sample(row) for row in self.rows()}
         telemetry = self._telemetry if self.state else None
+        measured = telemetry.cameras if telemetry else {}
+        cameras = {row.name: _camera_sample(row, measured.get(row.name)) for row in self.rows()}
         return Sample(
             t=time.time(),
             predicted_kbps=telemetry.predicted_kbps if telemetry else None,
@@ -398,7 +403,7 @@ class Station:
         self._set_state(None)
 
 
-def _camera_sample(row: CameraRow) -> CameraSample:
+def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSample:
     received, state = row.received, row.state
     return CameraSample(
         fps=round(row.rates.fps, 1),
@@ -416,4 +421,14 @@ def _camera_sample(row: CameraRow) -> CameraSample:
         bytes=received.bytes,
         damaged=received.damaged,
         buffer_ms=received.buffer_ms,
+        stages_ms=_stages(received, measured),
     )
+
+
+def _stages(received: StreamCounters, measured: CameraTelemetry | None) -> LatencyStages:
+    """The parts of a camera's latency: those that each side has measured, and the link as what they leave over."""
+    capture, encode = (measured.capture_ms, measured.encode_ms) if measured else (None, None)
+    buffer, decode, total = received.waited_ms, received.decode_ms, received.latency_ms
+    parts = [part for part in (capture, encode, buffer, decode) if part is not None]
+    link = total - sum(parts) if total is not None and len(parts) == 4 else None
+    return LatencyStages(*(None if ms is None else round(ms, 2) for ms in (capture, encode, link, buffer, decode)))

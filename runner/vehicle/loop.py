@@ -62,6 +62,7 @@ class Applier(Protocol):
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
+    def stages(self) -> Mapping[str, tuple[float, float]]: ...
     def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
 
@@ -410,9 +411,11 @@ class ControlLoop:
 
     def _publish_measured(self, t: float) -> None:
         """Publish what was read back from the elements, and what the encoders have output so far."""
-        sent = self.applier.sent()
+        sent, stages = self.applier.sent(), self.applier.stages()
         cameras = {
-            name: CameraTelemetry(applied_to_json(name, knobs), *sent[name])
+            name: CameraTelemetry(
+                applied_to_json(name, knobs), *sent[name], *(round(ms, 2) for ms in stages.get(name, ()))
+            )
             for name, knobs in self.applier.applied().items()
         }
         prediction = self._run.state.prediction

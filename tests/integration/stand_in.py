@@ -58,6 +58,9 @@ class RecordingVehicle:
     def sources(self) -> dict[str, str]:
         return {}
 
+    def stages(self) -> dict[str, tuple[float, float]]:
+        return {}
+
     def copies(self) -> dict[str, int]:
         return {}
 

@@ -12,7 +12,10 @@ from runner.core.uplink import LinkState
 from runner.drive.read import read_drive
 from runner.records import DecisionMade, LinkSample, ReceptionReported
 
-pytestmark = pytest.mark.gst
+pytestmark = [
+    pytest.mark.gst,
+    pytest.mark.alone,
+]  # load delays packets, and so lowers the measured link
 
 NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
 RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"

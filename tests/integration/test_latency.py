@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from statistics import median
 
 import pytest
 
@@ -11,7 +12,7 @@ from rig import SMALL_ROBOT, Operator, clock_ahead, free_port, needs_compiler, p
 from runner.drive.read import read_drive
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
-from runner.records import Sample, Telemetry
+from runner.records import Sample, Telemetry, to_json
 from runner.schema import message_problem
 
 AHEAD_MS, ONE_WAY_MS = 3700, 80
@@ -37,6 +38,8 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     for camera in ("front", "rear", "mast"):
         shown = [sample.cameras[camera].latency_ms is not None for sample in samples]
         assert sum(shown) >= 0.99 * len(shown)
+    for camera in ("front", "rear", "mast"):
+        check_stages([sample.cameras[camera] for sample in known], max(sample.clock_bound_ms for sample in known))
     # What a latency shows too much is what the difference of the clocks is wrong by.
     wrong = [abs(sample.clock_ahead_ms - sign * AHEAD_MS) for sample in known]
     assert sum(w <= sample.clock_bound_ms for w, sample in zip(wrong, known, strict=True)) >= 0.99 * len(known)
@@ -52,6 +55,17 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     (found,) = json.loads((report / "report.json").read_text())["drives"]
     assert ONE_WAY_MS / 4 < found["latency_arrival_ms"]["bound"] < 2 * ONE_WAY_MS
     assert found["latency_arrival_ms"]["median"] > 0
+
+
+def check_stages(received, bound_ms):
+    """The stages of one camera add up to its latency, and the delay of the link is found in the link's."""
+    whole = [camera for camera in received if camera.stages_ms.link is not None]
+    assert len(whole) >= 0.8 * len(received)
+    for camera in whole:
+        stages = to_json(camera.stages_ms)
+        assert sum(stages.values()) == pytest.approx(camera.latency_ms, abs=0.05)
+        assert min(stages[name] for name in ("capture", "encode", "buffer", "decode")) >= 0
+    assert median(camera.stages_ms.link for camera in whole) > ONE_WAY_MS - bound_ms - 5
 
 
 def test_a_flood_of_reports_is_not_answered_with_a_flood(broker):

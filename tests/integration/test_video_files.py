@@ -18,6 +18,7 @@ from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import ConfigError
 from runner.gst import Gst, video_files
+from runner.gst.clocks import captured_at
 from runner.plans import compile_plans
 
 CAMERAS = ("front", "rear")
@@ -157,7 +158,7 @@ def test_the_file_does_not_affect_the_stream(sides):
         pipeline.add(end)
         pipeline.get_by_name("pay0").link(end)
         if plan.video:
-            video_files.VideoFile(sides.files, "front", "vehicle", video_files.captured_at, sides.report).follow(
+            video_files.VideoFile(sides.files, "front", "vehicle", captured_at, sides.report).follow(
                 pipeline
             )
         pipeline.set_state(Gst.State.PLAYING)

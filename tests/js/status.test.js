@@ -8,7 +8,7 @@ import { judge, words } from "../../runner/page/static/status.js";
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
 const LIVE = {
-  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, damaged: false,
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, damaged: false, faulty: false,
   arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
@@ -36,6 +36,8 @@ const CASES = [
   ["damaged", { damaged: true }],
   ["damaged", { damaged: true, late_until: NOW + 1 }],
   ["frozen", { damaged: true, arrived: NOW - 500 }],
+  ["frozen", { faulty: true }], // pictures come, and may be the same one again and again
+  ["off", { faulty: true, on: false }],
 ];
 for (const [status, more] of CASES) test(`${status}: ${JSON.stringify(more)}`, () => assert.equal(judged(more), status));
 

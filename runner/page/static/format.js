@@ -5,6 +5,9 @@ const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0, useGroupin
 /** A whole number, "–" where unknown. */
 export const whole = (value) => (Number.isFinite(value) ? WHOLE.format(value) : "–");
 
+/** To a tenth, "–" where unknown; below 0 only because of the clocks, and shown as 0. */
+export const tenth = (value) => (Number.isFinite(value) ? Math.max(0, value).toFixed(1) : "–");
+
 /** A factor in its shortest exact form: 0.25, 0.125. */
 export const factor = (value) => (Number.isFinite(value) ? String(Math.round(value * 1e4) / 1e4) : "–");
 

@@ -87,6 +87,11 @@ function refreshTotals() {
   write(by("speed"), `${whole(100 * (factor ?? 0))} %`);
 }
 
+function refreshSkew() {
+  by("skew-total").hidden = store.skew_ms === null;
+  write(by("skew"), `${whole(store.skew_ms)} ms`);
+}
+
 function moveFocus(event) {
   const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
   if (!step) return;
@@ -107,6 +112,7 @@ export function startHeader() {
   by("help-open").addEventListener("click", () => publish("help"));
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
+  listen("ages", refreshSkew);
   setTimeout(refresh, START_MS + 50);
   refresh();
 }

@@ -18,8 +18,9 @@ const heard = {
     store.refused[camera] = why;
     publish("status", { camera, status });
   },
-  ages({ ages }) {
+  ages({ ages, skew_ms }) {
     store.ages = ages;
+    store.skew_ms = skew_ms;
     publish("ages", ages);
   },
   sent: ({ id, sent }) => sent || publish("unsent", id),

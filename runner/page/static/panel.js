@@ -6,7 +6,7 @@ import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js"
 import { makeSlider } from "./slider.js";
 import { SHAPES, switchCamera, unapplied } from "./tiles.js";
 import { colourOf } from "./colours.js";
-import { by, factor, make, mark, region, size, whole, write } from "./format.js";
+import { by, factor, latency, make, mark, region, size, tenth, whole, write } from "./format.js";
 
 const SIDES = ["x", "y", "width", "height"];
 const WHY = {
@@ -44,6 +44,17 @@ const full = make("button", { "data-control": "roi-full", onclick: () => sendFul
 const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), is: make("i", { class: "is" }), wish: make("i", { class: "wish" }) };
 const differing = make("p", { class: "differing" });
 const rows = new Map();
+const STAGES = {
+  capture: ["Capture", "on the vehicle, to the encoder: conversion, region and scaling"],
+  encode: ["Encode", "through the encoder"],
+  link: ["Link", "from the encoder to the station; right to within the bound of the clocks"],
+  buffer: ["Jitter buffer", "wait for packets that are late, overtaken or sent again"],
+  page: ["To this page", "from the station to this page"],
+  decode: ["Decode", "in this browser; in a page without video, at the station"],
+  draw: ["Draw", "until the picture was drawn; the screen adds its own delay"],
+};
+const latencies = new Map(); // by stage
+const age = make("td");
 let edited = new Set(); // inputs that the operator is changing: not to be overwritten
 
 function number(control, label, limits) {
@@ -65,6 +76,16 @@ function comparison() {
   }
   const head = make("tr", {}, ...["", "Decided", "Applied"].map((text) => make("th", { scope: "col" }, text)));
   return make("table", { class: "facts" }, make("caption", { class: "unseen" }, "decided and applied values"), make("thead", {}, head), body);
+}
+
+function stageTable() {
+  const body = make("tbody");
+  for (const [stage, [label, what]] of Object.entries(STAGES)) {
+    latencies.set(stage, make("td"));
+    body.append(make("tr", { title: what }, make("th", { scope: "row" }, label), latencies.get(stage)));
+  }
+  body.append(make("tr", { class: "sum", title: "capture to drawing" }, make("th", { scope: "row" }, "Latency"), age));
+  return make("table", { class: "facts" }, make("caption", {}, "Latency, ms"), body);
 }
 
 // --- requests ---------------------------------------------------------------------------------------------------------
@@ -115,6 +136,7 @@ function refresh() {
   refreshSettings(about, now);
   refreshComparison(now);
   refreshDiagram(about);
+  refreshStages();
 }
 
 function refreshHead(now) {
@@ -191,6 +213,16 @@ function refreshComparison(now) {
   write(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
 }
 
+/** Where the time goes between capture and drawing. Stages are sampled one by one: their sum is about the latency. */
+function refreshStages() {
+  const silent = !store.connected || !decided(name())?.sending;
+  const drawn = silent ? undefined : store.ages[name()];
+  const stages = silent ? undefined : store.sample?.cameras[name()]?.stages_ms;
+  const parts = { ...stages, ...(Number.isFinite(drawn?.age_ms) ? drawn?.parts_ms : {}) };
+  for (const [stage, cell] of latencies) write(cell, tenth(parts[stage]));
+  write(age, latency(drawn?.age_ms, drawn?.bound_ms));
+}
+
 /** Position of the region in the full image: solid as shown, dashed as requested. */
 function refreshDiagram(about) {
   diagram.box.style.aspectRatio = `${about.width} / ${about.height}`;
@@ -231,7 +263,7 @@ export function startPanel() {
       diagram.box),
   );
   const head = make("div", { class: "head" }, swatch, title, status, on);
-  by("camera-panel").append(head, reason, controls, comparison(), differing);
+  by("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
   listen("hello state sample control requests socket status theme", refresh);
   listen("selected", forget);
 }

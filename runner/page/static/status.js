@@ -11,6 +11,7 @@ const INTERVALS = 1.3; // this many frame intervals without a picture are more t
  * @property {boolean|null} sending
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
+ * @property {boolean} faulty whether the source has a fault: pictures that arrive may be repeated ones
  * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream
  * @property {number} decoded likewise
@@ -30,7 +31,7 @@ export function judge(s, limits, now) {
   if (s.refused) return "unsupported";
   if (!s.drawn) return "synchronising";
   const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
-  if (now - Math.min(s.arrived, s.decoded) > limit) return "frozen";
+  if (s.faulty || now - Math.min(s.arrived, s.decoded) > limit) return "frozen";
   if (s.damaged) return "damaged";
   return now < s.late_until ? "late" : "live";
 }
@@ -38,7 +39,7 @@ export function judge(s, limits, now) {
 /**
  * The words on an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
  * @param {string} status
- * @param {number} since_ms since the newest unit
+ * @param {number} since_ms since the newest unit, or since its source has a fault
  * @param {number} age_ms of the last late picture
  */
 export function words(status, since_ms, age_ms) {

@@ -37,7 +37,8 @@ const listeners = new Map();
  * @property {Applied} applied
  * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>}} State
  * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
- *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null}} CameraSample
+ *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null, stages_ms?: Stages|null}} CameraSample
+ * @typedef {Record<"capture"|"encode"|"link"|"buffer"|"decode", number|null>} Stages
  * @typedef {object} Sample
  * @property {number} time s since 1970
  * @property {number|null} predicted_kbps
@@ -64,7 +65,8 @@ const listeners = new Map();
  * @property {ReturnType<typeof emptySeries>} series
  * @property {Record<string, string>} status
  * @property {Record<string, string>} refused
- * @property {Record<string, {age_ms: number|null, bound_ms: number}>} ages
+ * @property {Record<string, {age_ms: number|null, bound_ms: number, parts_ms: {page: number, decode: number, draw: number}|null}>} ages
+ * @property {number|null} skew_ms
  * @property {string|null} selected
  * @property {string|null} enlarged
  */
@@ -80,7 +82,8 @@ export const store = {
   series: emptySeries([]),
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
-  ages: {}, // by camera, capture to drawing, and by how much that may be wrong
+  ages: {}, // by camera, capture to drawing, by how much that may be wrong, and its parts on the page
+  skew_ms: null, // between the capture times of the oldest and of the newest picture on show
   selected: null,
   enlarged: null,
 };

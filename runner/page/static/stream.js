@@ -61,6 +61,8 @@ export class Stream {
     this.patience = RESYNC_EVERY_MS;
     this.transit = null; // usual time from the station to here
     this.on = this.sending = null;
+    /** @type {number|null} */
+    this.failed_at = null; // since when the source has a fault: it may repeat a picture as new
     this.status = this.reported = "synchronising";
     /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
@@ -76,9 +78,10 @@ export class Stream {
   }
 
   /** The vehicle's decision about this camera. */
-  decide({ on, sending }) {
+  decide({ on, sending, fault }) {
     const begins = on && sending && (this.on === false || this.sending === false);
     Object.assign(this, { on, sending });
+    this.failed_at = fault ? (this.failed_at ?? now()) : null;
     if (begins) this.started();
   }
 
@@ -251,7 +254,8 @@ export class Stream {
   times() {
     const { connected, online } = this.station;
     const { on, sending, refused, drawn, damaged, arrived, decoded, late_until } = this;
-    return { connected, online, on, sending, refused, drawn, damaged, arrived, decoded, late_until, fps: this.camera.fps };
+    const faulty = this.failed_at !== null;
+    return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: this.camera.fps };
   }
 
   /** Judge the status; returns whether it has changed. Called by a timer. */
@@ -268,7 +272,7 @@ export class Stream {
   overlay(time) {
     if (this.status === "live") return "";
     const late = this.status === "damaged" && time < this.late_until ? `, ${words("late", 0, this.late_age)}` : "";
-    return words(this.status, time - this.arrived, this.late_age) + late;
+    return words(this.status, time - Math.min(this.arrived, this.failed_at ?? Infinity), this.late_age) + late;
   }
 
   paint(time) {

@@ -3,6 +3,7 @@
  * Text messages from the station are passed to the page unchanged; pictures go to the canvases that it has transferred.
  */
 
+import { ageOf, skewOf } from "./ages.js";
 import { Clock, now } from "./clock.js";
 import { hasGpu } from "./picture.js";
 import { Stream } from "./stream.js";
@@ -163,16 +164,12 @@ function judgeAll() {
   }
 }
 
-/** Report the ages that the page shows: the median age of the last pictures drawn. */
+/** Report the ages that the page shows, and how far apart in time the pictures of the cameras are. */
 function tellAges() {
-  const ages = {};
-  for (const { name, stages, status } of streams) {
-    const drawn_ms = stages.slice(-15).map(([captured, , , , drawn]) => drawn - captured);
-    const last = Number.isFinite(drawn_ms.at(-1)) ? drawn_ms.filter(Number.isFinite).sort((a, b) => a - b) : [];
-    const age_ms = last.length ? last[last.length >> 1] : NaN;
-    ages[name] = { age_ms: Number.isFinite(age_ms) ? Math.max(0, age_ms) : null, bound_ms: station.bound + station.clock.bound, status };
-  }
-  tell({ kind: "ages", ages });
+  const bound_ms = station.bound + station.clock.bound;
+  const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages), bound_ms, status }]));
+  const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
+  tell({ kind: "ages", ages, skew_ms });
 }
 
 // --- the page ---------------------------------------------------------------------------------------------------------

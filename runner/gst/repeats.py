@@ -1,0 +1,64 @@
+"""Recognises by content a source that repeats its last picture as new: a camera that hangs behind a working driver."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable
+
+from gi.repository import Gst
+
+from runner.gst.outage import Outage
+
+SLICES, SLICE_BYTES = 16, 8192  # of a picture that are compared: the noise of a sensor is everywhere
+REPEATED_S = 1.0  # the same picture for longer is no live one
+LOOKS = 4  # and at least so often
+
+
+class RepeatedPicture:
+    """Compares parts of one picture in many: no Python runs for the others.
+
+    pad        where raw pictures pass; others, and those outside the main memory, are not compared
+    on_report  called with a sentence when repetition begins, and when it ends
+    """
+
+    def __init__(self, pad: Gst.Pad, on_report: Callable[[str], None]) -> None:
+        self._pad = pad
+        self.outage = Outage(on_report)
+        self._armed = False
+        self._digest: int | None = None
+        self._since, self._looks = 0.0, 0
+
+    def look(self) -> None:
+        """Request a look at the next picture; to be called a few times a second, from one thread."""
+        if not self._armed:
+            self._armed = True
+            self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_picture)
+
+    def _on_picture(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        self._armed = False
+        caps, now = pad.get_current_caps(), time.monotonic()
+        if not caps or not _is_readable(caps):
+            return Gst.PadProbeReturn.REMOVE
+        digest = _digest(info.get_buffer())
+        if digest != self._digest:
+            self._digest, self._since, self._looks = digest, now, 1
+            self.outage.over(now)
+        else:
+            self._looks += 1
+            if now - self._since >= REPEATED_S and self._looks >= LOOKS:
+                self.outage.failed("source: repeats the same picture", self._since)
+        return Gst.PadProbeReturn.REMOVE
+
+
+def _is_readable(caps: Gst.Caps) -> bool:
+    in_memory = caps.get_features(0).contains(Gst.CAPS_FEATURE_MEMORY_SYSTEM_MEMORY)
+    return bool(in_memory and caps.get_structure(0).get_name() == "video/x-raw")
+
+
+def _digest(picture: Gst.Buffer) -> int:
+    step = max(0, picture.get_size() - SLICE_BYTES) / (SLICES - 1)
+    digest = 0
+    for number in range(SLICES):
+        digest = zlib.crc32(picture.extract_dup(round(number * step), SLICE_BYTES), digest)
+    return digest

@@ -1,0 +1,69 @@
+"""How long a picture takes on the vehicle: from its capture into the encoder, and through it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from gi.repository import Gst
+
+from runner.gst.clocks import captured_at
+
+CURRENT_S = 1.0  # older figures are not current
+SAME_S = 1e-5  # capture times of the same picture on both sides of the encoder
+
+
+class SenderStages(NamedTuple):
+    """Of one picture, ms. capture: to the encoder's input, with conversion, cropping and scaling."""
+
+    capture_ms: float
+    encode_ms: float
+
+
+class EncoderWatch:
+    """Measures one picture in many as it enters and leaves the encoder: no Python runs for the others.
+
+    elements  of the pipeline from gate to payloader; without an encoder among them nothing is measured
+    """
+
+    def __init__(self, elements: Iterable[Gst.Element]) -> None:
+        encoder = next((element for element in elements if _is_encoder(element)), None)
+        self._into: Any = encoder.get_static_pad("sink") if encoder else None
+        self._out: Any = encoder.get_static_pad("src") if encoder else None
+        self._armed = False
+        self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
+        self._measured: tuple[float, SenderStages] | None = None  # s by the monotonic clock
+
+    def take(self) -> SenderStages | None:
+        """The last figures, if they are current; requests those of the next picture.
+
+        To be called a few times a second, from one thread.
+        """
+        if self._into and not self._armed:
+            self._armed = True
+            self._into.add_probe(Gst.PadProbeType.BUFFER, self._on_raw)
+        measured = self._measured  # a streaming thread may replace it
+        return measured[1] if measured and time.monotonic() - measured[0] <= CURRENT_S else None
+
+    def _on_raw(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        captured = captured_at(pad, info.get_buffer())
+        self._entered = (captured, 1000 * (time.time() - captured))
+        self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_coded)
+        return Gst.PadProbeReturn.REMOVE
+
+    def _on_coded(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        now = time.time()
+        captured, capture_ms = self._entered
+        ahead_s = captured_at(pad, info.get_buffer()) - captured
+        if ahead_s < -SAME_S:
+            return Gst.PadProbeReturn.OK  # one that the encoder took earlier
+        if ahead_s < SAME_S:  # else it has dropped the picture
+            stages = SenderStages(capture_ms, 1000 * (now - captured) - capture_ms)
+            self._measured = (time.monotonic(), stages)
+        self._armed = False
+        return Gst.PadProbeReturn.REMOVE
+
+
+def _is_encoder(element: Gst.Element) -> bool:
+    return "Encoder" in (element.get_factory().get_metadata("klass") or "")
