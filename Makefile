@@ -28,7 +28,6 @@ untimed: $(TEST_READY) $(NODE_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
 
 golden: $(TEST_READY)
-	$(BIN)/tod-runner validate all=true
 	$(BIN)/python tests/golden
 
 units: $(TEST_READY)

@@ -235,3 +235,15 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
         until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts further keyframes
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         shot(page, "h265")
+
+
+def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
+    """Pictures come as always; only their content shows that none of them is new."""
+    still = "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true, pattern: circular}}, "
+    raw = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}]"
+    with sides() as (url, vehicle, _), vehicle(still + raw), opened(chromium, url) as page:
+        until(lambda: {camera["status"] for camera in measure(page).values()} == {"frozen"})
+        counted = measure(page)
+        until(lambda: all(camera["drawn"] > counted[name]["drawn"] + 5 for name, camera in measure(page).items()))
+        assert {camera["status"] for camera in measure(page).values()} == {"frozen"}
+        assert page.locator("[data-camera=rear] .refused").inner_text() == "source: repeats the same picture"
