@@ -232,6 +232,12 @@ class VehicleSide:
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: stages for name, pipeline in pipelines.items() if (stages := pipeline.stages())}
 
+    def send_key_frames(self, cameras: Iterable[str]) -> None:
+        """Let the encoders of these cameras start anew, as their graphs allow; unknown cameras are left out."""
+        for name in cameras:
+            if name in self._wanted and (pipeline := self._pipeline(name)):
+                pipeline.send_key_frame()
+
     def faults(self) -> list[str]:
         """Values that elements refused since the last call; each is a bug or a wrong graph."""
         faults = []
@@ -342,6 +348,10 @@ class OperatorSide:
     def take_arrivals(self) -> dict[str, list[Arrival]]:
         """By camera, the access units that have arrived since the last call; to be called from one thread."""
         return {name: receiver.take_arrivals() for name, receiver in self._receivers.items()}
+
+    def damaged(self) -> list[str]:
+        """Cameras whose newest picture shows that packets were lost for good."""
+        return [name for name, receiver in self._receivers.items() if receiver.is_damaged]
 
     def take_packets(self) -> tuple[int, int]:
         """RTP packets of all cameras received, and missing at first, since the last call; from one thread."""

@@ -335,6 +335,7 @@ class ReceptionReport:
     units          in order of arrival
     packets, lost  RTP packets of all cameras received, and missing at first: some may have been repaired
     latency_ms     age of the oldest picture on show, from capture to decoding, at most; absent: unknown
+    damaged        cameras whose newest picture shows that packets were lost for good; absent: none
     sent           s since 1970, by the operator's clock; given where the vehicle is to answer with a `ClockAnswer`
     """
 
@@ -344,6 +345,7 @@ class ReceptionReport:
     packets: int
     lost: int
     latency_ms: float | UnsetType = UNSET
+    damaged: tuple[str, ...] | UnsetType = UNSET
     sent: float | UnsetType = UNSET
 
 

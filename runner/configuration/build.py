@@ -45,7 +45,7 @@ from runner.system.files import file_problem
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
-GRAPH_STRUCTURE = ("defaults", "transport", "verified", "vehicle", "operator", "wire", "knobs", "mutable")
+GRAPH_STRUCTURE = ("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable")
 
 T = TypeVar("T")
 
@@ -344,7 +344,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         knobs={knob: tuple(KnobTarget(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
         settings=settings,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
-        **_given(data, ("verified",)),
+        **_given(data, ("verified", "key_frame")),
     )
 
 

@@ -162,6 +162,8 @@ class Graph:
     settings   named numbers of the graph (mtu_bytes, jitter_buffer_ms, ...) that properties refer to as {name}
     mutable    (element, property) that knobs set although GStreamer does not declare it mutable while playing
     verified   False: checked against its schema only, never run by this project's tests
+    key_frame  how to make the encoder start anew when packets were lost for good: "event", GStreamer's own; "caps",
+               a pixel aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
     """
 
     transport: str
@@ -173,6 +175,7 @@ class Graph:
     settings: Mapping[str, Value]
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
+    key_frame: str | None = None
 
     def __post_init__(self) -> None:
         names = [element.name for element in (*self.vehicle, *self.wire_vehicle)]
@@ -186,6 +189,8 @@ class Graph:
                 if turn.element not in names:
                     rule = f"no such element{suggest(turn.element, names)}"
                     raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
+        if self.key_frame == "caps" and [turn.property for turn in self.knobs["size"]] != ["caps"]:
+            raise ModelError("key_frame", "'caps'", "needs a knob `size` that sets the caps of one element")
         turned = {(turn.element, turn.property) for turns in self.knobs.values() for turn in turns}
         for index, pair in enumerate(self.mutable):
             if pair not in turned:

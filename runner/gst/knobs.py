@@ -12,6 +12,8 @@ from runner.core.commands import KnobValue
 from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
 
+ANOTHER_RATIO = (4001, 4000)
+
 
 class KnobPanel:
     """The knobs of one camera's pipeline, rebuilt with the pipeline.
@@ -54,6 +56,20 @@ class KnobPanel:
         # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()
         above.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
+
+    def set_anew(self, knob: str) -> None:
+        """Set the caps of a knob anew, with a pixel aspect ratio that differs: the encoder starts anew.
+
+        The ratio changes between 1 and 4001/4000, which nobody sees.
+        """
+        with self._lock:
+            if knob not in self.applied:
+                return
+            for name, _, _ in self._assignments(knob, self.applied[knob]):
+                caps = self._by_name[name].get_property("caps").copy()
+                _, above, below = caps.get_structure(0).get_fraction("pixel-aspect-ratio")
+                caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if above != below else ANOTHER_RATIO)))
+                self._by_name[name].set_property("caps", caps)
 
     def _between_frames(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._set_waiting()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gi.repository import Gst, GstRtp
+from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
 from runner.graph import Plan
@@ -100,6 +100,15 @@ class CameraPipeline:
         """Frames and bytes that the encoder has output so far, counted in C."""
         sent = self._pipeline.get_by_name("sent")
         return counted(sent) if sent else (0, 0)
+
+    def send_key_frame(self) -> None:
+        """Let the encoder start anew with its next picture, if the graph states how."""
+        match self._plan.camera.graph.key_frame:
+            case "caps":
+                self.knobs.set_anew("size")
+            case "event":
+                event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
+                self._pipeline.get_by_name("sent").get_static_pad("sink").push_event(event)
 
     def stages(self) -> SenderStages | None:
         """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.

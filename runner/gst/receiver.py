@@ -163,6 +163,11 @@ class Receiver:
         """Access units that have arrived since the last call. From any one thread."""
         return [self._unread.popleft() for _ in range(len(self._unread))]
 
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the newest picture shows that packets were lost for good."""
+        return self._damage.lasts
+
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
         before = self._packets

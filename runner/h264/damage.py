@@ -19,7 +19,7 @@ class Damage:
 
     def __init__(self, codec: str) -> None:
         self._codec = codec
-        self._damaged = False
+        self.lasts = False  # until the picture is healed
         self._left: int | None = None  # frames of the wave that heals; None: none has begun since the loss
 
     def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:
@@ -29,11 +29,11 @@ class Damage:
         head        returns its first HEAD_BYTES; called only while the picture is damaged
         """
         if incomplete:
-            self._damaged, self._left = self._codec in CODECS, None
+            self.lasts, self._left = self._codec in CODECS, None
             return True
-        if self._damaged and self._heals(head()):
-            self._damaged, self._left = False, None
-        return self._damaged
+        if self.lasts and self._heals(head()):
+            self.lasts, self._left = False, None
+        return self.lasts
 
     def _heals(self, head: bytes) -> bool:
         key, recovery = starts(head, self._codec)

@@ -104,7 +104,7 @@ class LiveOperator:
         self._repeat(
             "reception report",
             REPORT_S,
-            lambda: self.station.report_reception(side.take_arrivals(), *side.take_packets()),
+            lambda: self.station.report_reception(side.take_arrivals(), *side.take_packets(), side.damaged()),
         )
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:

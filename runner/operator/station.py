@@ -197,10 +197,13 @@ class Station:
         for listener in self.listeners:
             listener.on_sample(sample)
 
-    def report_reception(self, arrivals: Mapping[str, Iterable[Arrival]], packets: int, lost: int) -> None:
+    def report_reception(
+        self, arrivals: Mapping[str, Iterable[Arrival]], packets: int, lost: int, damaged: Iterable[str] = ()
+    ) -> None:
         """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread.
 
         packets, lost  RTP packets of all cameras received, and missing at first
+        damaged        cameras whose newest picture shows that packets were lost for good
         """
         now = time.monotonic()
         units = sorted((unit.arrived, name, unit) for name, arrived in arrivals.items() for unit in arrived)
@@ -215,6 +218,8 @@ class Station:
         if self.state is None:
             return
         report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
+        if damaged := tuple(damaged):
+            report = replace(report, damaged=damaged)
         if (latency_ms := self._worst_latency_ms(now)) is not None:
             report = replace(report, latency_ms=round(latency_ms, 1))
         if now >= self._clock_due:

@@ -49,6 +49,7 @@ TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
 CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
+KEY_FRAME_S = 1.0  # between two key frames that repair pictures of a camera: each takes bits from the next ones
 ADVICE_S = 0.2  # how long a reported latency, and what is advised because of it, counts
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
@@ -65,6 +66,7 @@ class Applier(Protocol):
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
     def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
+    def send_key_frames(self, cameras: Iterable[str]) -> None: ...
 
 
 class _PendingReply(NamedTuple):
@@ -108,6 +110,7 @@ class ControlLoop:
     _reported: dict[str, float] = field(default_factory=dict)  # by fault, when it was last reported
     _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, when
     _seen: tuple[float, float | None] = (-ADVICE_S, None)  # when the operator reported a latency, and that, ms
+    _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, when one was last asked for
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
@@ -269,9 +272,18 @@ class ControlLoop:
             latency_ms = item.report.latency_ms
             overdue_s = self._operators.overdue_s(item.sender, t, item.report.as_of)
             self._seen = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
+            self._repair(() if item.report.damaged is UNSET else item.report.damaged, t)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
+
+    def _repair(self, damaged: Iterable[str], t: float) -> None:
+        """Send key frames of cameras whose pictures are damaged for good."""
+        named = [name for name in damaged if name in self.vehicle.cameras]
+        due = [name for name in named if t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S]
+        self._key_frames |= dict.fromkeys(due, t)
+        if due:
+            self.applier.send_key_frames(due)
 
     def _advise(self, t: float) -> None:
         """Publish the speed that the latency of the operator's pictures allows: 0 if none was reported lately."""

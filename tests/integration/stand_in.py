@@ -18,8 +18,9 @@ FRAME_BYTES = 1000
 class RecordingVehicle:
     """Stands in for `runner.apply.VehicleSide`.
 
-    watched   cameras that have a pipeline: their commands count as applied
-    commands  all that were received, in order
+    watched     cameras that have a pipeline: their commands count as applied
+    commands    all that were received, in order
+    key_frames  cameras whose encoder was to start anew, in order
     """
 
     def __init__(self, plans: Sequence[Plan], *_: Any) -> None:
@@ -30,6 +31,7 @@ class RecordingVehicle:
         self.watched: set[str] = set()
         self.commands: list[Command] = []
         self.controller = ""
+        self.key_frames: list[str] = []
         self.on_turned: Callable[[], None] = lambda: None
 
     def watch(self, *names: str) -> None:
@@ -64,6 +66,9 @@ class RecordingVehicle:
     def copies(self) -> dict[str, int]:
         return {}
 
+    def send_key_frames(self, cameras: Iterable[str]) -> None:
+        self.key_frames += cameras
+
     def give_control(self, operator: str) -> None:
         self.controller = operator
 
@@ -92,6 +97,9 @@ class RecordingOperator:
 
     def take_packets(self) -> tuple[int, int]:
         return (0, 0)
+
+    def damaged(self) -> list[str]:
+        return []
 
     def stop(self) -> None:
         self._received = {}

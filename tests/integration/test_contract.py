@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from contextlib import ExitStack
 
 import pytest
 
 from rig import SMALL_ROBOT, Operator, RecordingListener, free_port, process, until
 from runner import apply
+from runner.mqtt.messages import topic
 from runner.operator.frames import live_frames
 from runner.operator.live import live_operator
 from runner.vehicle.live import live_vehicle
@@ -127,6 +129,27 @@ def test_telemetry_counts_what_is_sent_of_watched_cameras_only(operator, vehicle
     assert cameras["front"] == {"applied": {}, "frames": 0, "bytes": 0, "capture_ms": None, "encode_ms": None}
     assert cameras["rear"]["bytes"] > cameras["rear"]["frames"]
     assert cameras["rear"]["applied"]["sending"] is True
+
+
+@pytest.mark.parametrize("vehicle", ["recording"], indirect=True)
+def test_a_camera_that_is_damaged_for_good_starts_anew_once_a_second(operator, vehicle, broker):
+    operator.ask("1", event="operator_connected")  # holds control from here on
+    stranger = Operator(broker)
+    stranger.ask("1", event="operator_connected")
+    sent, side = [], vehicle.live.side
+
+    def reported():
+        """A report of each operator, 20 times a second; the next key frame is noted."""
+        now = time.monotonic()
+        for who, damaged in ((operator, ["rear", "misspelt"]), (stranger, ["front"])):
+            report = {"at": now, "as_of": who.as_of(), "units": [], "packets": 0, "lost": 0, "damaged": damaged}
+            who.link.publish(topic("delivery_robot", "reception", who.name), report)
+        sent.extend([now] * (len(side.key_frames) - len(sent)))
+        return len(sent) >= 3
+
+    until(reported, every_s=0.05)
+    assert set(side.key_frames) == {"rear"}
+    assert sent[-1] - sent[0] > 1.5
 
 
 # --- the operator's side ----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from rig import streaming, until
+from rig import streaming, until, watching
 from runner.core.commands import Command
 from runner.gst import receiver
 
@@ -129,3 +129,57 @@ def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeyp
     assert received.buffer_ms
     assert len(dropped) > 5
     assert (median(arrived - captured for arrived, captured in arrivals) < 1 / 3 / 2) is by_time
+
+
+@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
+def test_a_picture_that_is_damaged_for_good_is_whole_again_after_a_key_frame(graph, monkeypatch):
+    """Long before the next refresh wave or key frame."""
+    from runner.apply import OperatorSide
+    from runner.gst import Gst
+
+    left = [0]  # packets to lose
+
+    class Lossy(receiver.Receiver):
+        def _on_element(self, pipeline, parent, element):
+            super()._on_element(pipeline, parent, element)
+            if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
+                element.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._lose)
+
+        def _lose(self, _pad, _info):
+            left[0] -= 1
+            return Gst.PadProbeReturn.DROP if left[0] >= 0 else Gst.PadProbeReturn.OK
+
+    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+    units = []
+    overrides = (f"graph={graph}", "graph.retransmission_ms=0", "graph.key_interval_s=60", "fps_max=15")
+    with streaming(*overrides) as (side, _, plans, _):
+        knobs = {"sending": True, "size": (480, 260), "bitrate": 2000}
+        side.turn([Command("front_left", *knob) for knob in knobs.items()])
+        operator = OperatorSide(plans, lambda *_: None, lambda camera, unit: units.append(unit))
+        try:
+            until(lambda: len(units) > 20)
+            left[0] = 3
+            until(operator.damaged)
+            lost_at = len(units)
+            until(lambda: len(units) > lost_at + 20)
+            assert operator.damaged() == ["front_left"]  # nothing else heals it
+            side.send_key_frames(["front_left", "no_such_camera"])
+            asked_at = len(units)
+            until(lambda: not operator.damaged())
+            assert len(units) - asked_at < 15
+            until(lambda: len(units) > asked_at + 30)
+            assert operator.damaged() == []
+            received = operator.sample(SENDING)["front_left"]
+            assert (received.width, received.height) == knobs["size"]
+            assert side.faults() == []
+        finally:
+            operator.stop()
+
+
+def test_a_graph_that_does_not_state_how_is_left_alone():
+    with streaming("graph.key_frame=null", "fps_max=15") as (side, _, (plan,), _), watching(plan) as client:
+        until(lambda: len(client.sizes) > 5)
+        side.send_key_frames(["front_left"])
+        seen = len(client.sizes)
+        until(lambda: len(client.sizes) > seen + 5)
+        assert client.errors == []
