@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
@@ -269,7 +270,7 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
     if isinstance(value, bool):
         return {"on": value, "off": not value}
     if isinstance(value, int):
-        return {"kbps": value, "bps": value * 1000}
+        return {"kbps": value, "bps": value * 1000, **_buffer(camera, value)}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size
@@ -279,6 +280,24 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
         return {"left": left, "right": right, "top": top, "bottom": bottom}
     width, height = value
     return {"width": width, "height": height}
+
+
+def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:
+    """Length of the rate control's buffer, ms, if the graph states it in frames.
+
+    At least 1 kbit: x264 rounds down to whole kbit, and takes a buffer of 0 for one without limit.
+    """
+    key = "vbv_frames"
+    if key not in camera.graph.settings:
+        return {}
+    name, ms = _per_frame_rate(camera, key)
+    return {name: max(ms, math.ceil(1000 / kbps))}
+
+
+def _per_frame_rate(camera: Camera, key: str) -> tuple[str, int]:
+    """The placeholder that a setting fills at the camera's frame rate, and its value."""
+    name, amount = _PER_FRAME_RATE[key]
+    return name, max(1, round(amount(float(camera.graph.settings[key]), float(camera.fps))))
 
 
 def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
@@ -315,9 +334,7 @@ def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> di
         "url": rtsp_url(media, camera.name),
         "port": int(camera.graph.settings["first_port"]) + index,
     }
-    for key, (name, amount) in _PER_FRAME_RATE.items():
-        if key in camera.graph.settings:
-            values[name] = max(1, round(amount(float(camera.graph.settings[key]), float(camera.fps))))
+    values |= dict(_per_frame_rate(camera, key) for key in _PER_FRAME_RATE if key in camera.graph.settings)
     return values if clip is None else values | {"clip": clip}
 
 

@@ -20,7 +20,8 @@ CAMERA_KEYS = (
 OWN = "files of your own need conf=DIR"
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
-    "kbps, bps, left, right, top, bottom, on, off (quote these two), or a caps template over {width} and {height}"
+    "kbps, bps, vbv_ms, left, right, top, bottom, on, off (quote these two), or a caps template over"
+    " {width} and {height}"
 )
 MINE = """# @package _global_
 defaults:
@@ -241,7 +242,7 @@ REAR, GRAPH, PAPER, ROBOT = (
             "knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
         ),
         (GRAPH, {"value: kbps": "value: kbit"}, f"knobs.bitrate[0].value: 'kbit': {KNOB_VALUES}"),
-        (GRAPH, {"value: kbps": "value: left"}, "knobs.bitrate: 'left': bitrate offers kbps, bps"),
+        (GRAPH, {"value: kbps": "value: left"}, "knobs.bitrate: 'left': bitrate offers kbps, bps, vbv_ms"),
         (GRAPH, {'value: "off"': "value: off"}, 'knobs.sending[0].value: false: must be text, quote it: "on" or "off"'),
         (
             GRAPH,

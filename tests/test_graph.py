@@ -118,7 +118,10 @@ def test_every_graph_ends_in_a_sink_and_begins_with_the_source_for_it(name: str)
     [
         (LEFT, "sending", False, {"gate.drop": True}),
         (LEFT, "sending", True, {"gate.drop": False}),
-        (LEFT, "bitrate", 545, {"encoder.bitrate": 545}),
+        (LEFT, "bitrate", 545, {"encoder.bitrate": 545, "encoder.vbv-buf-capacity": 38}),
+        (LEFT, "bitrate", 27, {"encoder.bitrate": 27, "encoder.vbv-buf-capacity": 38}),
+        (LEFT, "bitrate", 26, {"encoder.bitrate": 26, "encoder.vbv-buf-capacity": 39}),  # 1 kbit, not 0.988
+        (LEFT, "bitrate", 1, {"encoder.bitrate": 1, "encoder.vbv-buf-capacity": 1000}),
         (LEFT, "size", (480, 260), {"size.caps": "video/x-raw,width=480,height=260,pixel-aspect-ratio=1/1"}),
         (
             LEFT,

@@ -46,7 +46,10 @@ def test_a_report_is_read_back_as_it_was_sent() -> None:
         ({"units": [["front", 1, 0]]}, 'units[0]: ["front", 1, 0]: must have at least 4 entries'),
         ({"units": [["front", 1, 0, 5.5]]}, "units[0][3]: 5.5: must be a whole number"),
         ({"lost": -1}, "lost: -1: must be at least 0"),
-        ({"extra": 1}, "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent"),
+        (
+            {"extra": 1},
+            "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent",
+        ),
     ],
 )
 def test_an_invalid_report_is_named(change: dict[str, object], problem: str) -> None:

@@ -46,7 +46,8 @@ class KnobPanel:
         with self._lock:
             alone = not self._waiting
             self._waiting |= values
-        turned = [turned for knob, value in values.items() for turned in self._assignments(knob, value)]
+        every = [turned for knob, value in values.items() for turned in self._assignments(knob, value)]
+        turned = [each for each in every if self._differs(each)] or every[:1]
         if alone and len(turned) == 1:
             # A single property needs no synchronisation: the encoder applies it from its next frame on.
             self._set_waiting()
@@ -92,10 +93,19 @@ class KnobPanel:
         """Set one property and read it back; returns the fault, None if there is none."""
         name, key, value = turned
         element = self._by_name[name]
-        wanted: Any = Gst.Caps.from_string(value) if key == "caps" else value
-        if element.get_property(key) != wanted:
+        wanted = _property(turned)
+        if self._differs(turned):
             element.set_property(key, wanted)
             held = element.get_property(key)
             if not (held.is_equal(wanted) if key == "caps" else held == wanted):
                 return f"{self._camera.name}: {name}.{key} is {text(str(held))} after it was set to {text(value)}"
         return None
+
+    def _differs(self, turned: Assignment) -> bool:
+        name, key, _ = turned
+        return bool(self._by_name[name].get_property(key) != _property(turned))
+
+
+def _property(turned: Assignment) -> Any:
+    _, key, value = turned
+    return Gst.Caps.from_string(value) if key == "caps" else value

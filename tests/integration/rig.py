@@ -44,6 +44,10 @@ ROBOT = (
     "page.serve=false",
 )
 
+_SNOW = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
+_RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
+NOISE = ("source=test", f"source.elements=[{_SNOW}, {_RAW}]")  # of which the encoder needs all of its bitrate
+
 # No sandbox inside containers; no background traffic to hosts that a closed network refuses anyway.
 CHROMIUM_FLAGS = [
     "--no-sandbox",

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from rig import CLIPS, Client, streaming, until, watching
+from rig import CLIPS, NOISE, Client, streaming, until, watching
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.errors import RunError
@@ -46,6 +46,24 @@ def test_bitrate_is_read_back_and_on_the_wire():
             start, sent = len(client.sizes), side.sent()[CAMERA][1]
             until(lambda: len(client.sizes) - start >= 80)
             assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 1.3 * 500_000  # two seconds at 40 Hz
+
+
+@pytest.mark.parametrize("kbps", [3, 9, 26])
+def test_the_lowest_bitrates_limit_the_encoder_too(kbps):
+    """x264 takes a buffer below 1 kbit for none, and encodes without limit from its next start on: 40 Hz of noise."""
+    with streaming(*NOISE) as (side, _, (plan,), _reported), watching(plan) as client:
+        turn(side, size=(240, 130), bitrate=500)
+        until(lambda: len(client.sizes) > 20)
+        turn(side, bitrate=kbps)
+        until(lambda: side.applied()[CAMERA].get("bitrate") == kbps)
+        for size in ((256, 138), (240, 130)):  # the encoder starts anew
+            turn(side, size=size)
+            until(lambda size=size: client.sizes[-1] == size)
+        side.send_key_frames([CAMERA])
+        start, sent = len(client.sizes), side.sent()[CAMERA][1]
+        until(lambda: len(client.sizes) - start >= 80)
+        assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 60_000  # of noise x264 makes 20 kbit/s at least, else 7000
+        assert side.faults() == []
 
 
 def test_all_knobs_of_a_change_act_between_the_same_two_frames():

@@ -6,7 +6,7 @@ from statistics import median
 
 import pytest
 
-from rig import SMALL_ROBOT, Operator, free_port, process, run
+from rig import NOISE, SMALL_ROBOT, Operator, free_port, process, run
 from runner.core.events import LinkMeasured
 from runner.core.uplink import LinkState
 from runner.drive.read import read_drive
@@ -17,10 +17,7 @@ pytestmark = [
     pytest.mark.alone,
 ]  # load delays packets, and so lowers the measured link
 
-NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
-RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
 ROBOT = (*SMALL_ROBOT, "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
-SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs all of its bitrate
 SECONDS, SETTLED_S = 14, 6
 
 
@@ -30,7 +27,7 @@ def drive(tmp_path_factory):
     path = tmp_path_factory.mktemp("feedback") / "drive"
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     link = ("link=relay", "link.share=0.5")
-    done = run("demo", *ROBOT, *SOURCE, *ports, *link, f"log={path}", f"duration_s={SECONDS}")
+    done = run("demo", *ROBOT, *NOISE, *ports, *link, f"log={path}", f"duration_s={SECONDS}")
     assert done.returncode == 0, done.stderr
     return path
 

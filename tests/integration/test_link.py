@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rig import CHECKOUT, free_port, process, streaming, until, watching
+from rig import CHECKOUT, NOISE, free_port, process, streaming, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.core.model import Endpoint
@@ -23,10 +23,7 @@ from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
-NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
-RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
 ROBOT = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "fps_max=15", "page.serve=false", "pqos=constant")
-SOURCE = ("source=test", f"source.elements=[{NOISE}, {RAW}]")  # the encoder needs all of its bitrate
 SETTLE_S, MEASURE_S = 2.0, 4.0
 
 
@@ -81,7 +78,7 @@ def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
     lines = []
     limit = Limit(kbps_at, queue_ms, delay_ms)
     media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
-    words = (*ROBOT, *SOURCE, f"pqos.kbps={sent_kbps}")
+    words = (*ROBOT, *NOISE, f"pqos.kbps={sent_kbps}")
     with (
         limited_link(kind, limit, media, control, lines.append) as link,
         private_broker(link.broker),
@@ -186,7 +183,7 @@ def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
     monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
     # A queue that holds most of a frame but not all of it: the rest arrives as soon as it is requested again.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
-    overrides = (*SOURCE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
+    overrides = (*NOISE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
     with (
         streaming(*overrides, cameras=("rear",)) as (side, vehicle, plans, _),
         limited_link("relay", limit, vehicle.media, _ends()[0], print) as link,

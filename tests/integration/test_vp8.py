@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rig import free_port, until, watching
+from rig import NOISE, free_port, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import ConfigError
@@ -46,9 +46,7 @@ knobs:
   size: [{element: size, property: caps, value: "video/x-raw,width={width},height={height},pixel-aspect-ratio=1/1"}]
   bitrate: [{element: encoder, property: target-bitrate, value: bps}]
 """
-NOISE = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
-RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
-WORDS = ("vehicle=delivery_robot", "source=test", f"source.elements=[{NOISE}, {RAW}]", "graph=vp8", "fps_max=15")
+WORDS = ("vehicle=delivery_robot", *NOISE, "graph=vp8", "fps_max=15")
 
 
 @contextmanager
