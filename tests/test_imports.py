@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (40, COMPOSING),
     "replay": (43, COMPOSING),
-    "validate": (78, COMPOSING | {"numpy", "gi"}),
+    "validate": (79, COMPOSING | {"numpy", "gi"}),
 }
 HELP = {"vehicle": {"numpy", "paho"}, "operator": {"rich", "paho"}, "demo": {"numpy"}, "map": {"numpy"}}
 

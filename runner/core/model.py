@@ -145,7 +145,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class KnobTarget:
-    """One property that a knob sets, and its value: kbps, bps, vbv_ms, left, right, top, bottom, on, off or a caps template."""
+    """One property that a knob sets, and its value: a quantity of the knob (see `runner.graph`) or a caps template."""
 
     element: str
     property: str

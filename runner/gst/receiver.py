@@ -19,12 +19,12 @@ from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records import Arrival
+from runner.system.recent import RecentValue
 
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
 KEPT_ARRIVALS = 1024  # not read yet; the oldest are dropped
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
-CURRENT_S = 1.0  # an older picture has no current latency
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -40,7 +40,7 @@ class Reception:
     foreign     RTP and RTCP packets from hosts other than the vehicle, dropped
     width, height  px of the decoded picture, 0 before the first
     latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
-                first, and where it is older than CURRENT_S
+                first, and where it is not recent
     buffer_ms   how long a picture waits for packets that are sent again; None: they are not, or the transport does it
     waited_ms   how long a sampled frame was in the jitter buffer; None: unknown, as without RTP
     decode_ms   from a sampled access unit to its picture; None: unknown
@@ -114,8 +114,7 @@ class Receiver:
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
-        self._latency: tuple[float, float] | None = None  # ms, and when
-        self._decode: tuple[float, float] | None = None  # likewise
+        self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
         self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
@@ -245,7 +244,7 @@ class Receiver:
             self._filter = None
 
     def _count(self) -> Reception:
-        before, now = self._before, time.monotonic()
+        before = self._before
         frames, size = counted(self._received)
         caps = self._sink.get_static_pad("sink").get_current_caps()
         picture = caps.get_structure(0) if caps else None
@@ -258,8 +257,8 @@ class Receiver:
             lost=before.lost + sum(lost for _, _, lost in (buffer.packets for buffer in self._buffers)),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
-            latency_ms=_current(self._latency, now),
-            decode_ms=_current(self._decode, now),
+            latency_ms=self._latency.get(),
+            decode_ms=self._decode.get(),
             rebuilt=self._supervised.rebuilt,
         )
 
@@ -267,9 +266,9 @@ class Receiver:
         buffer, now = info.get_buffer(), time.monotonic()
         captured, (pts, arrived) = capture_time(buffer), self._entered
         if captured is not None:
-            self._latency = (1000 * (time.time() - captured), now)
+            self._latency.set(1000 * (time.time() - captured))
         if buffer.pts == pts:
-            self._decode = (1000 * (now - arrived), now)
+            self._decode.set(1000 * (now - arrived))
         return Gst.PadProbeReturn.REMOVE
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
@@ -326,11 +325,6 @@ class MediaClock:
         ahead = (counter - self._last) & 0xFFFFFFFF
         self._ticks += ahead - (ahead >> 31 << 32)  # of two directions the shorter
         self._last, self.seconds = counter, self._ticks * self._tick_s
-
-
-def _current(measured: tuple[float, float] | None, now: float) -> float | None:
-    """A figure in ms that was measured lately."""
-    return measured[0] if measured and now - measured[1] <= CURRENT_S else None
 
 
 def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:

@@ -7,6 +7,8 @@ from collections import deque
 
 from gi.repository import GObject, Gst
 
+from runner.system.recent import RecentValue
+
 REORDER_MS = 5  # a packet that is missing for longer was lost, not overtaken
 TAIL_S = 0.01  # likewise for the last packets of a frame, of which no later packet tells
 GAPS = 2  # and this many times the longest recent gap between packets of a frame: a slow link spreads them
@@ -19,7 +21,6 @@ UNKNOWN_MS = 100  # taken for the round trip until the first packet was sent aga
 LONGEST_MS = 300  # a picture that is later is of no use for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
 FRAMES = 64  # whose end is remembered
-CURRENT_S = 1.0  # an older figure is not current
 MARKER, HALF = 0x80, 0x8000  # of the RTP header (RFC 3550, section 5.1); half of all sequence numbers
 
 
@@ -46,7 +47,7 @@ class RepairBuffer:
         self._gap = 0.0
         self._tails = 0  # packets that came because they were requested here
         self._ends: deque[tuple[bytes, float]] = deque(maxlen=FRAMES)  # of frames whose last packet came: stamp, when
-        self._waited: tuple[float, float] | None = None  # ms that a frame waited here lately, and when
+        self._waited = RecentValue[float]()  # how long a frame waited here, ms
         self._timing = False
         self._counted = (0, 0)  # packets that came, and that were missing
         self._missing = 0.0  # share of packets, lately
@@ -74,15 +75,15 @@ class RepairBuffer:
         if not self._timing:
             self._timing = True
             self._buffer.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_passed)
-        waited = self._waited
-        return waited[0] if waited and time.monotonic() - waited[1] <= CURRENT_S else None
+        return self._waited.get()
 
     def _on_passed(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         header, now = info.get_buffer().extract_dup(1, 7), time.monotonic()
         came = next((at for stamp, at in self._ends if stamp == header[3:]), None)
         if not header[0] & MARKER or came is None:
             return Gst.PadProbeReturn.OK
-        self._waited, self._timing = (1000 * (now - came), now), False
+        self._waited.set(1000 * (now - came))
+        self._timing = False
         return Gst.PadProbeReturn.REMOVE
 
     def _look(self) -> None:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from gi.repository import Gst
 
 from runner.gst.clocks import captured_at
+from runner.system.recent import RecentValue
 
-CURRENT_S = 1.0  # older figures are not current
 SAME_S = 1e-5  # capture times of the same picture on both sides of the encoder
 
 
@@ -33,18 +33,17 @@ class EncoderWatch:
         self._out: Any = encoder.get_static_pad("src") if encoder else None
         self._armed = False
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
-        self._measured: tuple[float, SenderStages] | None = None  # s by the monotonic clock
+        self._measured = RecentValue[SenderStages]()
 
     def take(self) -> SenderStages | None:
-        """The last figures, if they are current; requests those of the next picture.
+        """The last figures, if they are recent; requests those of the next picture.
 
         To be called a few times a second, from one thread.
         """
         if self._into and not self._armed:
             self._armed = True
             self._into.add_probe(Gst.PadProbeType.BUFFER, self._on_raw)
-        measured = self._measured  # a streaming thread may replace it
-        return measured[1] if measured and time.monotonic() - measured[0] <= CURRENT_S else None
+        return self._measured.get()
 
     def _on_raw(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         captured = captured_at(pad, info.get_buffer())
@@ -59,8 +58,7 @@ class EncoderWatch:
         if ahead_s < -SAME_S:
             return Gst.PadProbeReturn.OK  # one that the encoder took earlier
         if ahead_s < SAME_S:  # else it has dropped the picture
-            stages = SenderStages(capture_ms, 1000 * (now - captured) - capture_ms)
-            self._measured = (time.monotonic(), stages)
+            self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
         self._armed = False
         return Gst.PadProbeReturn.REMOVE
 

@@ -45,10 +45,10 @@ from runner.records import (
 )
 from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange, latency
 from runner.system.kernel_clock import clock_error_s
+from runner.system.recent import CURRENT_S
 
 SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
-CURRENT_S = 1.0  # an older sample has no current latency
 CLOCK_S = 0.2  # between two comparisons of the clocks
 MOST_VEHICLES = 100  # whose names are remembered
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
