@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
+    from runner.gst.pictures import LumaPlane
     from runner.gst.sequence import Form
     from runner.gst.video_reader import Unit
     from runner.lanes import LaneSet
@@ -51,6 +52,7 @@ __all__ = [
     "check_machine",
     "check_plan",
     "check_recorders",
+    "decode_video",
     "discover",
     "missing_plugins",
     "missing_recorders",
@@ -426,6 +428,13 @@ def read_video(path: Path) -> Iterator[Unit]:
     from runner.gst import video_reader
 
     return video_reader.read_video(path)
+
+
+def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:
+    """Pictures of a video file, see `runner.gst.pictures.decode_video`."""
+    from runner.gst import pictures
+
+    return pictures.decode_video(path, width, height)
 
 
 def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps: Fraction) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import json
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -14,6 +13,7 @@ from msgspec import UNSET
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
+from runner.drive.captures import SECOND_NS, files, follow, lies_outside, received
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import KINDS, Json, Note, Position, Record, Sample, VideoBegan, line_to_json
@@ -22,9 +22,6 @@ from runner.schema import referred
 if TYPE_CHECKING:
     from runner.apply import Unit
 
-SECOND_NS = 1_000_000_000
-# A frame of the file and one of the log further apart than this differ; less than most cameras' frame interval.
-SAME_NS = 20_000_000
 TELL_EVERY = 500  # messages between two reports of progress
 # Topic by kind of line. Notes become foxglove.Log, positions also foxglove.LocationFix, videos CompressedVideo.
 TOPICS = {
@@ -202,9 +199,9 @@ def _streams(
     for name, side in drive.sides.items():
         # If the vehicle did not log, the operator's log has its positions.
         yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
-        for camera, files in _files(side).items():
-            known = _captures(side, camera)
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, files, known, channels, read_video, on_warning)
+        for camera, lines in files(side).items():
+            known = [unit.captured for unit in received(side, camera)]
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, lines, known, channels, read_video, on_warning)
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
@@ -234,19 +231,11 @@ def _writers(
         yield lambda: channels.fix(position, ns)
 
 
-def _files(side: Side) -> dict[str, list[VideoBegan]]:
-    """By camera, its video files, in the order of their first frames."""
-    files: dict[str, list[VideoBegan]] = {}
-    for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
-        files.setdefault(line.camera, []).append(line)
-    return files
-
-
 def _pictures(
     directory: Path,
     topic: str,
     camera: str,
-    files: list[VideoBegan],
+    lines: list[VideoBegan],
     known: Sequence[int],
     channels: _Channels,
     read_video: ReadVideo,
@@ -258,9 +247,9 @@ def _pictures(
     """
     topic = topic.format(camera=camera)
     last = -1
-    for line in files:
+    for line in lines:
         first = round(line.captured * SECOND_NS)
-        if Path(line.file).is_absolute() or ".." in Path(line.file).parts:
+        if lies_outside(line):
             on_warning(f"{line.file}: lies outside the drive and was left out")
             continue
         try:
@@ -272,34 +261,6 @@ def _pictures(
                 yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
             on_warning(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
-
-
-def _captures(side: Side, camera: str) -> list[int]:
-    """Capture times of a camera's received frames, ns since 1970, increasing; empty if they were not logged."""
-    came = (
-        (t - ms / 1000 + (0.0 if sample.clock_bound_ms is None else (sample.clock_ahead_ms or 0.0) / 1000))
-        for sample in side.of(Sample)
-        if camera in sample.cameras
-        for t, ms in sample.cameras[camera].arrivals
-        if ms is not None
-    )
-    return sorted(round((side.began.time + t) * SECOND_NS) for t in came)
-
-
-def follow(known: Sequence[int], ns: int, offset: int) -> int:
-    """The offset to add to a frame's time in a file, ns, to get its capture time.
-
-    known   capture times from the log, increasing, ns
-    ns      the frame's time by the file alone
-    offset  that of the previous frame
-
-    A receiver smooths times, and slowly removes the delay of the first frame: 0.1 s and more. Frames missing in file or
-    log do not lead to a wrong match, as each frame is searched for near the match of the previous one.
-    """
-    wanted = ns + offset
-    at = bisect_left(known, wanted)
-    nearest = min(known[max(0, at - 1) : at + 1], key=lambda capture: abs(capture - wanted), default=None)
-    return offset if nearest is None or abs(nearest - wanted) > SAME_NS else nearest - ns
 
 
 def _cameras(drive: Drive) -> list[str]:

@@ -10,17 +10,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
 
-import numpy as np
-from gi.repository import GLib, Gst, GstVideo
-from numpy.typing import NDArray
+from gi.repository import GLib, Gst
 
 from runner.errors import RunError
+from runner.gst.pictures import LumaPlane, luma_of
 from runner.gst.pipeline import counted
 from runner.lanes import FRAMES, LaneSet
 
-LumaPlane = NDArray[np.uint8]  # height x width
 POLL_NS = 200 * 1_000_000
 STALLED_S = 60  # without a frame for this long the pipeline is deadlocked
 
@@ -125,7 +122,7 @@ def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFram
             _check_form(run, event.parse_caps())
         return Gst.PadProbeReturn.OK
     number, run.frames, run.moved = run.frames, run.frames + 1, time.monotonic()
-    _guarded(run, lambda: on_frame(number, _luma(info.get_buffer(), pad.get_current_caps())))
+    _guarded(run, lambda: on_frame(number, luma_of(info.get_buffer(), pad.get_current_caps())))
     return Gst.PadProbeReturn.OK
 
 
@@ -162,7 +159,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
     result.frames += 1
     run.moved = time.monotonic()
-    _guarded(run, lambda: on_picture(lane, number, _luma(buffer, sample.get_caps())))
+    _guarded(run, lambda: on_picture(lane, number, luma_of(buffer, sample.get_caps())))
     return Gst.FlowReturn.ERROR if run.failed else Gst.FlowReturn.OK
 
 
@@ -174,14 +171,3 @@ def _guarded(run: _Run, work: Callable[[], None]) -> None:
         work()
     except BaseException as error:
         run.failed = error
-
-
-def _luma(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
-    """A copy of the first plane of a picture with one byte per sample."""
-    picture = caps.get_structure(0)
-    width, height = picture.get_int("width")[1], picture.get_int("height")[1]
-    meta: Any = GstVideo.buffer_get_video_meta(buffer)
-    stride, offset = (meta.stride[0], meta.offset[0]) if meta else (-(-width // 4) * 4, 0)
-    plane = buffer.extract_dup(offset, stride * (height - 1) + width)
-    rows = np.frombuffer(plane.ljust(stride * height, b"\0"), np.uint8).reshape(height, stride)
-    return rows[:, :width]

@@ -40,6 +40,7 @@ VERBS = {
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
+    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE),
     "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
     "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),

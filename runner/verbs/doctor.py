@@ -25,7 +25,7 @@ from runner.system.ports import check_port_free
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
 CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
-STREAMING = ("vehicle", "operator", "demo", "record", "model")  # verbs that need GStreamer
+STREAMING = ("vehicle", "operator", "demo", "record", "model", "quality")  # verbs that need GStreamer
 NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
@@ -33,6 +33,7 @@ NEEDED = {  # extras of this package that a verb needs with any configuration
     "record": ("live",),
     "model": ("model",),
     "report": ("report",),
+    "quality": ("model",),
     "export": ("mcap",),
 }
 

@@ -82,7 +82,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras.mkdir(parents=True)
     text = (CHECKOUT / "conf" / "cameras" / "rear_center.yaml").read_text()
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
-    assert run("demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}").returncode == 0
+    assert (
+        run(
+            "demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}", "log.video=true"
+        ).returncode
+        == 0
+    )
     write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
     shutil.copytree(directory / "other", directory / "drives" / "monday")
     return directory

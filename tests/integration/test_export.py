@@ -18,8 +18,8 @@ from rig import free_port, run, until
 from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
+from runner.drive.captures import follow
 from runner.drive.log import FORMAT
-from runner.drive.mcap import follow
 from runner.plans import compile_plans
 
 pytest.importorskip("foxglove")

@@ -1,0 +1,223 @@
+"""Quality of what the operator saw: the picture on show at each moment against the scene that the camera saw then.
+
+For a picture captured at time t, what counts is the newest picture captured by then that had arrived DEADLINE_S after.
+So one that was frozen, lost or late is compared with a scene that has moved on. Pictures are compared at the full size
+of the camera, after scaling, as a screen shows them, damage included.
+
+The scene is the camera's clip, where the drive was driven with one: what scaling and encoding lost is included. Of
+other sources only the stream as sent is known: what it lost against the scene is not included.
+"""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.core.model import Camera
+from runner.drive.captures import SAME_NS, SECOND_NS, UnitTimes, captured, files, lies_outside, received
+from runner.drive.read import Drive, Side
+from runner.rate_quality.metrics.mssim import metric
+from runner.records import DecisionMade, VideoBegan
+
+if TYPE_CHECKING:
+    from runner.apply import Unit
+
+DEADLINE_S = 0.3  # a later picture is of no use for driving
+EVERY_S = 0.5  # between two moments that are compared
+BLOCKS = 32  # along the shorter side of a picture
+
+Luma = NDArray[np.uint8]
+ReadVideo = Callable[[Path], "Iterator[Unit]"]
+DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
+
+
+@dataclass(frozen=True, slots=True)
+class DeliveredQuality:
+    """Of one camera.
+
+    t      moments, s since the vehicle's side began
+    mssim  of each: the picture on show against the scene
+    stale  share of the moments at which an older picture stood for the one due
+    clip   whether the scene was known; otherwise it is the stream as sent
+    """
+
+    t: tuple[float, ...]
+    mssim: tuple[float, ...]
+    stale: float
+    clip: bool
+
+
+def measure(
+    drive: Drive,
+    cameras: Mapping[str, Camera],
+    clips: Mapping[str, Path],
+    read_video: ReadVideo,
+    decode_video: DecodeVideo,
+    progress: Callable[[float], None] = lambda done: None,
+) -> dict[str, DeliveredQuality]:
+    """Measure all cameras whose video both sides have kept, on all processors.
+
+    clips    by camera, the clip that its source repeated; others are left out
+    raises   RunError for a file that cannot be read
+    """
+    vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
+    sent, came = files(vehicle), files(operator)
+    names = [name for name in cameras if name in sent and name in came]
+    done: list[str] = []
+
+    def one(name: str) -> DeliveredQuality:
+        videos = _Videos(drive.path, read_video, decode_video)
+        quality = _camera(cameras[name], videos, vehicle, operator, sent[name], came[name], clips.get(name))
+        done.append(name)
+        progress(len(done) / len(names))
+        return quality
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(names, pool.map(one, names), strict=True))
+
+
+def due(moments: Sequence[int], units: Sequence[UnitTimes], deadline_ns: int) -> list[int]:
+    """By moment, the number of the unit whose picture stands for it; -1: none had arrived.
+
+    moments  capture times, ns
+    units    in the order of capture, as they were received
+    """
+    times = [unit.captured for unit in units]
+    found = []
+    for moment in moments:
+        number = bisect_right(times, moment + SAME_NS // 2) - 1
+        while number >= 0 and units[number].arrived > moment + deadline_ns:
+            number -= 1
+        found.append(number)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Videos:
+    """The video files of a drive."""
+
+    directory: Path
+    read: ReadVideo
+    decode: DecodeVideo
+
+    def captures(self, line: VideoBegan, known: Sequence[int]) -> dict[int, int]:
+        """By time since the first access unit of a file, ns: when the unit was captured."""
+        if lies_outside(line):
+            return {}
+        after = [unit.after_ns for unit in self.read(self.directory / line.file)]
+        return dict(zip(after, captured(known, round(line.captured * SECOND_NS), after), strict=True))
+
+    def pictures(
+        self, lines: Sequence[VideoBegan], known: Sequence[int], size: tuple[int, int]
+    ) -> Iterator[tuple[int, Luma]]:
+        """The decoded pictures of some files, with their capture times."""
+        for line in lines:
+            captures = self.captures(line, known)
+            for after, picture in self.decode(self.directory / line.file, *size) if captures else ():
+                if after in captures:
+                    yield captures[after], picture
+
+
+def _camera(
+    camera: Camera,
+    videos: _Videos,
+    vehicle: Side,
+    operator: Side,
+    sent: Sequence[VideoBegan],
+    came: Sequence[VideoBegan],
+    clip: Path | None,
+) -> DeliveredQuality:
+    times = received(operator, camera.name)
+    known = [unit.captured for unit in times]
+    arrived = dict(times)
+    units = [
+        UnitTimes(ns, arrived[ns]) for line in came for ns in videos.captures(line, known).values() if ns in arrived
+    ]
+    captures = [ns for line in sent for ns in videos.captures(line, ()).values()]
+    moments = _moments(captures, units, _whole(vehicle, camera))
+    numbers = due(moments, units, round(DEADLINE_S * SECOND_NS))
+    pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
+    scenes = _scenes(camera, videos, sent, [moment for moment, _ in pairs], clip)
+    shown: dict[int, list[int]] = {}  # by capture time of the picture on show, the moments that it stands for
+    for moment, on_show in pairs:
+        shown.setdefault(on_show, []).append(moment)
+    meter = metric().meter((camera.width, camera.height), camera.fps)
+    numbered = {moment: number for number, (moment, _) in enumerate(pairs)}
+    for ns, picture in videos.pictures(came, known, (camera.width, camera.height)):
+        for moment in shown.get(ns, ()):
+            if moment in scenes:
+                meter.add(numbered[moment], scenes[moment], picture)
+    scores = meter.close()
+    began = round(vehicle.began.time * SECOND_NS)
+    stale = [moment - on_show > SAME_NS for moment, on_show in pairs]
+    return DeliveredQuality(
+        t=tuple((pairs[number][0] - began) / SECOND_NS for number in scores),
+        mssim=tuple(scores.values()),
+        stale=sum(stale) / len(stale) if stale else 0.0,
+        clip=clip is not None,
+    )
+
+
+def _moments(sent: Sequence[int], units: Sequence[UnitTimes], counts: Callable[[int], bool]) -> list[int]:
+    """Capture times of the vehicle's pictures, EVERY_S apart, while the operator's side received."""
+    found: list[int] = []
+    for ns in sent:
+        received_then = units and units[0].captured <= ns <= units[-1].captured
+        if received_then and counts(ns) and (not found or ns - found[-1] >= EVERY_S * SECOND_NS):
+            found.append(ns)
+    return found
+
+
+def _whole(vehicle: Side, camera: Camera) -> Callable[[int], bool]:
+    """Whether the whole image was sent at a time, ns since 1970; a region is not compared."""
+    decisions = [line for line in vehicle.of(DecisionMade) if camera.name in line.cameras]
+    times = [round((vehicle.began.time + line.t) * SECOND_NS) for line in decisions]
+
+    def whole(ns: int) -> bool:
+        at = bisect_right(times, ns) - 1
+        return at >= 0 and decisions[at].cameras[camera.name].roi == camera.full_roi
+
+    return whole
+
+
+def _scenes(
+    camera: Camera, videos: _Videos, sent: Sequence[VideoBegan], moments: Sequence[int], clip: Path | None
+) -> dict[int, Luma]:
+    """The scene at each moment."""
+    wanted = set(moments)
+    if clip is None:
+        size = (camera.width, camera.height)
+        return {ns: picture for ns, picture in videos.pictures(sent, (), size) if ns in wanted}
+    crop = camera.crop or camera.full_roi
+    width, height = camera.source_size
+    window = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
+    clipped = [_thumbnail(picture[window]) for _, picture in videos.decode(clip, width, height)]
+    numbers = {
+        ns: _nearest(clipped, _thumbnail(picture))
+        for ns, picture in videos.pictures(sent, (), (camera.width, camera.height))
+        if ns in wanted
+    }
+    needed = set(numbers.values())  # a whole clip would not fit into memory
+    scenes = {n: p[window] for n, (_, p) in enumerate(videos.decode(clip, width, height)) if n in needed}
+    return {ns: scenes[number] for ns, number in numbers.items()}
+
+
+def _thumbnail(picture: Luma) -> NDArray[np.float32]:
+    """The picture in blocks, enough to recognise it in a clip."""
+    side = max(1, min(picture.shape) // BLOCKS)
+    height, width = (length // side for length in picture.shape)
+    blocks = picture[: height * side, : width * side].reshape(height, side, width, side)
+    small: NDArray[np.float32] = blocks.mean(axis=(1, 3), dtype=np.float32)
+    return small
+
+
+def _nearest(candidates: Sequence[NDArray[np.float32]], picture: NDArray[np.float32]) -> int:
+    return int(np.argmin([np.square(candidate - picture).sum() for candidate in candidates]))

@@ -1,0 +1,76 @@
+"""Decoded pictures as numpy arrays. Offline work, so Python per frame is fine here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gi.repository import Gst, GstVideo
+from numpy.typing import NDArray
+
+from runner.errors import RunError
+from runner.system.files import file_problem
+
+LumaPlane = NDArray[np.uint8]  # height x width
+WAIT_NS = 100 * Gst.MSECOND
+SILENT = 100  # consecutive waits without a picture, EOS or error before the file is given up
+
+
+def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
+    """A copy of the first plane of a picture with one byte per sample."""
+    picture = caps.get_structure(0)
+    width, height = picture.get_int("width")[1], picture.get_int("height")[1]
+    meta: Any = GstVideo.buffer_get_video_meta(buffer)
+    stride, offset = (meta.stride[0], meta.offset[0]) if meta else (-(-width // 4) * 4, 0)
+    plane = buffer.extract_dup(offset, stride * (height - 1) + width)
+    rows = np.frombuffer(plane.ljust(stride * height, b"\0"), np.uint8).reshape(height, stride)
+    return rows[:, :width]
+
+
+def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:
+    """Decode a file, whatever sizes its pictures change to: ns since its first access unit, luma scaled to one size.
+
+    raises  RunError if the path names no file or nothing can be decoded; damaged pictures are left out
+    """
+    if not path.is_file():
+        raise RunError(f"{path}: {file_problem(path)}")
+    form = f"video/x-raw,format=I420,width={width},height={height},pixel-aspect-ratio=1/1"
+    pipeline = Gst.parse_launch(
+        "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert ! videoscale add-borders=false"
+        f" ! {form} ! appsink name=out sync=false max-buffers=4"
+    )
+    pipeline.get_by_name("file").set_property("location", str(path))
+    first: list[int] = []
+    units = pipeline.get_by_name("units").get_static_pad("src")
+    units.add_probe(Gst.PadProbeType.BUFFER, _on_first_unit, first)
+    try:
+        pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
+        yield from _pulled(pipeline, path, first)
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+def _on_first_unit(_pad: Gst.Pad, info: Gst.PadProbeInfo, first: list[int]) -> Gst.PadProbeReturn:
+    if info.get_buffer().pts == Gst.CLOCK_TIME_NONE:
+        return Gst.PadProbeReturn.OK
+    first.append(info.get_buffer().pts)
+    return Gst.PadProbeReturn.REMOVE
+
+
+def _pulled(pipeline: Gst.Pipeline, path: Path, first: list[int]) -> Iterator[tuple[int, LumaPlane]]:
+    out, bus = pipeline.get_by_name("out"), pipeline.get_bus()
+    silent, decoded = 0, False
+    while silent < SILENT:
+        sample = out.emit("try-pull-sample", WAIT_NS)
+        if sample is not None:
+            silent, decoded = 0, True
+            yield sample.get_buffer().pts - first[0], luma_of(sample.get_buffer(), sample.get_caps())
+            continue
+        if out.get_property("eos") and decoded:
+            return
+        if out.get_property("eos") or bus.pop_filtered(Gst.MessageType.ERROR) is not None:
+            break
+        silent += 1
+    raise RunError(f"{path}: {'is damaged' if decoded else 'contains no picture that can be decoded'}")

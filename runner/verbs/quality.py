@@ -1,0 +1,110 @@
+"""usage: tod-runner quality DRIVE [DRIVE ...]
+
+Measure the pictures that the operator saw: twice a second, the picture on show against the scene that the camera saw
+then (MSSIM of luma at the camera's full size). Frozen, late and damaged pictures count as what they are. Needs drives
+with log.video=true on both sides. With a source that repeats a clip (synthetic, file) the scene is the clip's picture;
+otherwise it is the stream as sent, and what the encoder lost is not included.
+
+Writes the score of each moment to DRIVE/quality.json.
+
+  tod-runner demo log=monday log.video=true duration_s=60
+  tod-runner quality monday
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.errors import UserError
+from runner.verbs import Arguments
+from runner.verbs.screen import progress_bar, streaming
+
+if TYPE_CHECKING:
+    from runner.drive.delivered import DeliveredQuality
+    from runner.drive.read import Drive
+
+DOCUMENT = "quality.json"
+SIDES = ("vehicle", "operator")
+
+
+def run(arguments: Arguments) -> int:
+    if not arguments.words:
+        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")
+    if arguments.overrides:
+        raise UserError("command line", "", arguments.overrides[0], "unknown argument; quality takes drives only")
+    for word in arguments.words:
+        _one(Path(word))
+    return 0
+
+
+def _one(path: Path) -> None:
+    from runner.drive.delivered import measure
+    from runner.drive.read import read_drive
+    from runner.rate_quality.artefact import dumps
+    from runner.system.files import write_whole
+
+    drive = read_drive(path)
+    cameras, clips = _cameras(drive)
+    apply = streaming()
+    with progress_bar() as progress:
+        found = measure(
+            drive, cameras, clips, apply.read_video, apply.decode_video, lambda share: progress(str(path), share)
+        )
+    if not found:
+        raise UserError(str(path), "", None, "no camera's video was kept on both sides: drive with log.video=true")
+    write_whole(path / DOCUMENT, dumps(_document(found)))
+    _show(path, found)
+
+
+def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
+    """The cameras of a drive, and the clips that their sources repeated."""
+    from runner.configuration.config import configuration
+    from runner.plans import compile_plans
+
+    missing = [side for side in SIDES if side not in drive.sides]
+    if missing:
+        raise UserError(str(drive.path), "", None, f"no log of the {' and the '.join(missing)}: both sides are needed")
+    began = drive.sides["vehicle"].began
+    vehicle = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).vehicle()
+    clips = {
+        plan.camera.name: Path(str(plan.source[0].properties["location"]))
+        for plan in compile_plans(vehicle)
+        if plan.loops and "location" in plan.source[0].properties
+    }
+    return vehicle.cameras, {name: clip for name, clip in clips.items() if clip.is_file()}
+
+
+def _document(found: Mapping[str, DeliveredQuality]) -> dict[str, Any]:
+    from dataclasses import asdict
+    from statistics import fmean
+
+    means = {name: fmean(quality.mssim) for name, quality in found.items() if quality.mssim}
+    return {
+        "metric": "mssim",
+        "mean": fmean(means.values()) if means else None,
+        "worst": min(means, key=lambda name: means[name], default=None),
+        "cameras": {name: {"mean": means.get(name), **asdict(quality)} for name, quality in found.items()},
+    }
+
+
+def _show(path: Path, found: Mapping[str, DeliveredQuality]) -> None:
+    from statistics import fmean
+
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=str(path), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for number, heading in enumerate(("camera", "MSSIM", "lowest", "moments", "older picture", "against")):
+        table.add_column(heading, justify="right" if 0 < number < 5 else "left")
+    for name, quality in found.items():
+        scores = quality.mssim
+        figures = (f"{fmean(scores):.4f}", f"{min(scores):.4f}") if scores else ("–", "–")
+        against = "the scene" if quality.clip else "the stream as sent"
+        table.add_row(name, *figures, str(len(scores)), f"{100 * quality.stale:.1f} %", against)
+    means = [fmean(quality.mssim) for quality in found.values() if quality.mssim]
+    Console().print(table)
+    if means:
+        print(f"mean {fmean(means):.4f}, worst camera {min(means):.4f}")

@@ -1,0 +1,86 @@
+"""Quality of delivered pictures: measured on a real drive, and lower where pictures came late."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from rig import free_port, run
+
+SIZE = [f"cameras.front_center.{key}" for key in ("width_px=480", "height_px=260")]
+OTHERS = [f"~cameras.{name}" for name in ("front_left", "front_right", "rear_center")]
+OTHERS += [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """One camera with a clip that repeats, at a bitrate that leaves little to be desired."""
+    path = tmp_path_factory.mktemp("quality") / "drive"
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    words = (*OTHERS, *SIZE, "source.render.seconds=4", "fps_max=10", "page.serve=false", "modes=open_loop")
+    rate = ("pqos=constant", "pqos.kbps=5000", "log.video=true", "duration_s=5")
+    cache = {"XDG_CACHE_HOME": str(tmp_path_factory.getbasetemp() / "cache")}  # as in the tests
+    done = run("demo", *words, *rate, *ports, f"log={path}", env=cache)
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+def measured(tod, path):
+    result = tod("quality", str(path))
+    assert result.status == 0, result.err
+    assert "front_center" in result.out
+    return json.loads((path / "quality.json").read_text())
+
+
+def changed(path, to, change):
+    """A copy of a drive whose samples of the operator's log are changed."""
+    shutil.copytree(path, to)
+    lines = [json.loads(line) for line in (to / "operator.jsonl").read_text().splitlines()]
+    for line in lines:
+        if line.get("log") == "sample":
+            change(line["cameras"]["front_center"])
+    (to / "operator.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return to
+
+
+def test_pictures_that_came_in_time_are_as_good_as_their_encoding(tod, drive):
+    found = measured(tod, drive)
+    camera = found["cameras"]["front_center"]
+    assert camera["clip"] is True
+    assert len(camera["mssim"]) >= 4
+    assert 0.9 < found["mean"] < 1
+    assert found["worst"] == "front_center"
+
+
+def test_pictures_that_came_a_second_late_show_an_old_scene(tod, drive, tmp_path):
+    def late(camera):
+        camera["arrivals"] = [[t + 1, ms and ms + 1000] for t, ms in camera["arrivals"]]
+
+    before = measured(tod, drive)
+    after = measured(tod, changed(drive, tmp_path / "late", late))
+    assert after["cameras"]["front_center"]["stale"] == 1
+    assert after["mean"] < before["mean"] - 0.1
+
+
+def test_without_its_clip_the_stream_as_sent_is_the_reference(tod, drive, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "no clips"))
+    camera = measured(tod, drive)["cameras"]["front_center"]
+    assert camera["clip"] is False
+    assert sum(camera["mssim"]) / len(camera["mssim"]) > 0.99
+
+
+def test_a_drive_without_video_is_refused(tod, drive, tmp_path):
+    shutil.copytree(drive, tmp_path / "blind")
+    for name in ("drive", "operator"):
+        file = tmp_path / "blind" / f"{name}.jsonl"
+        file.write_text("".join(f"{line}\n" for line in file.read_text().splitlines() if '"log": "video"' not in line))
+    result = tod("quality", str(tmp_path / "blind"))
+    assert (result.status, result.err) == (
+        2,
+        f"{tmp_path / 'blind'}: no camera's video was kept on both sides: drive with log.video=true\n",
+    )
+    (tmp_path / "blind" / "operator.jsonl").unlink()
+    rule = "no log of the operator: both sides are needed"
+    assert tod("quality", str(tmp_path / "blind")).err == f"{tmp_path / 'blind'}: {rule}\n"

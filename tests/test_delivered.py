@@ -1,0 +1,60 @@
+"""Which picture was on show at a moment, and which picture of a clip it shows."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runner.drive.captures import SAME_NS, UnitTimes
+from runner.drive.delivered import _nearest, _thumbnail, due
+
+MS = 1_000_000
+DEADLINE = 300 * MS
+
+
+def units(*times: tuple[int, int]) -> list[UnitTimes]:
+    """Capture times and delays in ms."""
+    return [UnitTimes(at * MS, (at + delay) * MS) for at, delay in times]
+
+
+def test_a_picture_that_came_in_time_stands_for_its_moment() -> None:
+    came = units((0, 30), (100, 30), (200, 30))
+    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 1, 2]
+
+
+def test_times_of_both_sides_may_differ_by_less_than_half_a_frame() -> None:
+    came = units((0, 30), (100, 30))
+    assert due([100 * MS - SAME_NS // 2], came, DEADLINE) == [1]
+    assert due([100 * MS - SAME_NS], came, DEADLINE) == [0]
+
+
+def test_a_late_picture_leaves_the_older_one_on_show() -> None:
+    came = units((0, 30), (100, 301), (200, 300))
+    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 0, 2]
+
+
+def test_while_nothing_comes_the_last_picture_stands() -> None:
+    came = units((0, 30), (1000, 30))
+    assert due([500 * MS, 900 * MS, 1000 * MS], came, DEADLINE) == [0, 0, 1]
+
+
+def test_before_the_first_picture_nothing_stands() -> None:
+    assert due([-1000 * MS, 0], units((0, 400)), DEADLINE) == [-1, -1]
+
+
+@given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 1000)), max_size=30), st.integers(0, 6000))
+def test_what_stands_was_captured_by_then_and_had_arrived(times: list[tuple[int, int]], at: int) -> None:
+    came = sorted(units(*times))
+    (number,) = due([at * MS], came, DEADLINE)
+    fits = [n for n, u in enumerate(came) if u.captured <= at * MS + SAME_NS // 2 and u.arrived <= at * MS + DEADLINE]
+    assert number == (fits[-1] if fits else -1)
+
+
+def test_a_coarse_copy_is_found_among_the_pictures_of_a_clip() -> None:
+    noise = np.random.default_rng(1)
+    street = noise.integers(0, 256, (270, 1000)).astype(np.uint8)
+    street = np.repeat(np.repeat(street[::10, ::10], 10, 0), 10, 1)
+    clip = [street[:, 4 * n : 4 * n + 480] for n in range(60)]
+    candidates = [_thumbnail(picture) for picture in clip]
+    for number in (0, 17, 59):
+        coarse = clip[number] // 64 * 64 + noise.integers(0, 32, clip[number].shape).astype(np.uint8)
+        assert _nearest(candidates, _thumbnail(coarse)) == number
