@@ -8,7 +8,7 @@ from statistics import median
 
 import pytest
 
-from rig import SMALL_ROBOT, Operator, clock_ahead, free_port, needs_compiler, process, run, until
+from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, process, run, until
 from runner.drive.read import read_drive
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
@@ -16,7 +16,6 @@ from runner.records import Sample, Telemetry, to_json
 from runner.schema import message_problem
 
 AHEAD_MS, ONE_WAY_MS = 3700, 80
-ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=3000")
 SLOW = ("link=relay", "link.share=3", "link.delay_ms=80", "link.reverse=null")  # from the vehicle; none back
 
 

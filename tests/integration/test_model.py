@@ -155,7 +155,7 @@ def received(plan, count: int) -> list[np.ndarray]:
 
 def pulled(line: str, count: int) -> list[np.ndarray]:
     from runner.gst import Gst
-    from runner.gst.lanes import _luma
+    from runner.gst.pictures import luma_of
 
     pipeline = Gst.parse_launch(f"{line} ! appsink name=sink sync=false")
     pipeline.set_state(Gst.State.PLAYING)
@@ -164,7 +164,7 @@ def pulled(line: str, count: int) -> list[np.ndarray]:
         while len(pictures) < count:
             sample = pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND)
             assert sample, f"{len(pictures)} of {count} pictures arrived"
-            pictures.append(_luma(sample.get_buffer(), sample.get_caps()))
+            pictures.append(luma_of(sample.get_buffer(), sample.get_caps()))
         return pictures
     finally:
         pipeline.set_state(Gst.State.NULL)

@@ -1,0 +1,193 @@
+"""Predictions that are right and wrong over recorded uplinks, in paired runs: what the operator saw.
+
+  python bench/uplinks.py OUT UPLINK.csv...                   5 runs of each, hours
+  python bench/uplinks.py OUT UPLINK.csv --runs 1 --seconds 30 --only right high_50
+
+Drives `experiment=wrong_prediction` over each uplink, measures each drive, and prints a table: medians over the runs,
+and their range. OUT keeps the drives and OUT/uplinks.json all figures; what is there is not driven again. Run it on an
+otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean, median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.configuration.config import configuration
+from runner.core.model import plain
+from runner.drive.read import Drive, read_drive
+from runner.drive.series import Series, series
+from runner.drive.statistics import statistics
+from runner.records import LinkSample
+from runner.system.files import write_whole
+
+EXPERIMENT = "experiment=wrong_prediction"
+FPS = 15  # eight cameras that two cores encode and decode beside the rest
+SETTLED_S = 3.0  # from then on a drive counts
+USABLE_KBPS = 500  # latency counts while the link carries at least so much
+OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # a link that carries less for longer is out
+FIGURES = {
+    "frozen": "frozen %",
+    "back_s": "back after outage, p95 s",
+    "p50_ms": "p50 ms",
+    "p99_ms": "p99 ms",
+    "used": "used %",
+    "damaged": "damaged %",
+    "lost": "lost",
+    "mssim": "MSSIM mean",
+    "worst": "MSSIM worst",
+}
+Figures = dict[str, float]
+Floats = NDArray[np.float64]
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("output", type=Path)
+    options.add_argument("uplinks", type=Path, nargs="+")
+    options.add_argument("--runs", type=int, default=5)
+    options.add_argument("--seconds", type=int, default=60)
+    options.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
+    asked = options.parse_args()
+    found: dict[str, dict[str, list[Figures]]] = {}
+    for uplink in asked.uplinks:
+        conditions = _conditions(uplink)
+        for name in asked.only or conditions:
+            drives = []
+            for number in range(asked.runs):
+                path = asked.output / uplink.stem / f"{name}.{number}"
+                _drive(path, uplink, conditions[name], asked.seconds)
+                drives.append(figures(path))
+                print(uplink.stem, path.name, {key: round(value, 3) for key, value in drives[-1].items()}, flush=True)
+            found.setdefault(uplink.stem, {})[name] = drives
+            write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
+    print("\n".join(table(found)))
+
+
+def _conditions(uplink: Path) -> dict[str, list[str]]:
+    """The overrides of each run of the experiment, by name."""
+    experiment, _ = configuration([EXPERIMENT, f"pqos.file={uplink.resolve()}"]).experiment()
+    return {name: list(words) for name, words in experiment.runs.items()}
+
+
+def _drive(path: Path, uplink: Path, words: Sequence[str], seconds: int) -> None:
+    """Drive once, unless it was driven before; one that was cut short begins anew."""
+    done = path / "quality.json"
+    if done.exists():
+        return
+    shutil.rmtree(path, ignore_errors=True)
+    runner = [sys.executable, "-m", "runner"]
+    own = [f"pqos.file={uplink.resolve()}", f"fps_max={FPS}", "page.serve=false", "log.video=true"]
+    one = [EXPERIMENT, "~experiment.runs", *words, *own, f"duration_s={seconds}", f"log={path}"]
+    subprocess.run([*runner, "demo", *one], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([*runner, "quality", str(path)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    shutil.rmtree(path / "video")
+
+
+def figures(path: Path) -> Figures:
+    """What one drive showed."""
+    drive = read_drive(path)
+    over_time = series(drive, path.name)
+    whole = statistics(over_time)
+    link_t, link_kbps = _link(drive)
+    arrived = [camera.received for camera in over_time.cameras.values() if camera.received]
+    times = np.concatenate([received.arrival_t for received in arrived])
+    ms = np.concatenate([received.arrival_ms for received in arrived])
+    usable = _at(link_t, link_kbps, times) >= USABLE_KBPS
+    counts = usable & (times > SETTLED_S) & np.isfinite(ms)
+    quality = json.loads((path / "quality.json").read_text())
+    means = [
+        fmean(score for t, score in zip(camera["t"], camera["mssim"], strict=True) if t > SETTLED_S)
+        for camera in quality["cameras"].values()
+    ]
+    return {
+        "frozen": 100 * whole.frozen,
+        "back_s": _back(over_time, link_t, link_kbps),
+        "p50_ms": float(np.percentile(ms[counts], 50)),
+        "p99_ms": float(np.percentile(ms[counts], 99)),
+        "used": 100 * _used(drive, over_time),
+        "damaged": 100 * whole.damaged,
+        "lost": float(whole.lost or 0),
+        "mssim": fmean(means),
+        "worst": min(means),
+    }
+
+
+def _link(drive: Drive) -> tuple[Floats, Floats]:
+    """Rate of the link over time, s since the vehicle's log began and kbit/s."""
+    link = drive.sides["link"]
+    ahead = link.began.time - drive.sides["vehicle"].began.time
+    samples = [(sample.t + ahead, sample.kbps) for sample in link.of(LinkSample)]
+    t, kbps = np.array(samples, dtype=float).T
+    return t, kbps
+
+
+def _at(t: Floats, values: Floats, times: Floats) -> Floats:
+    """The values in force at some times."""
+    held: Floats = values[np.clip(np.searchsorted(t, times, "right") - 1, 0, len(values) - 1)]
+    return held
+
+
+def _used(drive: Drive, over_time: Series) -> float:
+    """Bytes that passed over those that could have: no more than the link carried, or the cameras may send."""
+    vehicle = configuration([], base=(dict(drive.sides["vehicle"].began.config), "config"), runnable=False).vehicle()
+    most = float(plain(sum(camera.rate_quality.b_full for camera in vehicle.cameras.values())))
+    samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
+    could = sum(min(before.kbps, most) * (after.t - before.t) for before, after in pairwise(samples))
+    return (samples[-1].bytes - samples[0].bytes) * 8 / 1000 / could
+
+
+def _back(over_time: Series, t: Floats, kbps: Floats) -> float:
+    """Time from the end of an outage to the next picture, over all cameras and outages: p95, s; nan without one."""
+    waits = [
+        float(came[0] - end)
+        for end in _outages(t, kbps)
+        for camera in over_time.cameras.values()
+        if camera.received and len(came := camera.received.arrival_t[camera.received.arrival_t > end])
+    ]
+    return float(np.percentile(waits, 95)) if waits else float("nan")
+
+
+def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
+    """The end of each outage."""
+    began: float | None = None
+    for now, rate in zip(t, kbps, strict=True):
+        if rate < OUTAGE_KBPS:
+            began = now if began is None else began
+        elif began is not None:
+            if now - began >= OUTAGE_S and began > SETTLED_S:
+                yield now
+            began = None
+
+
+def table(found: dict[str, dict[str, list[Figures]]]) -> Iterator[str]:
+    """Markdown: a row for each uplink and condition, median and range over its runs."""
+    yield "| uplink | prediction | " + " | ".join(FIGURES.values()) + " |"
+    yield "| --- " * (len(FIGURES) + 2) + "|"
+    for uplink, conditions in found.items():
+        for name, drives in conditions.items():
+            cells = (_shown(key, [drive[key] for drive in drives]) for key in FIGURES)
+            yield f"| {uplink} | {name} | " + " | ".join(cells) + " |"
+
+
+def _shown(key: str, values: Sequence[float]) -> str:
+    digits = 3 if key in ("mssim", "worst") else 0 if key in ("p50_ms", "p99_ms", "used", "lost") else 1
+    known = [value for value in values if np.isfinite(value)]
+    if not known:
+        return "–"
+    ends = f" ({min(known):.{digits}f} to {max(known):.{digits}f})" if len(known) > 1 else ""
+    return f"{median(known):.{digits}f}{ends}"
+
+
+if __name__ == "__main__":
+    main()
