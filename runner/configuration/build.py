@@ -353,7 +353,7 @@ def _source(data: Mapping[str, Any]) -> Source:
     return Source(
         elements=_elements(data["elements"]),
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
-        **_given(data, ("loop", "frozen_s")),
+        **_given(data, ("loop", "frozen_s", "repeated_s")),
         render=render["drive"] if render else "",
         render_s=render["seconds"] if render else 0,
         stand_in=_elements(data.get("stand_in")),

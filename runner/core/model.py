@@ -207,19 +207,21 @@ def _check_unique(key: str, names: list[str]) -> None:
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
-    settings  values for placeholders from the file itself: clip, device, address
-    loop      restart at the end without a gap (a clip)
-    frozen_s  without a frame for this long, and for 10 frame intervals, the source is replaced while the camera plays;
-              None: it is not monitored
-    render    name of the procedural drive that makes the clip, or ""
-    render_s  length of that drive, s
-    stand_in  elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
+    settings    values for placeholders from the file itself: clip, device, address
+    loop        restart at the end without a gap (a clip)
+    frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
+                None: it is not monitored
+    repeated_s  the same picture for this long is a fault; None: pictures are not compared
+    render      name of the procedural drive that makes the clip, or ""
+    render_s    length of that drive, s
+    stand_in    elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
     """
 
     elements: tuple[Element, ...]
     settings: Mapping[str, Value] = field(default_factory=dict)
     loop: bool = False
     frozen_s: float | None = None
+    repeated_s: float | None = None
     render: str = ""
     render_s: float = 0
     stand_in: tuple[Element, ...] = ()

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from runner.drive.read import Side
 from runner.records import Sample, VideoBegan
 
+if TYPE_CHECKING:
+    from runner.apply import Unit
+
 SECOND_NS = 1_000_000_000
 # A frame of the file and one of the log further apart than this differ; less than most cameras' frame interval.
 SAME_NS = 20_000_000
+
+ReadVideo = Callable[[Path], Iterator["Unit"]]
 
 
 class UnitTimes(NamedTuple):

@@ -4,7 +4,7 @@ For a picture captured at time t, what counts is the newest picture captured by 
 So one that was frozen, lost or late is compared with a scene that has moved on. Pictures are compared at the full size
 of the camera, after scaling, as a screen shows them, damage included.
 
-The scene is the camera's clip, where the drive was driven with one: what scaling and encoding lost is included. Of
+The scene is the camera's rendered clip, if its source has one: what scaling and encoding lost is included. Of
 other sources only the stream as sent is known: what it lost against the scene is not included.
 """
 
@@ -12,30 +12,28 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.core.model import Camera
-from runner.drive.captures import SAME_NS, SECOND_NS, UnitTimes, captured, files, lies_outside, received
+from runner.drive.captures import SAME_NS, SECOND_NS, ReadVideo, UnitTimes, captured, files, lies_outside, received
 from runner.drive.read import Drive, Side
+from runner.errors import RunError
+from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
-from runner.records import DecisionMade, VideoBegan
-
-if TYPE_CHECKING:
-    from runner.apply import Unit
+from runner.records import DecisionMade, Sample, VideoBegan
 
 DEADLINE_S = 0.3  # a later picture is of no use for driving
 EVERY_S = 0.5  # between two moments that are compared
+TELL_S = 0.25  # between two reports of progress
 BLOCKS = 32  # along the shorter side of a picture
 
-Luma = NDArray[np.uint8]
-ReadVideo = Callable[[Path], "Iterator[Unit]"]
 DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
 
 
@@ -62,26 +60,34 @@ def measure(
     read_video: ReadVideo,
     decode_video: DecodeVideo,
     progress: Callable[[float], None] = lambda done: None,
+    on_warning: Callable[[str], None] = lambda what: None,
 ) -> dict[str, DeliveredQuality]:
     """Measure all cameras whose video both sides have kept, on all processors.
 
-    clips    by camera, the clip that its source repeated; others are left out
-    raises   RunError for a file that cannot be read
+    clips       by camera, the clip that its source repeated; others are left out
+    progress    called a few times a second, by this thread, with the share of the cameras done
+    on_warning  called with a line about each camera that is left out, since its files cannot be read
     """
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
     sent, came = files(vehicle), files(operator)
     names = [name for name in cameras if name in sent and name in came]
-    done: list[str] = []
+    videos = _Videos(drive.path, read_video, decode_video)
 
     def one(name: str) -> DeliveredQuality:
-        videos = _Videos(drive.path, read_video, decode_video)
-        quality = _camera(cameras[name], videos, vehicle, operator, sent[name], came[name], clips.get(name))
-        done.append(name)
-        progress(len(done) / len(names))
-        return quality
+        return _camera(cameras[name], videos, vehicle, operator, sent[name], came[name], clips.get(name))
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return dict(zip(names, pool.map(one, names), strict=True))
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        work = {name: pool.submit(one, name) for name in names}
+        while not all(each.done() for each in work.values()):
+            progress(sum(each.done() for each in work.values()) / len(work))
+            wait(work.values(), TELL_S, FIRST_EXCEPTION)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    for name, each in work.items():
+        if isinstance(error := each.exception(), RunError):
+            on_warning(f"{name} is left out: {error}")
+    return {name: each.result() for name, each in work.items() if not isinstance(each.exception(), RunError)}
 
 
 def due(moments: Sequence[int], units: Sequence[UnitTimes], deadline_ns: int) -> list[int]:
@@ -142,19 +148,17 @@ def _camera(
         UnitTimes(ns, arrived[ns]) for line in came for ns in videos.captures(line, known).values() if ns in arrived
     ]
     captures = [ns for line in sent for ns in videos.captures(line, ()).values()]
-    moments = _moments(captures, units, _whole(vehicle, camera))
+    whole = _whole(vehicle, camera)
+    moments = _moments(captures, units, _last(operator), whole)
     numbers = due(moments, units, round(DEADLINE_S * SECOND_NS))
     pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
+    pairs = [(moment, on_show) for moment, on_show in pairs if whole(on_show)]
     scenes = _scenes(camera, videos, sent, [moment for moment, _ in pairs], clip)
-    shown: dict[int, list[int]] = {}  # by capture time of the picture on show, the moments that it stands for
-    for moment, on_show in pairs:
-        shown.setdefault(on_show, []).append(moment)
-    meter = metric().meter((camera.width, camera.height), camera.fps)
-    numbered = {moment: number for number, (moment, _) in enumerate(pairs)}
-    for ns, picture in videos.pictures(came, known, (camera.width, camera.height)):
-        for moment in shown.get(ns, ()):
-            if moment in scenes:
-                meter.add(numbered[moment], scenes[moment], picture)
+    size = (camera.width, camera.height)
+    meter = metric().meter(size, camera.fps)
+    for number, picture in _on_show(pairs, videos.pictures(came, known, size) if pairs else ()):
+        if pairs[number][0] in scenes:
+            meter.add(number, scenes[pairs[number][0]], picture)
     scores = meter.close()
     began = round(vehicle.began.time * SECOND_NS)
     stale = [moment - on_show > SAME_NS for moment, on_show in pairs]
@@ -166,11 +170,31 @@ def _camera(
     )
 
 
-def _moments(sent: Sequence[int], units: Sequence[UnitTimes], counts: Callable[[int], bool]) -> list[int]:
-    """Capture times of the vehicle's pictures, EVERY_S apart, while the operator's side received."""
+def _on_show(pairs: Sequence[tuple[int, int]], pictures: Iterable[tuple[int, Luma]]) -> Iterator[tuple[int, Luma]]:
+    """By number of the moment, the picture on show; where the decoder left it out, the last one before it.
+
+    pairs  moments, and the capture time of what was on show, neither ever decreasing
+    """
+    waiting = deque(enumerate(on_show for _, on_show in pairs))
+    last: Luma | None = None
+    for ns, picture in pictures:
+        while waiting and last is not None and waiting[0][1] < ns:
+            yield waiting.popleft()[0], last
+        last = picture
+    while waiting and last is not None:
+        yield waiting.popleft()[0], last
+
+
+def _last(operator: Side) -> int:
+    """When the operator's side measured for the last time, ns since 1970 by the vehicle's clock."""
+    return round((operator.began_s + max((sample.t for sample in operator.of(Sample)), default=0.0)) * SECOND_NS)
+
+
+def _moments(sent: Sequence[int], units: Sequence[UnitTimes], until: int, counts: Callable[[int], bool]) -> list[int]:
+    """Capture times of the vehicle's pictures, EVERY_S apart, from the first one received until the operator's end."""
     found: list[int] = []
     for ns in sent:
-        received_then = units and units[0].captured <= ns <= units[-1].captured
+        received_then = units and units[0].captured <= ns <= until - DEADLINE_S * SECOND_NS
         if received_then and counts(ns) and (not found or ns - found[-1] >= EVERY_S * SECOND_NS):
             found.append(ns)
     return found
@@ -193,6 +217,8 @@ def _scenes(
 ) -> dict[int, Luma]:
     """The scene at each moment."""
     wanted = set(moments)
+    if not wanted:
+        return {}
     if clip is None:
         size = (camera.width, camera.height)
         return {ns: picture for ns, picture in videos.pictures(sent, (), size) if ns in wanted}

@@ -13,7 +13,7 @@ from msgspec import UNSET
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, files, follow, lies_outside, received
+from runner.drive.captures import SECOND_NS, ReadVideo, files, follow, lies_outside, received
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import KINDS, Json, Note, Position, Record, Sample, VideoBegan, line_to_json
@@ -32,8 +32,6 @@ TOPICS = {
     "link": "/link",
 }
 VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_received"}
-
-ReadVideo = Callable[[Path], Iterator["Unit"]]
 
 
 class McapMessage(NamedTuple):

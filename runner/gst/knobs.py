@@ -12,7 +12,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
 
-ANOTHER_RATIO = (4001, 4000)
+ANOTHER_RATIO = (60001, 60000)  # of 16 bits each; below 30000 px no player rounds it to another pixel
 
 
 class KnobPanel:
@@ -61,7 +61,7 @@ class KnobPanel:
     def set_anew(self, knob: str) -> None:
         """Set the caps of a knob anew, with a pixel aspect ratio that differs: the encoder starts anew.
 
-        The ratio changes between 1 and 4001/4000, which nobody sees.
+        The ratio changes between 1 and one that nobody sees.
         """
         with self._lock:
             if knob not in self.applied:

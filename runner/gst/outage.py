@@ -24,7 +24,7 @@ class Outage:
     @property
     def reason(self) -> str | None:
         """Why it began; None while there is no outage."""
-        return self._reasons[0] if self._reasons else None
+        return next(iter(tuple(self._reasons)), None)  # another thread may clear them
 
     def failed(self, why: str, since: float) -> None:
         """Record a failure.

@@ -32,7 +32,7 @@ def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
 def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:
     """Decode a file, whatever sizes its pictures change to: ns since its first access unit, luma scaled to one size.
 
-    raises  RunError if the path names no file or nothing can be decoded; damaged pictures are left out
+    raises  RunError if the path names no file or nothing can be decoded. Damaged pictures come as they were decoded
     """
     if not path.is_file():
         raise RunError(f"{path}: {file_problem(path)}")
@@ -66,6 +66,8 @@ def _pulled(pipeline: Gst.Pipeline, path: Path, first: list[int]) -> Iterator[tu
         sample = out.emit("try-pull-sample", WAIT_NS)
         if sample is not None:
             silent, decoded = 0, True
+            if not first or sample.get_buffer().pts == Gst.CLOCK_TIME_NONE:
+                continue
             yield sample.get_buffer().pts - first[0], luma_of(sample.get_buffer(), sample.get_caps())
             continue
         if out.get_property("eos") and decoded:

@@ -45,7 +45,8 @@ class CameraPipeline:
         self._started = False
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
-        self._repeats = RepeatedPicture(self._elements[0].get_static_pad("sink"), on_report)
+        entry = self._elements[0].get_static_pad("sink")
+        self._repeats = RepeatedPicture(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._stamp(last.get_parent_element())
         self.knobs.set_now(self._allowed(wanted))
@@ -108,7 +109,8 @@ class CameraPipeline:
                 self.knobs.set_anew("size")
             case "event":
                 event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
-                self._pipeline.get_by_name("sent").get_static_pad("sink").push_event(event)
+                if sent := self._pipeline.get_by_name("sent"):
+                    sent.get_static_pad("sink").push_event(event)
 
     def stages(self) -> SenderStages | None:
         """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.

@@ -101,7 +101,7 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
         "sending": True,
         "roi": camera.full_roi,
         "size": (camera.width, camera.height),
-        "bitrate": int(camera.rate_quality.b_full),
+        "bitrate": max(1, int(camera.rate_quality.b_full)),
     }
     for knob, value in largest.items():
         for index, (name, key, filled) in enumerate(assignments(camera, knob, value)):

@@ -79,8 +79,11 @@ class RepairBuffer:
 
     def _on_passed(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         header, now = info.get_buffer().extract_dup(1, 7), time.monotonic()
-        came = next((at for stamp, at in self._ends if stamp == header[3:]), None)
-        if not header[0] & MARKER or came is None:
+        if not header[0] & MARKER:
+            return Gst.PadProbeReturn.OK
+        # A copy: the thread of arriving packets adds to it.
+        came = next((at for stamp, at in tuple(self._ends) if stamp == header[3:]), None)
+        if came is None:
             return Gst.PadProbeReturn.OK
         self._waited.set(1000 * (now - came))
         self._timing = False

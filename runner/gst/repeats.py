@@ -11,19 +11,19 @@ from gi.repository import Gst
 from runner.gst.outage import Outage
 
 SLICES, SLICE_BYTES = 16, 8192  # of a picture that are compared: the noise of a sensor is everywhere
-REPEATED_S = 1.0  # the same picture for longer is no live one
-LOOKS = 4  # and at least so often
+LOOKS = 4  # at which a picture is the same before it counts as repeated
 
 
 class RepeatedPicture:
     """Compares parts of one picture in many: no Python runs for the others.
 
     pad        where raw pictures pass; others, and those outside the main memory, are not compared
+    after_s    for how long a picture has to be repeated; None: pictures are not compared
     on_report  called with a sentence when repetition begins, and when it ends
     """
 
-    def __init__(self, pad: Gst.Pad, on_report: Callable[[str], None]) -> None:
-        self._pad = pad
+    def __init__(self, pad: Gst.Pad, after_s: float | None, on_report: Callable[[str], None]) -> None:
+        self._pad, self._after_s = pad, after_s
         self.outage = Outage(on_report)
         self._armed = False
         self._digest: int | None = None
@@ -31,7 +31,7 @@ class RepeatedPicture:
 
     def look(self) -> None:
         """Request a look at the next picture; to be called a few times a second, from one thread."""
-        if not self._armed:
+        if self._after_s is not None and not self._armed:
             self._armed = True
             self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_picture)
 
@@ -46,7 +46,7 @@ class RepeatedPicture:
             self.outage.over(now)
         else:
             self._looks += 1
-            if now - self._since >= REPEATED_S and self._looks >= LOOKS:
+            if now - self._since >= (self._after_s or 0.0) and self._looks >= LOOKS:
                 self.outage.failed("source: repeats the same picture", self._since)
         return Gst.PadProbeReturn.REMOVE
 

@@ -11,7 +11,8 @@ from gi.repository import Gst
 from runner.gst.clocks import captured_at
 from runner.system.recent import RecentValue
 
-SAME_S = 1e-5  # capture times of the same picture on both sides of the encoder
+SAME_S = 1e-4  # capture times of the same picture on both sides of the encoder differ by less
+PATIENCE = 100  # pictures that leave the encoder before the one that was awaited is given up
 
 
 class SenderStages(NamedTuple):
@@ -32,6 +33,7 @@ class EncoderWatch:
         self._into: Any = encoder.get_static_pad("sink") if encoder else None
         self._out: Any = encoder.get_static_pad("src") if encoder else None
         self._armed = False
+        self._left = 0
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
         self._measured = RecentValue[SenderStages]()
 
@@ -46,7 +48,9 @@ class EncoderWatch:
         return self._measured.get()
 
     def _on_raw(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        captured = captured_at(pad, info.get_buffer())
+        if info.get_buffer().pts == Gst.CLOCK_TIME_NONE:
+            return Gst.PadProbeReturn.OK
+        captured, self._left = captured_at(pad, info.get_buffer()), PATIENCE
         self._entered = (captured, 1000 * (time.time() - captured))
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_coded)
         return Gst.PadProbeReturn.REMOVE
@@ -55,9 +59,10 @@ class EncoderWatch:
         now = time.time()
         captured, capture_ms = self._entered
         ahead_s = captured_at(pad, info.get_buffer()) - captured
-        if ahead_s < -SAME_S:
+        self._left -= 1
+        if ahead_s < -SAME_S and self._left:
             return Gst.PadProbeReturn.OK  # one that the encoder took earlier
-        if ahead_s < SAME_S:  # else it has dropped the picture
+        if abs(ahead_s) < SAME_S:  # else the encoder has dropped the picture
             self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
         self._armed = False
         return Gst.PadProbeReturn.REMOVE

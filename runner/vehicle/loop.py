@@ -272,15 +272,17 @@ class ControlLoop:
             latency_ms = item.report.latency_ms
             overdue_s = self._operators.overdue_s(item.sender, t, item.report.as_of)
             self._seen = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
-            self._repair(() if item.report.damaged is UNSET else item.report.damaged, t)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
+        if reported.in_control and item.report.damaged is not UNSET:
+            self._repair(item.report.damaged, t)
 
     def _repair(self, damaged: Iterable[str], t: float) -> None:
-        """Send key frames of cameras whose pictures are damaged for good."""
-        named = [name for name in damaged if name in self.vehicle.cameras]
-        due = [name for name in named if t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S]
+        """Send key frames of cameras that lack packets for good; one that is not sent has nothing to repair."""
+        sending = {name for name, setting in self._run.decision.settings.items() if setting.sending}
+        named = sending.intersection(damaged)
+        due = sorted(name for name in named if t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S)
         self._key_frames |= dict.fromkeys(due, t)
         if due:
             self.applier.send_key_frames(due)

@@ -2,8 +2,8 @@
 
 Measure the pictures that the operator saw: twice a second, the picture on show against the scene that the camera saw
 then (MSSIM of luma at the camera's full size). Frozen, late and damaged pictures count as what they are. Needs drives
-with log.video=true on both sides. With a source that repeats a clip (synthetic, file) the scene is the clip's picture;
-otherwise it is the stream as sent, and what the encoder lost is not included.
+with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise it is
+the stream as sent, and what the encoder lost is not included.
 
 Writes the score of each moment to DRIVE/quality.json.
 
@@ -13,11 +13,13 @@ Writes the score of each moment to DRIVE/quality.json.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.errors import UserError
+from runner.system import signals
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
@@ -46,16 +48,30 @@ def _one(path: Path) -> None:
     from runner.system.files import write_whole
 
     drive = read_drive(path)
+    for warning in drive.warnings:
+        print(warning, file=sys.stderr)
     cameras, clips = _cameras(drive)
     apply = streaming()
     with progress_bar() as progress:
-        found = measure(
-            drive, cameras, clips, apply.read_video, apply.decode_video, lambda share: progress(str(path), share)
-        )
+
+        def tell(share: float) -> None:
+            signals.check()
+            progress(str(path), share)
+
+        found = measure(drive, cameras, clips, apply.read_video, apply.decode_video, tell, _warn)
     if not found:
         raise UserError(str(path), "", None, "no camera's video was kept on both sides: drive with log.video=true")
+    if not any(quality.mssim for quality in found.values()):
+        rule = "no capture times were logged, so nothing can be compared; over SRT there are none"
+        raise UserError(str(path), "", None, rule)
+    if clips and len({quality.clip for quality in found.values()}) > 1:
+        _warn(f"{path}: the clips of some cameras are missing: these are compared with the stream as sent")
     write_whole(path / DOCUMENT, dumps(_document(found)))
     _show(path, found)
+
+
+def _warn(what: str) -> None:
+    print(what, file=sys.stderr)
 
 
 def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
@@ -68,10 +84,10 @@ def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
         raise UserError(str(drive.path), "", None, f"no log of the {' and the '.join(missing)}: both sides are needed")
     began = drive.sides["vehicle"].began
     vehicle = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).vehicle()
-    clips = {
+    clips = {  # rendered ones have the shape of the camera's picture; others are cropped by their source
         plan.camera.name: Path(str(plan.source[0].properties["location"]))
         for plan in compile_plans(vehicle)
-        if plan.loops and "location" in plan.source[0].properties
+        if plan.loops and plan.camera.source.render
     }
     return vehicle.cameras, {name: clip for name, clip in clips.items() if clip.is_file()}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from contextlib import ExitStack
@@ -87,8 +88,9 @@ def test_a_request_is_answered_once_it_is_read_back(operator, vehicle):
     vehicle.watch(*CAMERAS)
     operator.ask("1", event="mode_selected", mode="collective")
     for number, kbps in enumerate((900, 4000, 500), 2):
-        reply = operator.ask(str(number), event="total_set", kbps=kbps)
-        assert (reply["result"], reply["reason"]) == ("applied", "")
+        replies = (operator.ask(f"{number}.{turn}", event="total_set", kbps=kbps) for turn in itertools.count())
+        # On a busy machine a viewer may have to connect again meanwhile.
+        until(lambda replies=replies: (reply := next(replies))["result"] == "applied" and not reply["reason"])
         state = operator.reach(lambda state, kbps=kbps: state["total_kbps"] == kbps and all_fit(state))
         assert sum(camera["applied"]["bitrate"] for camera in state["cameras"].values()) <= kbps
 

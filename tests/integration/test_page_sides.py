@@ -242,7 +242,7 @@ def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
     """Pictures come as always; only their content shows that none of them is new."""
     still = "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true, pattern: circular}}, "
     raw = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}]"
-    with sides() as (url, vehicle, _), vehicle(still + raw), opened(chromium, url) as page:
+    with sides() as (url, vehicle, _), vehicle(still + raw, "+source.repeated_s=1"), opened(chromium, url) as page:
         until(lambda: {camera["status"] for camera in measure(page).values()} == {"frozen"})
         counted = measure(page)
         until(lambda: all(camera["drawn"] > counted[name]["drawn"] + 5 for name, camera in measure(page).items()))

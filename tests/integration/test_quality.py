@@ -9,6 +9,7 @@ import pytest
 
 from rig import free_port, run
 
+pytestmark = [pytest.mark.gst, pytest.mark.alone]  # on a busy machine pictures are late
 SIZE = [f"cameras.front_center.{key}" for key in ("width_px=480", "height_px=260")]
 OTHERS = [f"~cameras.{name}" for name in ("front_left", "front_right", "rear_center")]
 OTHERS += [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
@@ -84,3 +85,31 @@ def test_a_drive_without_video_is_refused(tod, drive, tmp_path):
     (tmp_path / "blind" / "operator.jsonl").unlink()
     rule = "no log of the operator: both sides are needed"
     assert tod("quality", str(tmp_path / "blind")).err == f"{tmp_path / 'blind'}: {rule}\n"
+
+
+def test_a_camera_whose_file_cannot_be_read_is_left_out(tod, drive, tmp_path):
+    shutil.copytree(drive, tmp_path / "torn")
+    (tmp_path / "torn" / "video" / "front_center.operator.0.ts").write_bytes(b"")
+    result = tod("quality", str(tmp_path / "torn"))
+    assert result.status == 2
+    assert "front_center is left out: " in result.err
+
+
+def test_without_capture_times_nothing_is_compared(tod, drive, tmp_path):
+    def timeless(camera):
+        camera["arrivals"] = [[t, None] for t, _ in camera["arrivals"]]
+
+    path = changed(drive, tmp_path / "timeless", timeless)
+    rule = "no capture times were logged, so nothing can be compared; over SRT there are none"
+    assert tod("quality", str(path)).err.endswith(f"{path}: {rule}\n")
+
+
+def test_pictures_that_stop_count_until_the_operators_end(tod, drive, tmp_path):
+    def stops(camera):
+        camera["arrivals"] = [[t, ms] for t, ms in camera["arrivals"] if t < 2.5]
+
+    before = measured(tod, drive)["cameras"]["front_center"]
+    after = measured(tod, changed(drive, tmp_path / "stops", stops))["cameras"]["front_center"]
+    assert len(after["mssim"]) >= len(before["mssim"]) - 1
+    assert after["stale"] > before["stale"]
+    assert sum(after["mssim"]) < sum(before["mssim"])

@@ -8,6 +8,7 @@ import numpy as np
 from rig import SMALL_ROBOT, streaming, until, watching
 
 SHAPE = (240 * 3 // 2, 424)  # I420
+WORDS = (*SMALL_ROBOT, "source=appsrc", "+source.repeated_s=1")
 FAULT = {"rear": "source: repeats the same picture"}
 
 
@@ -36,8 +37,7 @@ def dark(number):
 
 
 def test_a_source_that_repeats_a_picture_is_at_fault_until_its_pictures_change():
-    words = (*SMALL_ROBOT, "source=appsrc")
-    with streaming(*words, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
+    with streaming(*WORDS, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
         play(side, dark, lambda: len(client.sizes) > 5)
         play(side, dark, passed(2))
         assert side.sources() == {}
@@ -53,12 +53,21 @@ def test_a_source_that_repeats_a_picture_is_at_fault_until_its_pictures_change()
 
 def test_a_picture_that_comes_seldom_is_not_taken_for_a_repeated_one():
     """Until it has been seen several times."""
-    words = (*SMALL_ROBOT, "source=appsrc")
-    with streaming(*words, cameras=("rear",)) as (side, _, (plan,), _reported), watching(plan) as client:
+    with streaming(*WORDS, cameras=("rear",)) as (side, _, (plan,), _reported), watching(plan) as client:
         play(side, dark, lambda: len(client.sizes) > 5)
         still = dark(1)
         for _ in range(3):
             side.push("rear", still)
             side.stages()
             time.sleep(0.6)
+        assert side.sources() == {}
+
+
+def test_pictures_are_not_compared_where_a_still_scene_gives_identical_ones():
+    """Of decoded or generated pictures, by default: a scene that stands still is not a camera that hangs."""
+    words = (*SMALL_ROBOT, "source=appsrc")
+    with streaming(*words, cameras=("rear",)) as (side, _, (plan,), _reported), watching(plan) as client:
+        still = dark(1)
+        play(side, lambda number: still, lambda: len(client.sizes) > 5)
+        play(side, lambda number: still, passed(2))
         assert side.sources() == {}
