@@ -34,8 +34,10 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     assert len(samples) > 15
     known = [sample for sample in samples if sample.clock_bound_ms is not None]
     assert len(known) >= 0.99 * len(samples)
-    for camera in ("front", "rear", "mast"):
-        shown = [sample.cameras[camera].latency_ms is not None for sample in samples]
+    for name in ("front", "rear", "mast"):
+        received = [sample.cameras[name] for sample in samples if sample.cameras[name].arrivals]
+        assert len(received) > 15
+        shown = [camera.latency_ms is not None for camera in received]  # a picture of a second ago has no latency
         assert sum(shown) >= 0.99 * len(shown)
     for camera in ("front", "rear", "mast"):
         check_stages([sample.cameras[camera] for sample in known], max(sample.clock_bound_ms for sample in known))
