@@ -35,7 +35,8 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     known = [sample for sample in samples if sample.clock_bound_ms is not None]
     assert len(known) >= 0.99 * len(samples)
     for name in ("front", "rear", "mast"):
-        received = [sample.cameras[name] for sample in samples if sample.cameras[name].arrivals]
+        received = [camera for camera in (sample.cameras[name] for sample in samples) if camera.arrivals]
+        received = [camera for camera in received if camera.frames > 15]  # after its first second
         assert len(received) > 15
         shown = [camera.latency_ms is not None for camera in received]  # a picture of a second ago has no latency
         assert sum(shown) >= 0.99 * len(shown)

@@ -243,8 +243,9 @@ def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
     still = "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true, pattern: circular}}, "
     raw = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}]"
     with sides() as (url, vehicle, _), vehicle(still + raw, "+source.repeated_s=1"), opened(chromium, url) as page:
+        refused = page.locator("[data-camera] .refused")
+        until(lambda: refused.all_inner_texts() == 3 * ["source: repeats the same picture"])
         until(lambda: {camera["status"] for camera in measure(page).values()} == {"frozen"})
         counted = measure(page)
         until(lambda: all(camera["drawn"] > counted[name]["drawn"] + 5 for name, camera in measure(page).items()))
         assert {camera["status"] for camera in measure(page).values()} == {"frozen"}
-        assert page.locator("[data-camera=rear] .refused").inner_text() == "source: repeats the same picture"
