@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
 
 SAMPLE_S = 0.25
+START_S = 20.0  # how long a given duration waits for the vehicle
 END_S = 1.0  # how long the last sample may take
 
 
@@ -46,7 +48,8 @@ class LiveOperator:
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
         self._stopped = threading.Event()
-        self._until = float("inf")
+        self._duration_s: float | None = None
+        self._latest_start = self._until = inf
         self._failure: RunError | None = None
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
@@ -54,12 +57,13 @@ class LiveOperator:
     def start(self, on_unit: OnUnit | None = None, duration_s: float | None = None) -> None:
         """Connect, receive, and sample, until stopped or for a given time.
 
-        on_unit  called, from the camera's streaming thread, with each access unit that arrives
+        on_unit     called, from the camera's streaming thread, with each access unit that arrives
+        duration_s  from the moment the vehicle is online, or START_S after this call; None: until stopped
         """
         self.station.connect()
         self._side = self._build(on_unit)
         self._log.begin()
-        self._until = float("inf") if duration_s is None else time.monotonic() + duration_s
+        self._duration_s, self._latest_start = duration_s, time.monotonic() + START_S
         self._thread.start()
         self._reporting.start()
 
@@ -113,7 +117,7 @@ class LiveOperator:
         raises  RunError
         """
         noted = ""
-        while not self._stopped.wait(every_s) and time.monotonic() < self._until:
+        while not self._stopped.wait(every_s) and not self._over():
             try:
                 work()
             except RunError:
@@ -121,6 +125,13 @@ class LiveOperator:
             except Exception as error:
                 if noted != (noted := f"a {what} failed: {type(error).__name__}: {error}"):
                     self.station.note(noted)
+
+    def _over(self) -> bool:
+        """Whether the given time has passed. A slow start of the vehicle takes nothing from it."""
+        now, state = time.monotonic(), self.station.state
+        if self._duration_s is not None and self._until == inf and (state or now >= self._latest_start):
+            self._until = now + self._duration_s
+        return now >= self._until
 
 
 @contextmanager

@@ -3,8 +3,9 @@
 The operator's side: receives and decodes every camera with the operator graph of the configuration. A browser on this
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
 bitrates and factors, charts, the drive, and why each decision was made. The terminal shows the same as a table. Ends
-with Ctrl-C or after duration_s, with a summary of how well the received video followed the decisions. With log=DIR all
-that is received is written to DIR/operator.jsonl, for `report` and `export`.
+with Ctrl-C or duration_s after the vehicle came online, with a summary of how well the received video followed the
+decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR all that is received is written to
+DIR/operator.jsonl, for `report` and `export`.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7

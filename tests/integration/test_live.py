@@ -158,10 +158,23 @@ def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_p
     assert run("replay", f"input={tmp_path / 'drive'}").returncode == 0
 
 
+def test_a_given_duration_begins_when_the_vehicle_is_online(broker, tmp_path):
+    ports = (f"control.port={broker.port}", f"media.port={free_port()}")
+    with process("operator", *ROBOT, *ports, "duration_s=1.5", f"log={tmp_path}") as operator:
+        log = tmp_path / "operator.jsonl"
+        until(lambda: log.exists() and len(log.read_text().splitlines()) > 2)
+        time.sleep(1.5)
+        with process("vehicle", *ROBOT, *ports):
+            operator.communicate(timeout=60)
+    samples = [*read_drive(tmp_path).sides["operator"].of(Sample)]
+    assert samples[-1].cameras["front"].frames > 0
+    assert samples[-1].t - samples[0].t > 2.5
+
+
 @pytest.mark.alone
 def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
     ports = (f"control.port={broker.port}", f"media.port={free_port()}")
-    with process("operator", *ROBOT, *ports, "duration_s=16") as operator:
+    with process("operator", *ROBOT, *ports, "duration_s=14") as operator:
         with process("vehicle", *ROBOT, *ports) as first:
             watching = Operator(broker)
             watching.state(lambda state: state["online"] and all(c["applied"] for c in state["cameras"].values()))
