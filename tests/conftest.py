@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers import Command, UserConf
+from helpers import Command, UserConf, shared_cache
 from hypothesis import settings
 
 settings.register_profile("any machine", deadline=None)  # a busy one may take longer than 0.2 s for an example
@@ -15,7 +15,7 @@ settings.load_profile("any machine")
 @pytest.fixture(autouse=True)
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(shared_cache(tmp_path_factory)))
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -25,6 +26,12 @@ CONF = directory("conf")
 @cache
 def vehicle(*overrides: str) -> Vehicle:
     return configuration(["source=test", *overrides]).vehicle()
+
+
+def shared_cache(factory: pytest.TempPathFactory) -> Path:
+    """An empty cache at first, shared by all processes of pytest-xdist: a clip is rendered once."""
+    base = factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
 
 
 class Drive:

@@ -6,6 +6,7 @@ import json
 import shutil
 
 import pytest
+from helpers import shared_cache
 
 from rig import free_port, run
 
@@ -21,7 +22,7 @@ def drive(tmp_path_factory):
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     words = (*OTHERS, *SIZE, "source.render.seconds=4", "fps_max=10", "page.serve=false", "modes=open_loop")
     rate = ("pqos=constant", "pqos.kbps=5000", "log.video=true", "duration_s=5")
-    cache = {"XDG_CACHE_HOME": str(tmp_path_factory.getbasetemp() / "cache")}  # as in the tests
+    cache = {"XDG_CACHE_HOME": str(shared_cache(tmp_path_factory))}  # as in the tests
     done = run("demo", *words, *rate, *ports, f"log={path}", env=cache)
     assert done.returncode == 0, done.stderr
     return changed(path, path.with_name("prompt"), in_time)
