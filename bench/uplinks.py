@@ -76,7 +76,7 @@ def main() -> None:
 
 def _conditions(uplink: Path) -> dict[str, list[str]]:
     """The overrides of each run of the experiment, by name."""
-    experiment, _ = configuration([EXPERIMENT, f"pqos.file={uplink.resolve()}"]).experiment()
+    experiment = configuration([EXPERIMENT, f"pqos.file={uplink.resolve()}"]).experiment()
     return {name: list(words) for name, words in experiment.runs.items()}
 
 

@@ -394,7 +394,10 @@ class VideoBegan:
 
 @dataclass(frozen=True, slots=True)
 class LinkSample:
-    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded, dropped and lost so far."""
+    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded, dropped and lost so far.
+
+    tcp_bytes  that competing TCP flows have delivered, without headers
+    """
 
     t: float
     kbps: float
@@ -403,6 +406,7 @@ class LinkSample:
     packets: int
     dropped: int
     lost: int = 0
+    tcp_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

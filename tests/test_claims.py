@@ -22,7 +22,8 @@ def held(path: Path) -> dict[str, bool | None]:
 
 
 def test_the_driving_test_does_what_the_paper_reports(tmp_path: Path) -> None:
-    experiment, link = configuration(TEST, runnable=False).experiment()
+    config = configuration(TEST, runnable=False)
+    experiment, link = config.experiment(), config.link()
     assert (experiment.duration_s, experiment.claims, link) == (100, "driving_test", None)
     checks = claims(series(read_drive(write_drive(tmp_path / "drive", seconds=100, overrides=TEST))))
     assert len(checks) == 9

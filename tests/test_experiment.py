@@ -27,7 +27,8 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 @pytest.mark.slow
 @pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
-    experiment, link = configuration([f"experiment={name}"], runnable=False).experiment()
+    config = configuration([f"experiment={name}"], runnable=False)
+    experiment, link = config.experiment(), config.link()
     assert (link is not None) == (name in ("bottleneck", "loss", "wrong_prediction"))
     for words in ((), *experiment.runs.values()):
         configuration([f"experiment={name}", *words], runnable=False).pqos()
@@ -45,7 +46,7 @@ def test_the_command_line_has_the_last_word() -> None:
 
 
 def limited(*words: str) -> LinkSettings:
-    _, link = configuration(words, runnable=False).experiment()
+    link = configuration(words, runnable=False).link()
     assert link is not None
     return link
 

@@ -76,19 +76,26 @@ class Configuration:
 
         return self._builder.finished(self._builder.part(("study",), read_study))
 
-    def experiment(self) -> tuple[Experiment, LinkSettings | None]:
-        """What the demo drives, and the limited link between its sides."""
-        from runner.configuration.experiment import Experiment, read_experiment, read_link, truth
+    def experiment(self) -> Experiment:
+        """What the demo drives, and what its operator asks for."""
+        from runner.configuration.experiment import Experiment, read_experiment
 
         builder = self._builder
-        experiment = builder.part(("experiment",), read_experiment) if "experiment" in self.document else Experiment()
+        given = "experiment" in self.document
+        return builder.finished(builder.part(("experiment",), read_experiment) if given else Experiment())
+
+    def link(self) -> LinkSettings | None:
+        """The limited link between the demo's sides, if there is one."""
+        from runner.configuration.experiment import read_link, truth
+
+        builder = self._builder
         if "link" not in self.document:
-            return builder.finished(experiment), None
+            return None
         rates = builder.part(("pqos",), lambda settings: truth(settings, self._bases))
         link = builder.part(("link",), lambda settings: read_link(settings, rates, self._bases)) if rates else None
         if link:
             builder.check_link(link.kind)
-        return builder.finished(experiment), builder.finished(link)
+        return builder.finished(link)
 
     @cached_property
     def _builder(self) -> Builder:

@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from runner.core.events import ClockAdvanced, Event
-from runner.core.model import Kbps, exact
-from runner.link.limit import Limit, Reverse
+from runner.core.model import Kbps, ModelError, exact
+from runner.link.limit import Limit, Reverse, TcpFlows
 from runner.pqos import Pqos, build_pqos, trace
 from runner.pqos.table import find_file
 from runner.pqos.track import Track, build_track
+from runner.schema import event_problem
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
 STEP_S = 0.1  # interval at which the rate of a link follows a map
+
+
+class TimedRequest(NamedTuple):
+    """What the operator asks for at a time of the drive, s: an event in JSON without its time."""
+
+    at_s: float
+    event: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -26,12 +34,14 @@ class Experiment:
     duration_s  length of each drive, s
     claims      name of the claims that a publication makes about such a drive, or ""
     runs        by name, the overrides that each of several drives adds; empty: one drive
+    requests    in the order of their times
     """
 
     about: str = ""
     duration_s: float = 60
     claims: str = ""
     runs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    requests: tuple[TimedRequest, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -43,8 +53,18 @@ class LinkSettings:
 
 
 def read_experiment(data: Mapping[str, Any]) -> Experiment:
+    """The `experiment` section. raises ModelError with the key, the value found and the rule"""
     runs = {name: tuple(words) for name, words in (data.get("runs") or {}).items()}
-    return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs)
+    requests = [_request(*numbered) for numbered in enumerate(data.get("requests") or ())]
+    in_order = tuple(sorted(requests, key=lambda request: request.at_s))
+    return Experiment(data["about"], float(data["duration_s"]), data.get("claims") or "", runs, in_order)
+
+
+def _request(index: int, data: Mapping[str, Any]) -> TimedRequest:
+    event = dict(data["request"])
+    if problem := event_problem({"t": 0, **event}):
+        raise ModelError(f"requests[{index}].request", event, problem)
+    return TimedRequest(float(data["at_s"]), event)
 
 
 def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> LinkSettings:
@@ -54,17 +74,37 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
-    rates = trace(find_file(data, "file", bases), data["loop"], exact(0)) if data["file"] else predicted
+    rates = _recorded(data, data["loop"], bases) if data["file"] else predicted
     share = float(data["share"])
 
     def kbps_at(t: float) -> float:
         return share * float(rates(t))
 
-    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), reverse=_reverse(data.get("reverse"))))
+    back = data.get("reverse")
+    reverse = _reverse(back, data["loop"], bases) if back else None
+    tcp = _tcp(data["tcp"]) if data.get("tcp") else None
+    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), reverse=reverse, tcp=tcp))
 
 
-def _reverse(data: Mapping[str, Any] | None) -> Reverse | None:
-    return Reverse(float(data["kbps"]), **_path(data)) if data else None
+def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> RateAtTime:
+    return trace(find_file(data, "file", bases), loop, None)
+
+
+def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reverse:
+    """The way back: its rate is a file's, or constant."""
+    kbps, file = data.get("kbps"), data.get("file")
+    if (kbps is None) == (file is None):
+        raise ModelError("reverse", dict(data), "must give either kbps or file")
+    constant = exact(kbps or 0)
+    rates = _recorded(data, loop, bases) if file else lambda _: constant
+    return Reverse(lambda t: float(rates(t)), **_path(data))
+
+
+def _tcp(data: Mapping[str, Any]) -> TcpFlows:
+    sizes = data.get("bytes")
+    return TcpFlows(
+        data["flows"], (sizes[0], sizes[1]) if sizes else None, data.get("pause_s", 10), data.get("start_s", 0)
+    )
 
 
 def _path(data: Mapping[str, Any]) -> dict[str, float]:

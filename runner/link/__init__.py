@@ -1,8 +1,8 @@
 """A limited link between the vehicle's and the operator's process, whose rate follows a trace.
 
-Arrivals, losses and delays are then measured, not assumed. Two kinds: `netns` (root; the kernel limits real network
-devices) and `relay` (no root; a process between the two). Both limit all traffic from the vehicle to the operator in
-one queue; the other direction is unlimited.
+Arrivals, losses and delays are then measured, not assumed. Two kinds: `netns` (root; any packet of any protocol between
+two network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
+vehicle to the operator in one queue, and all traffic back in another, if that is limited.
 
 with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):
     ...  # [*link.vehicle_command, python, ..., *link.vehicle_overrides] and [python, ..., *link.operator_overrides]
@@ -39,12 +39,13 @@ class LimitedLink:
 
     on_sample  called with each sample, from a thread of the link
 
-    `vehicle_command`, `vehicle_overrides`, `operator_overrides` and `broker`: see `Ends`.
+    `vehicle_command`, `vehicle_overrides`, `operator_overrides`, `broker` and `notes`: see `Ends`.
     """
 
     def __init__(self, limit: Limit, ends: Ends, on_sample: OnLinkSample) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
+        self.notes = ends.notes
         self._limit, self._shaper, self._on_sample = limit, ends.shaper, on_sample
         self._stopped = threading.Event()
         self._failure: Exception | None = None
@@ -81,17 +82,17 @@ class LimitedLink:
             self._failure = error
 
     def _follow(self, zero: float) -> None:
-        in_force, line = self._limit.kbps(0), 0
+        in_force, line = self._limit.rates(0), 0
         ended = False
         while not ended:
             ended = self._stopped.wait(LOOK_S)
             t = time.monotonic() - zero
-            kbps, logs = self._limit.kbps(t), t >= line * LOG_S or (ended and t >= 0)
-            if kbps != in_force or logs:
-                in_force, counters = kbps, self._shaper.limit(kbps)
+            rates, logs = self._limit.rates(t), t >= line * LOG_S or (ended and t >= 0)
+            if rates != in_force or logs:
+                in_force, counters = rates, self._shaper.limit(rates)
             if logs:
                 line = int(t / LOG_S) + 1
-                self._on_sample(_sample(t, kbps, counters))
+                self._on_sample(_sample(t, rates.up, counters))
 
 
 def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
@@ -103,6 +104,7 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
         packets=counters.packets,
         dropped=counters.dropped,
         lost=counters.lost,
+        tcp_bytes=counters.tcp,
     )
 
 

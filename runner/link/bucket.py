@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Bucket(Generic[T]):
-    """Packets wait until the bucket holds as many tokens (bytes) as they are long.
+    """Packets wait until the bucket holds as many tokens (bytes) as they are long; at a rate of 0 they stay.
 
     Departures are computed, not observed: a late caller gets every packet with its departure time, and a late
     scheduler costs no rate. Times are seconds of any monotonic clock.
@@ -64,14 +64,17 @@ class Bucket(Generic[T]):
 
     def counters(self, now: float) -> LinkCounters:
         self._advance(now)
-        tokens = self._tokens + max(0.0, now - self._at) * self._rate
-        wait_ms = 1000 * max(0.0, self._backlog - tokens) / self._rate
+        waiting = max(0.0, self._backlog - self._tokens - max(0.0, now - self._at) * self._rate)
+        wait_ms = 1000 * waiting / self._rate if self._rate else self._queue_ms if waiting else 0.0
         return LinkCounters(wait_ms, self._passed, self._packets, self._dropped)
 
     def _next(self) -> float | None:
         if not self._items:
             return None
-        return self._at + max(0.0, self._items[0][0] - self._tokens) / self._rate
+        missing = max(0.0, self._items[0][0] - self._tokens)
+        if missing and not self._rate:
+            return None
+        return self._at + (missing / self._rate if missing else 0.0)
 
     def _advance(self, now: float) -> None:
         """Let packets depart that are due by now."""

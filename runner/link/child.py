@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from runner.errors import RunError
+from runner.link.limit import LinkCounters, Rates
 from runner.system import children, signals
 
 ANSWER_S = 5.0  # a child that has not answered by then never will
@@ -105,3 +106,25 @@ class Child:
             raise RunError(f"{self._name}: it has not answered for {ANSWER_S:g} s")
         if self._rest:
             yield self._rest.decode(errors="replace")
+
+
+class ChildShaper:
+    """A child that passes packets on, and reads rates by `runner.link.direction.take_rates`.
+
+    tcp  sends competing TCP flows, from the first rates on; None: there are none
+    """
+
+    def __init__(self, child: Child, tcp: Child | None = None) -> None:
+        self._child, self._tcp = child, tcp
+        self._sends = False
+
+    def limit(self, rates: Rates) -> LinkCounters:
+        if self._tcp and not self._sends:
+            self._sends = True
+            self._tcp.ask("start")
+        return LinkCounters(**self._child.ask(" ".join(str(kbps) for kbps in rates if kbps is not None)))
+
+    def check(self) -> None:
+        for child in (self._child, self._tcp):
+            if child:
+                child.check()

@@ -16,7 +16,8 @@ class Ends:
     vehicle_overrides   where the vehicle's RTSP server listens and where it finds the broker
     operator_overrides  where the operator finds both
     broker              where the broker has to listen
-    shaper              sets the rate and counts
+    shaper              sets the rates and counts
+    notes               for the user
     """
 
     vehicle_command: tuple[str, ...]
@@ -24,6 +25,7 @@ class Ends:
     operator_overrides: tuple[str, ...]
     broker: Endpoint
     shaper: Shaper
+    notes: tuple[str, ...] = ()
 
 
 def overrides(media: Endpoint, control: Endpoint) -> tuple[str, ...]:

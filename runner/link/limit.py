@@ -1,24 +1,27 @@
-"""What a limited link does to packets, defined once for both kinds of link. Pure.
-
-Sizes are bytes as each kind counts them: netns the Ethernet frame, the relay the IP packet (14 bytes less).
-"""
+"""What a limited link does to packets, defined once for both kinds of link. Pure. Sizes are bytes of IP packets."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, Protocol
 
-FRAME_BYTES = 1514  # the largest Ethernet frame of an MTU of 1500
+PACKET_BYTES = 1500  # the largest IP packet on Ethernet
 BURST_S = 0.002  # of data that an idle link passes at once; with less, late timers on a busy machine would cost rate
-SLOWEST_KBPS = 1.0  # tbf cannot stop completely; at this rate one packet passes in 10 s
+
+
+class Rates(NamedTuple):
+    """kbit/s in force from vehicle to operator and back; None: unlimited."""
+
+    up: float
+    down: float | None
 
 
 @dataclass(frozen=True)
 class Reverse:
-    """The direction from operator to vehicle: a constant rate, kbit/s, and otherwise as in `Limit`."""
+    """The direction from operator to vehicle, as in `Limit`."""
 
-    kbps: float
+    kbps_at: Callable[[float], float]
     queue_ms: float
     delay_ms: float
     loss: float = 0.0
@@ -26,15 +29,32 @@ class Reverse:
 
 
 @dataclass(frozen=True)
+class TcpFlows:
+    """TCP flows from vehicle to operator that compete with the cameras.
+
+    flows    how many at a time
+    size     bytes of a transfer, uniformly distributed between two bounds; None: one that does not end
+    pause_s  mean time between two transfers of a flow, exponentially distributed
+    start_s  when the first transfers begin, s after the start of the drive
+    """
+
+    flows: int
+    size: tuple[int, int] | None = None
+    pause_s: float = 10.0
+    start_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class Limit:
     """What the link does to all traffic from the vehicle to the operator.
 
-    kbps_at   rate in force t seconds after the start of the drive; below 1 kbit/s it is 1 kbit/s
+    kbps_at   rate in force t seconds after the start of the drive; 0: nothing passes
     queue_ms  packets that would wait longer are dropped
     delay_ms  one way, in addition to the wait
-    loss      share of UDP packets that are lost after the queue
+    loss      share of packets that are lost after the queue; of a relay, of UDP packets
     burst     mean number of packets that are lost in a row
     reverse   what it does to traffic from the operator to the vehicle; None: nothing
+    tcp       what else is sent from vehicle to operator; None: nothing
     """
 
     kbps_at: Callable[[float], float]
@@ -43,10 +63,22 @@ class Limit:
     loss: float = 0.0
     burst: float = 1.0
     reverse: Reverse | None = None
+    tcp: TcpFlows | None = None
 
-    def kbps(self, t: float) -> float:
-        """The rate to set, kbit/s; before the start, the rate at the start."""
-        return max(SLOWEST_KBPS, float(self.kbps_at(max(0.0, t))))
+    def rates(self, t: float) -> Rates:
+        """The rates to set; before the start, those at the start."""
+        at = max(0.0, t)
+        return Rates(float(self.kbps_at(at)), float(self.reverse.kbps_at(at)) if self.reverse else None)
+
+    def settings(self) -> dict[str, Any]:
+        """Both directions at the start, for a process that passes packets on (`runner.link.direction`)."""
+        rates = self.rates(0)
+        back = None if self.reverse is None else _direction(self.reverse, rates.down)
+        return {"up": _direction(self, rates.up), "down": back, "tcp": asdict(self.tcp) if self.tcp else None}
+
+
+def _direction(one: Limit | Reverse, kbps: float | None) -> dict[str, float | None]:
+    return {"kbps": kbps, "queue_ms": one.queue_ms, "delay_ms": one.delay_ms, "loss": one.loss, "burst": one.burst}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +90,7 @@ class LinkCounters:
     packets   of these
     dropped   packets that found the queue full
     lost      packets lost after the queue
+    tcp       bytes that competing TCP flows have delivered
     """
 
     queue_ms: float
@@ -65,21 +98,22 @@ class LinkCounters:
     packets: int
     dropped: int
     lost: int = 0
+    tcp: int = 0
 
 
 class Shaper(Protocol):
     """Sets rates and reads counters."""
 
-    def limit(self, kbps: float) -> LinkCounters:
-        """Set the rate; returns the counters. raises RunError if the link is gone"""
+    def limit(self, rates: Rates) -> LinkCounters:
+        """Set the rates; returns the counters. raises RunError if the link is gone"""
 
     def check(self) -> None:
         """raises RunError if the link is gone"""
 
 
 def burst_bytes(kbps: float) -> int:
-    """Size of the token bucket: two full frames, or 2 ms of the rate."""
-    return max(2 * FRAME_BYTES, round(kbps * 1000 / 8 * BURST_S))
+    """Size of the token bucket: two full packets, or 2 ms of the rate."""
+    return max(2 * PACKET_BYTES, round(kbps * 1000 / 8 * BURST_S))
 
 
 def queue_bytes(kbps: float, queue_ms: float) -> int:

@@ -8,7 +8,7 @@ count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (T
 packets are never split. The other direction has a `Bucket` of its own if `down` is given, otherwise it is unlimited.
 Losses and delay follow the queue; only UDP packets are lost.
 
-Each line of input is a rate in kbit/s, answered with the counters; at the end of its input the relay ends.
+Each line of input gives the rates in force, see `take_rates`; at the end of its input the relay ends.
 """
 
 from __future__ import annotations
@@ -16,20 +16,15 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import random
-import selectors
 import socket
 import sys
-import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import asdict
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from runner.link import rtsp
-from runner.link.bucket import Bucket
+from runner.link.direction import Delivery, Direction, Link, exact_loop, take_rates
 
 UDP_HEADERS = 28  # bytes of IPv4 and UDP
 TCP_HEADERS = 52  # bytes of IPv4 and TCP with time stamps
@@ -41,86 +36,7 @@ WAIT_S = 0.5  # for a server to accept
 
 SocketAddress = tuple[str, int]
 Cut = Callable[[bytes], Iterable[bytes]]
-Delivery = Callable[[], object]
 Serve = Callable[["Link", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
-UNLIMITED = {"kbps": 1e7, "queue_ms": 1000, "delay_ms": 0}
-
-
-class Lottery:
-    """Which packets are lost: the two states of Gilbert's model (Bell System Technical Journal, 1960).
-
-    loss   share of all packets
-    burst  mean number lost in a row; 1: each independently
-    """
-
-    def __init__(self, loss: float, burst: float, seed: int = 1) -> None:
-        self._ends = min(1 / burst, 1 - loss)  # by chance some follow each other, too
-        self._begins = 1.0 if loss >= 1 else loss * self._ends / (1 - loss)
-        self._chance = random.Random(seed)  # the same losses in every run
-        self._losing = False
-
-    def draw(self) -> bool:
-        """Whether the next packet is lost."""
-        if self._begins:
-            changes = self._ends if self._losing else self._begins
-            self._losing ^= self._chance.random() < changes
-        return self._losing
-
-
-class Direction:
-    """Everything from one side to the other: one queue with one rate, then losses and the delay."""
-
-    def __init__(self, kbps: float, queue_ms: float, delay_ms: float, loss: float = 0.0, burst: float = 1.0) -> None:
-        self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
-        self._delay_s = delay_ms / 1000
-        self._lottery, self._lost = Lottery(loss, burst), 0
-        self._delayed: deque[tuple[float, Delivery]] = deque()
-        self._timer: asyncio.TimerHandle | None = None
-        self._departed = asyncio.Event()
-
-    def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
-        """Queue a packet of that many bytes; without `keep` it may be dropped or lost. `delivery`: on arrival."""
-        if not keep and self._lottery.draw():
-            delivery = self._lose
-        self._bucket.put(size, delivery, time.monotonic(), keep=keep)
-        self._deliver()
-
-    def set_rate(self, kbps: float) -> dict[str, Any]:
-        """Change the rate. Returns the counters."""
-        now = time.monotonic()
-        self._bucket.set_rate(kbps, now)
-        self._deliver()
-        return asdict(self._bucket.counters(now)) | {"lost": self._lost}
-
-    def _lose(self) -> None:
-        self._lost += 1
-
-    async def room(self) -> None:
-        """Wait until the queue has room for a segment of TCP."""
-        while not self._bucket.has_room(SEGMENT + TCP_HEADERS):
-            self._departed.clear()
-            await self._departed.wait()
-
-    def _deliver(self) -> None:
-        """Deliver what has been queued and delayed long enough, and set a timer for the rest."""
-        now = time.monotonic()
-        for left, delivery in self._bucket.take(now):
-            self._delayed.append((left + self._delay_s, delivery))
-        while self._delayed and self._delayed[0][0] <= now:
-            self._delayed.popleft()[1]()
-        self._departed.set()
-        if self._timer:
-            self._timer.cancel()
-        times = [self._bucket.due(), self._delayed[0][0] if self._delayed else None]
-        known = [when for when in times if when is not None]
-        self._timer = asyncio.get_running_loop().call_at(min(known), self._deliver) if known else None
-
-
-class Link(NamedTuple):
-    """Both directions: from vehicle to operator, and back."""
-
-    up: Direction
-    down: Direction
 
 
 async def join(link: Link, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
@@ -154,7 +70,7 @@ async def _pass(direction: Direction, source: socket.socket, arrived: asyncio.Qu
     with suppress(OSError, ValueError):
         while True:
             await arrived.join()  # a receiver that does not read is not sent more
-            await direction.room()
+            await direction.room(SEGMENT + TCP_HEADERS)
             if not (data := await loop.sock_recv(source, SEGMENT)):
                 break
             for unit in cut(data):
@@ -341,18 +257,10 @@ async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> No
         await serving
 
 
-async def take_rates(link: Link) -> None:
-    """Set rates from standard input, each answered with the counters, until the input ends."""
-    lines = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
-    while line := await lines.readline():
-        print(json.dumps(link.up.set_rate(float(line))), flush=True)
-
-
 async def main() -> None:
     settings = json.loads(sys.argv[1])
     media, control = ((socket.gethostbyname(host), port) for host, port in (settings["media"], settings["control"]))
-    link = Link(Direction(**settings["up"]), Direction(**(settings["down"] or UNLIMITED)))
+    link = Link.of(settings)
     listening = {"media": listen(media[0]), "control": listen(control[0])}
     print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)
     gc.freeze()
@@ -368,6 +276,5 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    # epoll's waits are exact to 1 ms, select's to 0.1 ms
-    with asyncio.Runner(loop_factory=partial(asyncio.SelectorEventLoop, selectors.SelectSelector())) as runner:
+    with asyncio.Runner(loop_factory=exact_loop) as runner:
         runner.run(main())

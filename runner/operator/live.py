@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,9 +27,11 @@ from runner.errors import RunError
 from runner.operator.log import DriveLog
 from runner.operator.station import Station
 from runner.plans import compile_plans
+from runner.records import Outcome
 
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
+    from runner.configuration.experiment import TimedRequest
 
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
@@ -39,17 +43,25 @@ class LiveOperator:
 
     vehicle  as this side's configuration describes it
     station  this end of the control link; its listeners must be added before `start`
+
+    requests  sent at their times since the vehicle came online, in the order of their times
     """
 
     def __init__(
-        self, vehicle: Vehicle, station: Station, log: Log, build: Callable[[OnUnit | None], OperatorSide]
+        self,
+        vehicle: Vehicle,
+        station: Station,
+        log: Log,
+        build: Callable[[OnUnit | None], OperatorSide],
+        requests: Sequence[TimedRequest] = (),
     ) -> None:
         self.vehicle, self.station = vehicle, station
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
         self._stopped = threading.Event()
-        self._duration_s: float | None = None
-        self._latest_start = self._until = inf
+        self._duration_s, self._latest_start = inf, inf
+        self._online_at: float | None = None  # time.monotonic
+        self._requests = deque(requests)
         self._failure: RunError | None = None
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
@@ -63,7 +75,8 @@ class LiveOperator:
         self.station.connect()
         self._side = self._build(on_unit)
         self._log.begin()
-        self._duration_s, self._latest_start = duration_s, time.monotonic() + START_S
+        self._duration_s = inf if duration_s is None else duration_s
+        self._latest_start = time.monotonic() + START_S
         self._thread.start()
         self._reporting.start()
 
@@ -97,7 +110,7 @@ class LiveOperator:
         side = self._side
         assert side
         try:
-            self._repeat("sample", SAMPLE_S, lambda: self.station.take(side.sample(self.station.sending())))
+            self._repeat("sample", SAMPLE_S, lambda: self._sample(side))
         except RunError as error:  # GStreamer hangs; kept for the main thread
             self._failure = error
 
@@ -117,7 +130,7 @@ class LiveOperator:
         raises  RunError
         """
         noted = ""
-        while not self._stopped.wait(every_s) and not self._over():
+        while not self._stopped.wait(every_s) and self._driven_s() < self._duration_s:
             try:
                 work()
             except RunError:
@@ -126,12 +139,24 @@ class LiveOperator:
                 if noted != (noted := f"a {what} failed: {type(error).__name__}: {error}"):
                     self.station.note(noted)
 
-    def _over(self) -> bool:
-        """Whether the given time has passed. A slow start of the vehicle takes nothing from it."""
-        now, state = time.monotonic(), self.station.state
-        if self._duration_s is not None and self._until == inf and (state or now >= self._latest_start):
-            self._until = now + self._duration_s
-        return now >= self._until
+    def _sample(self, side: OperatorSide) -> None:
+        self.station.take(side.sample(self.station.sending()))
+        while self._requests and self._driven_s() >= self._requests[0].at_s:
+            request = self._requests.popleft()
+            self.station.ask(request.event, partial(self._note_reply, request))
+
+    def _note_reply(self, request: TimedRequest, reply: Outcome) -> None:
+        if reply.result != "applied":
+            self.station.note(f"the request at {request.at_s:g} s was not applied: {reply.result}, {reply.reason}")
+
+    def _driven_s(self) -> float:
+        """Time since the vehicle came online, however slowly it started; below 0 before."""
+        now = time.monotonic()
+        if self._online_at is None:
+            if not self.station.state and now < self._latest_start:
+                return -1.0
+            self._online_at = now
+        return now - self._online_at
 
 
 @contextmanager
@@ -162,7 +187,7 @@ def live_operator(
             plans, station.report, on_unit, arrivals=logged, video=video, operator=station.identity
         )
 
-    operator = LiveOperator(vehicle, station, drive, build)
+    operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)
     try:
         yield operator
     finally:

@@ -153,8 +153,10 @@ class WrongPqos:
         return replace(due, t=event.t, kbps=due.kbps * self._share, lower_kbps=lower)
 
 
-def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
+def trace(path: Path, loop: bool, off_trace: Kbps | None) -> Callable[[float], Kbps]:
     """Rate in force at a time: that of the last row not after it; `off_trace` before the first row and after the end.
+
+    None there: the first and the last rate hold.
 
     path  CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop restarts
     """
@@ -166,7 +168,7 @@ def trace(path: Path, loop: bool, off_trace: Kbps) -> Callable[[float], Kbps]:
 
     def kbps_at(t: float) -> Kbps:
         if t < begin or (t >= end and not loop):
-            return off_trace
+            return off_trace if off_trace is not None else rates[0 if t < begin else -1]
         return rates[bisect_right(times, t if t < end else begin + (t - begin) % (end - begin)) - 1]
 
     return kbps_at

@@ -74,7 +74,7 @@ class _Run(NamedTuple):
 def run(arguments: Arguments) -> int:
     apply = streaming()
     arguments, config = _with_rate(arguments)
-    experiment, link = config.experiment()
+    experiment, link = config.experiment(), config.link()
     duration_s = arguments.number("duration_s")
     duration_s = experiment.duration_s if duration_s is None else duration_s
     output, models = arguments.path("output"), arguments.path("models")
@@ -128,7 +128,7 @@ def _prepared(
     directory = _directory(arguments, name)
     if words:
         config = configuration(own.overrides, own.conf, runnable=False)
-        _, link = config.experiment()
+        link = config.link()
     if link and directory is None:
         raise UserError("command line", "link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     config = config.drivable(apply.check_plan)
@@ -180,6 +180,8 @@ def _drive(run: _Run, duration_s: float) -> None:
         private_broker(link.broker if link else run.vehicle.control) as broker,
         _sides(own, link, duration_s) as (vehicle, operator),
     ):
+        for note in link.notes if link else ():
+            say(note)
         waiting = link is not None
         while True:
             signals.check()

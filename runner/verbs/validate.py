@@ -52,7 +52,7 @@ ConfigReader = Callable[[Configuration], object]
 READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
     "study": Configuration.study,
-    "link": Configuration.experiment,
+    "link": Configuration.link,
 }
 ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
@@ -87,7 +87,7 @@ class ValidationTask(NamedTuple):
     def readers(self) -> Sequence[ConfigReader]:
         """The readers to apply to the configuration."""
         if not self.choices or "experiment" in dict(self.choices):
-            return Configuration.pqos, Configuration.experiment
+            return Configuration.pqos, Configuration.experiment, Configuration.link
         return [READERS.get(group, Configuration.vehicle) for group, _ in self.choices]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
+from runner.link.limit import Rates, Reverse
 from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
@@ -162,8 +164,9 @@ def test_rtsp_over_tcp_waits_where_udp_is_dropped():
     assert frames > MEASURE_S
 
 
-def test_a_delay_is_added_to_the_wait():
-    with driving("relay", lambda t: 5000, sent_kbps=1000, delay_ms=300) as drive:
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_delay_is_added_to_the_wait(kind):
+    with driving(kind, lambda t: 5000, sent_kbps=1000, delay_ms=300) as drive:
         drive.settle()
         assert until(lambda: drive.received().latency_ms) >= 300
         assert drive.lines[-1].dropped == 0
@@ -222,7 +225,7 @@ def test_queued_packets_do_not_block_their_sender():
     with limited_link("netns", slow, *_ends(), print) as link:
         command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-        waits = link._shaper.limit(1000)
+        waits = link._shaper.limit(Rates(1000, None))
     assert done.stdout.strip() == str(300 * 1200)
     assert waits.dropped == 0
     assert waits.queue_ms > 1000
@@ -234,7 +237,6 @@ def test_nothing_of_a_namespace_stays_behind():
     with limited_link("netns", WIDE, *_ends(), print) as one, limited_link("netns", WIDE, *_ends(), print) as two:
         names = [link.vehicle_command[-1] for link in (one, two)]
         assert len({*names, one.broker.host, two.broker.host}) == 4  # they do not collide
-        names += [f"{name}-router" for name in names]
         assert set(names) <= _names()
         stays = subprocess.Popen([*two.vehicle_command, "sleep", "1000"])
         until(lambda: str(stays.pid) in subprocess.check_output(["ip", "netns", "pids", names[1]], text=True).split())
@@ -285,8 +287,7 @@ def test_a_link_that_fails_is_reported(kind):
         link.start(time.time())
         until(lambda: lines)
         link.check()
-        shaper = link._shaper
-        child = shaper._tc if kind == "netns" else shaper._child
+        child = link._shaper._child
         child._process.kill()
         until(lambda: link._failure)
     assert child._process.poll() is not None
@@ -322,16 +323,45 @@ def test_without_iproute2_the_error_names_what_to_install(monkeypatch):
     assert str(raised.value) == f"link=netns needs ip; {rule}"
 
 
+ECHO = """
+import socket, sys, time
+out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+out.settimeout(1)
+back = []
+for number in range(200):
+    out.sendto(bytes([number]), (sys.argv[1], int(sys.argv[2])))
+    time.sleep(0.002)
+began = time.monotonic()
+try:
+    while True:
+        back.append(out.recv(10)[0])
+except TimeoutError:
+    print(len(back))
+out.sendto(b"!" * 1000, (sys.argv[1], int(sys.argv[2])))
+"""
+
+
 @needs_root
-def test_a_delay_needs_netem():
-    before = _names()
-    try:
-        with limited_link("netns", replace(WIDE, delay_ms=20), *_ends(), print):
-            pytest.skip("this kernel has netem")
-    except RunError as error:
-        rule = "which the kernel of this machine has not (module sch_netem): set it to 0, or choose link=relay"
-        assert str(error) == f"link=netns with delay_ms=20 needs netem, {rule}"
-    assert _names() <= before
+def test_both_ways_of_a_namespace_lose_and_delay_any_packet():
+    """As the relay does with UDP. Half of the packets pass one way, and half of those come back."""
+    lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=Reverse(lambda t: 5000, 200, 150, loss=0.5))
+    with limited_link("netns", lossy, *_ends(), print) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:
+        echo.bind((link.broker.host, 0))
+        echo.settimeout(10)
+        words = (sys.executable, "-c", ECHO, link.broker.host, str(echo.getsockname()[1]))
+        with subprocess.Popen([*link.vehicle_command, *words], stdout=subprocess.PIPE, text=True) as vehicle:
+            passed = 0
+            while vehicle.poll() is None:
+                data, address = echo.recvfrom(2000)
+                if len(data) > 1:
+                    break
+                passed += 1
+                echo.sendto(data, address)
+            returned = int(vehicle.communicate(timeout=10)[0])
+        counters = link._shaper.limit(Rates(5000, 5000))
+    assert 60 < passed < 140
+    assert 0.3 * passed < returned < 0.7 * passed
+    assert counters.lost == 200 - passed
 
 
 def test_a_relay_stays_on_this_machine():

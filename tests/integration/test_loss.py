@@ -92,7 +92,8 @@ def test_lost_packets_are_sent_again(monkeypatch):
     assert lost < len(dropped) / 2
 
 
-@pytest.mark.parametrize("by_time", [True, False])
+@pytest.mark.alone
+@pytest.mark.parametrize("by_time", [True, pytest.param(False, marks=pytest.mark.soak)])
 def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeypatch, by_time):
     from runner.apply import OperatorSide
     from runner.gst import Gst, repair

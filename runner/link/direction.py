@@ -1,0 +1,122 @@
+"""What a process that passes packets on does to them: a limited queue, losses and a delay in each direction."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import selectors
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+from runner.link.bucket import Bucket
+
+Delivery = Callable[[], object]
+UNLIMITED = {"kbps": 1e7, "queue_ms": 1000, "delay_ms": 0}
+
+
+class Lottery:
+    """Which packets are lost: the two states of Gilbert's model (Bell System Technical Journal, 1960).
+
+    loss   share of all packets
+    burst  mean number lost in a row; 1: each independently
+    """
+
+    def __init__(self, loss: float, burst: float, seed: int = 1) -> None:
+        self._ends = min(1 / burst, 1 - loss)  # by chance some follow each other, too
+        self._begins = 1.0 if loss >= 1 else loss * self._ends / (1 - loss)
+        self._chance = random.Random(seed)  # the same losses in every run
+        self._losing = False
+
+    def draw(self) -> bool:
+        """Whether the next packet is lost."""
+        if self._begins:
+            changes = self._ends if self._losing else self._begins
+            self._losing ^= self._chance.random() < changes
+        return self._losing
+
+
+class Direction:
+    """Everything from one side to the other: one queue with one rate, then losses and the delay."""
+
+    def __init__(self, kbps: float, queue_ms: float, delay_ms: float, loss: float = 0.0, burst: float = 1.0) -> None:
+        self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
+        self._delay_s = delay_ms / 1000
+        self._lottery, self._lost = Lottery(loss, burst), 0
+        self._delayed: deque[tuple[float, Delivery]] = deque()
+        self._timer: asyncio.TimerHandle | None = None
+        self._departed = asyncio.Event()
+
+    def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
+        """Queue a packet of that many bytes; without `keep` it may be dropped or lost. `delivery`: on arrival."""
+        if not keep and self._lottery.draw():
+            delivery = self._lose
+        self._bucket.put(size, delivery, time.monotonic(), keep=keep)
+        self._deliver()
+
+    def set_rate(self, kbps: float) -> dict[str, Any]:
+        """Change the rate. Returns `runner.link.limit.LinkCounters` as a dictionary."""
+        now = time.monotonic()
+        self._bucket.set_rate(kbps, now)
+        self._deliver()
+        return asdict(self._bucket.counters(now)) | {"lost": self._lost}
+
+    def _lose(self) -> None:
+        self._lost += 1
+
+    async def room(self, size: int) -> None:
+        """Wait until the queue has room for so many bytes."""
+        while not self._bucket.has_room(size):
+            self._departed.clear()
+            await self._departed.wait()
+
+    def _deliver(self) -> None:
+        """Deliver what has been queued and delayed long enough, and set a timer for the rest."""
+        now = time.monotonic()
+        for left, delivery in self._bucket.take(now):
+            self._delayed.append((left + self._delay_s, delivery))
+        while self._delayed and self._delayed[0][0] <= now:
+            self._delayed.popleft()[1]()
+        self._departed.set()
+        if self._timer:
+            self._timer.cancel()
+        times = [self._bucket.due(), self._delayed[0][0] if self._delayed else None]
+        known = [when for when in times if when is not None]
+        self._timer = asyncio.get_running_loop().call_at(min(known), self._deliver) if known else None
+
+
+class Link(NamedTuple):
+    """Both directions: from vehicle to operator, and back."""
+
+    up: Direction
+    down: Direction
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Link:
+        """The link that `runner.link.limit.Limit.settings` describes."""
+        return cls(Direction(**settings["up"]), Direction(**(settings["down"] or UNLIMITED)))
+
+
+async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -> None:
+    """Set rates from standard input until it ends: in each line those of both directions, kbit/s, or of the first one.
+
+    Each line is answered with the counters of the first direction.
+
+    more  further counters
+    """
+    lines = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    while line := await lines.readline():
+        up, *down = map(float, line.split())
+        for kbps in down:
+            link.down.set_rate(kbps)
+        print(json.dumps({**link.up.set_rate(up), **more()}), flush=True)
+
+
+def exact_loop() -> asyncio.AbstractEventLoop:
+    """An event loop whose waits are exact to 0.1 ms (select), not to 1 ms (epoll)."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())

@@ -1,0 +1,93 @@
+"""usage: python -m runner.link.tunnel '{"devices": [HERE, FAR], "host": HOST, "up": {...}, "down": null}'
+
+The process between two TUN devices, which it creates: IP packets that leave one are limited, delayed and lost by
+`runner.link.direction`, and then enter the other. `up` is the way from the second device to the first.
+
+Its first line of output says that both exist, and names the port of a TCP server on `host`, which takes what anybody
+sends. Each line of input gives the rates in force, see `take_rates`; at the end of its input it ends, and the devices
+with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import gc
+import json
+import os
+import socket
+import struct
+import sys
+from contextlib import suppress
+from functools import partial
+
+from runner.link.direction import Direction, Link, exact_loop, take_rates
+
+TUN = "/dev/net/tun"
+IFF_TUN, IFF_NO_PI, TUNSETIFF = 0x0001, 0x1000, 0x400454CA  # linux/if_tun.h
+IP_FREEBIND = 15  # linux/in.h
+PACKETS_PER_TURN = 64  # that are read before the other device gets its turn
+
+
+def create(name: str) -> int:
+    """Create a TUN device that lives as long as its file descriptor; ends the process if that fails."""
+    try:
+        device = os.open(TUN, os.O_RDWR | os.O_NONBLOCK)
+        fcntl.ioctl(device, TUNSETIFF, struct.pack("16sH22x", name.encode(), IFF_TUN | IFF_NO_PI))  # struct ifreq
+    except OSError as error:
+        sys.exit(
+            f"cannot create a network device by {TUN}: {error.strerror}; load the module tun, or choose link=relay"
+        )
+    return device
+
+
+def read(source: int, direction: Direction, sink: int) -> None:
+    """Take what waits at one device; the link is gone if that fails."""
+    for _ in range(PACKETS_PER_TURN):
+        try:
+            packet = os.read(source, 65_536)
+        except BlockingIOError:
+            return
+        direction.put(len(packet), partial(write, sink, packet))
+
+
+def write(sink: int, packet: bytes) -> None:
+    with suppress(OSError):  # a device that is down: a packet lost after the link
+        os.write(sink, packet)
+
+
+class Sink(asyncio.Protocol):
+    """Takes what is sent, and counts it for all connections."""
+
+    taken = 0
+
+    def data_received(self, data: bytes) -> None:
+        Sink.taken += len(data)
+
+
+async def serve(host: str) -> int:
+    """A server at an address that a device will have later. Returns its port."""
+    sock = socket.socket()
+    sock.setsockopt(socket.SOL_IP, IP_FREEBIND, 1)
+    sock.bind((host, 0))
+    await asyncio.get_running_loop().create_server(Sink, sock=sock)
+    port: int = sock.getsockname()[1]
+    return port
+
+
+async def main() -> None:
+    settings = json.loads(sys.argv[1])
+    here, far = map(create, settings["devices"])
+    link = Link.of(settings)
+    print(json.dumps({"port": await serve(settings["host"])}), flush=True)
+    gc.freeze()
+    gc.disable()  # no reference cycle here lasts long; a collection would delay packets
+    loop = asyncio.get_running_loop()
+    for source, direction, sink in ((far, link.up, here), (here, link.down, far)):
+        loop.add_reader(source, read, source, direction, sink)
+    await take_rates(link, lambda: {"tcp": Sink.taken})
+
+
+if __name__ == "__main__":
+    with asyncio.Runner(loop_factory=exact_loop) as runner:
+        runner.run(main())
