@@ -34,6 +34,24 @@ class Link:
     loss: float = 0.0
 
 
+class Tcp:
+    """The window of a TCP flow that never ends: one packet more per round trip, 0.7 of it after a loss (RFC 9438)."""
+
+    PACKET = 1500
+
+    def __init__(self) -> None:
+        self.window, self.flying, self.reduced = 10.0, 0, 0.0
+
+    def on_ack(self) -> None:
+        self.flying -= 1
+        self.window += 1 / self.window
+
+    def on_loss(self, t: float, rtt_s: float) -> None:
+        self.flying -= 1
+        if t - self.reduced > rtt_s:
+            self.window, self.reduced = max(2.0, 0.7 * self.window), t
+
+
 @dataclass(repr=False)
 class Drive:
     """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived."""
@@ -41,6 +59,7 @@ class Drive:
     caps: list[tuple[float, float, str]] = field(default_factory=list)
     waits: list[tuple[float, float]] = field(default_factory=list)
     arrived: list[tuple[float, int]] = field(default_factory=list)
+    tcp: list[tuple[float, int]] = field(default_factory=list)
 
     def wait_ms(self, share: float, since: float = 0.0) -> float:
         waits = sorted(wait for t, wait in self.waits if t >= since)
@@ -67,10 +86,12 @@ def drive(
     report_s: float = 0.04,
     noise: float = 0.15,
     seed: int = 1,
+    tcp_s: tuple[float, float] | None = None,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
     noise  share by which sizes of access units vary
+    tcp_s  begin and end of a TCP flow over the same link
     """
     chance, order = random.Random(seed), itertools.count()
     uplink, cap, done = UplinkMemory(), LinkCap(), Drive()
@@ -82,6 +103,9 @@ def drive(
     for camera in range(cameras):
         at(0.001 * camera, "frame", camera)
     at(report_s, "report", None)
+    tcp = Tcp()
+    if tcp_s:
+        at(tcp_s[0], "tcp", None)
     free = last_unit = last_report = 0.0
     on_the_way: list[ReceivedUnit] = []
     packets = lost = 0
@@ -103,6 +127,19 @@ def drive(
             done.arrived.append((last_unit, size))
             on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size, count))
             packets += count
+        elif kind in ("tcp", "ack", "loss"):
+            if kind == "ack":
+                tcp.on_ack()
+                done.tcp.append((t, tcp.PACKET))
+            elif kind == "loss":
+                tcp.on_loss(t, free - t + 2 * link.one_way_s)
+            while tcp_s and t < tcp_s[1] and tcp.flying < tcp.window:
+                tcp.flying += 1
+                if free - t > link.queue_s:
+                    at(free + 2 * link.one_way_s, "loss", None)
+                else:
+                    free = _sent(link, max(t, free), tcp.PACKET)
+                    at(free + 2 * link.one_way_s, "ack", None)
         elif kind == "report":
             at(t + report_s, "report", None)
             units = tuple(unit for unit in on_the_way if unit.arrived <= t)

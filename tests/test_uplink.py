@@ -85,6 +85,17 @@ def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
     assert done.wait_ms(0.95) <= 100
 
 
+@pytest.mark.parametrize("fps", [15, 40])
+def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
+    """Case 5.6 of RFC 8867, rates times two: a quarter of the fair share at least. TCP itself fills the queue."""
+    link, limit = Link(steps((0, 4000)), one_way_s=0.05), steps((0, 4000))
+    done = drive(link, limit, 80, fps=fps, tcp_s=(5, 60))
+    assert done.kbps(15, 60) >= 500
+    assert sum(size for t, size in done.tcp if 15 <= t < 60) * 8 / 1000 / 45 >= 500
+    assert done.kbps(70, 80) >= 3000
+    assert done.wait_ms(0.95, since=65) <= 100
+
+
 MEASURED = st.tuples(
     st.sampled_from(LinkState),
     st.none() | st.integers(0, 20_000),

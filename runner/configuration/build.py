@@ -248,11 +248,15 @@ class Builder:
 
     def check_link(self, kind: str) -> None:
         """Check that all cameras can use a limited link of a kind."""
-        cameras = self.vehicle.cameras.values() if self.vehicle else ()
+        cameras = tuple(self.vehicle.cameras.values()) if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
-        if dialling:
-            rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport"
-            self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
+        if dialling and kind == "relay":
+            rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport; choose link=netns"
+        elif dialling and len(dialling) < len(cameras):
+            rule = f"joins cameras that all use RTSP, or none: the graph of {dialling[0]} uses its own transport"
+        else:
+            return
+        self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
 
     def _check_inputs(self, camera: Camera) -> None:
         """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""

@@ -110,7 +110,7 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
 
 @contextmanager
 def limited_link(
-    kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample
+    kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample, *, dials: bool = False
 ) -> Iterator[LimitedLink]:
     """The link, for the duration of the block; everything that belongs to it is removed at the end.
 
@@ -119,11 +119,12 @@ def limited_link(
     media, control  RTSP server and broker as configured
     on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
                     since the link was made
+    dials           whether the vehicle dials the operator for media, as with SRT; kind netns
     raises          RunError if it cannot be set up, with the remedy; at the end, if it has failed meanwhile
     """
     if kind not in KINDS:
         raise RunError(f"link={kind}: unknown kind{suggest(kind, KINDS)}")
-    with KINDS[kind](limit, media, control) as ends:
+    with KINDS[kind](limit, media, control, dials) as ends:
         link = LimitedLink(limit, ends, on_sample)
         try:
             yield link

@@ -41,10 +41,11 @@ OTHERWISE = "or choose link=relay"
 
 
 @contextmanager
-def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
+def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = False) -> Iterator[Ends]:
     """The link, for the duration of the block; processes still running in its namespace at the end are killed.
 
     media, control  their ports are used, on addresses of the link
+    dials           whether the vehicle dials the operator for media, as with SRT
     raises          RunError with the remedy
     """
     ip = _find("ip")
@@ -59,7 +60,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[End
                 port = tunnel.answer()["port"]
                 _connect(ip, devices, (machine, vehicle))
                 broker = Endpoint(machine, control.port)
-                both = overrides(Endpoint(vehicle, media.port), broker)
+                both = overrides(Endpoint(machine if dials else vehicle, media.port), broker)
                 with _competing(limit.tcp, (machine, port), inside) as (tcp, notes):
                     yield Ends(inside, both, both, broker, ChildShaper(tunnel, tcp), notes)
         finally:

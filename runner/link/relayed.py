@@ -16,14 +16,15 @@ from runner.system import children
 
 
 @contextmanager
-def relayed(limit: Limit, media: Endpoint, control: Endpoint) -> Iterator[Ends]:
+def relayed(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = False) -> Iterator[Ends]:
     """The relay, for the duration of the block: the operator's RTSP and the vehicle's MQTT pass through it.
 
     media, control  where RTSP server and broker listen, on this machine
     raises          RunError
     """
-    if limit.tcp:
-        raise RunError("link=relay: tcp is not supported, choose link=netns")
+    for what, given in (("tcp", limit.tcp), ("media that the vehicle dials", dials)):
+        if given:
+            raise RunError(f"link=relay: {what} is not supported, choose link=netns")
     settings = {"media": [media.host, media.port], "control": [control.host, control.port], **limit.settings()}
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
     relay = Child("relay", command, children.environment())

@@ -242,7 +242,8 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
     log = Log(run.directory, "link", run.document, {}, say)
     try:
         media, control = run.vehicle.media, run.vehicle.control
-        with limited_link(settings.kind, settings.limit, media, control, log.record) as link:
+        dials = any(camera.graph.transport != "rtsp" for camera in run.vehicle.cameras.values())
+        with limited_link(settings.kind, settings.limit, media, control, log.record, dials=dials) as link:
             yield link, log
     finally:
         log.close()
