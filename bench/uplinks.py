@@ -176,11 +176,11 @@ def table(found: dict[str, dict[str, list[Figures]]]) -> Iterator[str]:
     yield "| --- " * (len(FIGURES) + 2) + "|"
     for uplink, conditions in found.items():
         for name, drives in conditions.items():
-            cells = (_shown(key, [drive[key] for drive in drives]) for key in FIGURES)
+            cells = (shown(key, [drive[key] for drive in drives]) for key in FIGURES)
             yield f"| {uplink} | {name} | " + " | ".join(cells) + " |"
 
 
-def _shown(key: str, values: Sequence[float]) -> str:
+def shown(key: str, values: Sequence[float]) -> str:
     digits = 3 if key in ("mssim", "worst") else 0 if key in ("p50_ms", "p99_ms", "used", "lost") else 1
     known = [value for value in values if np.isfinite(value)]
     if not known:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured
 from runner.core.link_cap import LinkCap, advanced, believed
-from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
+from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
 SLOT_S = 0.01  # capacity is constant for this long
@@ -34,22 +34,46 @@ class Link:
     loss: float = 0.0
 
 
+class Queue:
+    """The queue in front of a link: when the last bit of what it has taken leaves."""
+
+    def __init__(self, link: Link) -> None:
+        self._link, self.free = link, 0.0
+
+    def put(self, t: float, size: int) -> float | None:
+        """When that many bytes have left; None: dropped."""
+        if self.free - t > self._link.queue_s:
+            return None
+        self.free = _sent(self._link, max(t, self.free), size)
+        return self.free
+
+
 class Tcp:
-    """The window of a TCP flow that never ends: one packet more per round trip, 0.7 of it after a loss (RFC 9438)."""
+    """A TCP flow: one packet more per round trip, 0.7 of the window after a loss (RFC 9438)."""
 
     PACKET = 1500
 
-    def __init__(self) -> None:
-        self.window, self.flying, self.reduced = 10.0, 0, 0.0
+    def __init__(self, until: float, rtt_s: float) -> None:
+        self._until, self._rtt_s = until, rtt_s
+        self._window, self._flying, self._reduced = 10.0, 0, 0.0
+        self.delivered: list[tuple[float, int]] = []
 
-    def on_ack(self) -> None:
-        self.flying -= 1
-        self.window += 1 / self.window
+    def react(self, t: float, what: str) -> None:
+        if what == "ack":
+            self._flying -= 1
+            self._window += 1 / self._window
+            self.delivered.append((t, self.PACKET))
+        elif what == "loss":
+            self._flying -= 1
+            if t - self._reduced > self._rtt_s:
+                self._window, self._reduced = max(2.0, 0.7 * self._window), t
 
-    def on_loss(self, t: float, rtt_s: float) -> None:
-        self.flying -= 1
-        if t - self.reduced > rtt_s:
-            self.window, self.reduced = max(2.0, 0.7 * self.window), t
+    def send(self, t: float, queue: Queue) -> Iterator[tuple[float, str]]:
+        """As much as the window allows: when the sender learns what became of each packet."""
+        while t < self._until and self._flying < self._window:
+            self._flying += 1
+            left = queue.put(t, self.PACKET)
+            yield (left or queue.free) + self._rtt_s, "ack" if left else "loss"
 
 
 @dataclass(repr=False)
@@ -59,7 +83,7 @@ class Drive:
     caps: list[tuple[float, float, str]] = field(default_factory=list)
     waits: list[tuple[float, float]] = field(default_factory=list)
     arrived: list[tuple[float, int]] = field(default_factory=list)
-    tcp: list[tuple[float, int]] = field(default_factory=list)
+    tcp: Sequence[tuple[float, int]] = ()
 
     def wait_ms(self, share: float, since: float = 0.0) -> float:
         waits = sorted(wait for t, wait in self.waits if t >= since)
@@ -103,10 +127,11 @@ def drive(
     for camera in range(cameras):
         at(0.001 * camera, "frame", camera)
     at(report_s, "report", None)
-    tcp = Tcp()
-    if tcp_s:
-        at(tcp_s[0], "tcp", None)
-    free = last_unit = last_report = 0.0
+    begin, end = tcp_s or (seconds, seconds)
+    waiting, tcp = Queue(link), Tcp(end, 2 * link.one_way_s)
+    done.tcp = tcp.delivered
+    at(begin, "tcp", "begins")
+    last_unit = last_report = 0.0
     on_the_way: list[ReceivedUnit] = []
     packets = lost = 0
     in_force = limit(0.0)
@@ -117,29 +142,20 @@ def drive(
             size = int(in_force * 1000 / 8 / fps / cameras * chance.uniform(1 - noise, 1 + noise))
             count = -(-size // 1200)
             gone = sum(chance.random() < link.loss for _ in range(count)) if link.loss else 0
-            if free - t > link.queue_s or gone:
+            left = None if gone else waiting.put(t, size)
+            if left is None:
                 lost += gone or count
                 packets += count - gone if gone else 0
                 continue
-            free = _sent(link, max(t, free), size)
-            last_unit = max(last_unit, free + link.one_way_s + link.delay_s(t))
-            done.waits.append((t, free - t))
+            last_unit = max(last_unit, left + link.one_way_s + link.delay_s(t))
+            done.waits.append((t, left - t))
             done.arrived.append((last_unit, size))
             on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size, count))
             packets += count
-        elif kind in ("tcp", "ack", "loss"):
-            if kind == "ack":
-                tcp.on_ack()
-                done.tcp.append((t, tcp.PACKET))
-            elif kind == "loss":
-                tcp.on_loss(t, free - t + 2 * link.one_way_s)
-            while tcp_s and t < tcp_s[1] and tcp.flying < tcp.window:
-                tcp.flying += 1
-                if free - t > link.queue_s:
-                    at(free + 2 * link.one_way_s, "loss", None)
-                else:
-                    free = _sent(link, max(t, free), tcp.PACKET)
-                    at(free + 2 * link.one_way_s, "ack", None)
+        elif kind == "tcp":
+            tcp.react(t, what)
+            for when, outcome in tcp.send(t, waiting):
+                at(when, "tcp", outcome)
         elif kind == "report":
             at(t + report_s, "report", None)
             units = tuple(unit for unit in on_the_way if unit.arrived <= t)
@@ -150,21 +166,22 @@ def drive(
         else:
             uplink, estimated = estimate(uplink, what)
             if estimated:
-                rtt_ms = 2000 * link.one_way_s
-                kbps = None if estimated.kbps is None else Fraction(round(estimated.kbps, 1)).limit_denominator(10)
-                measured = LinkMeasured(
-                    t=t,
-                    kbps=kbps,
-                    queue_ms=round(estimated.queue_ms, 1),
-                    loss=round(estimated.loss, 4),
-                    state=estimated.state,
-                    rtt_ms=rtt_ms,
-                )
-                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2))
+                cap = advanced(cap, _measured(t, estimated, link), t, Fraction(limit(t)), Fraction(1, 2))
             trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
+
+
+def _measured(t: float, estimated: LinkEstimate, link: Link) -> LinkMeasured:
+    return LinkMeasured(
+        t=t,
+        kbps=None if estimated.kbps is None else Fraction(round(estimated.kbps, 1)).limit_denominator(10),
+        queue_ms=round(estimated.queue_ms, 1),
+        loss=round(estimated.loss, 4),
+        state=estimated.state,
+        rtt_ms=2000 * link.one_way_s,
+    )
 
 
 def _sent(link: Link, t: float, size: int) -> float:

@@ -38,7 +38,10 @@ LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the r
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
 VAIN = (Fraction(17, 20), Fraction(23, 20))  # times the last cut: where all that is sent arrives, the cut has effect
 UNDRAINED = 0.8  # of the wait at the last cut: where it is still as long, the queue is not the cameras' own
-CONTENDED, CONTENDED_S = 2, 10.0  # others fill the link after so many such cuts, each within this time of the one before
+CONTENDED, CONTENDED_S = (
+    2,
+    10.0,
+)  # others fill the link after so many such cuts, each within this time of the one before
 YIELDED = Fraction(1, 4)  # of the most that arrived lately: to others the cameras yield down to this
 NARROW = Fraction(4, 5)  # of what is sent: where less arrives, the link itself is narrower than that
 FADED = Fraction(99, 100)  # of the most that arrived is left after each second

@@ -240,6 +240,7 @@ def test_other_workers_find_the_same(clip, measured, tmp_path, cache, workers):
     assert points_of(tmp_path) == points_of(measured[0])
 
 
+@pytest.mark.soak
 def test_a_cluster_that_loses_a_worker_finds_the_same(clip, measured, tmp_path, cache, monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))  # for the workers
@@ -273,6 +274,7 @@ sys.exit(without_cycle_collection(main, sys.argv[1:]))
 """
 
 
+@pytest.mark.soak
 def test_measuring_works_while_a_dask_worker_inspects_its_threads(clip, measured, tmp_path, cache):
     """As in a worker, but all the time: threads are inspected, and cycles collected meanwhile."""
     words = ("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
