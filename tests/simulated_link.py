@@ -118,19 +118,18 @@ def drive(
     tcp_s  begin and end of a TCP flow over the same link
     """
     chance, order = random.Random(seed), itertools.count()
-    uplink, cap, done = UplinkMemory(), LinkCap(), Drive()
-    queue: list[tuple[float, int, str, Any]] = []
+    begin, end = tcp_s or (seconds, seconds)
+    waiting, tcp = Queue(link), Tcp(end, 2 * link.one_way_s)
+    uplink, cap, done = UplinkMemory(), LinkCap(), Drive(tcp=tcp.delivered)
+    queue: list[tuple[float, int, str, Any]] = [
+        (0.001 * number, next(order), "frame", number) for number in range(cameras)
+    ]
+    queue += [(report_s, next(order), "report", None), (begin, next(order), "tcp", "begins")]
+    heapq.heapify(queue)
 
     def at(t: float, kind: str, what: Any) -> None:
         heapq.heappush(queue, (t, next(order), kind, what))
 
-    for camera in range(cameras):
-        at(0.001 * camera, "frame", camera)
-    at(report_s, "report", None)
-    begin, end = tcp_s or (seconds, seconds)
-    waiting, tcp = Queue(link), Tcp(end, 2 * link.one_way_s)
-    done.tcp = tcp.delivered
-    at(begin, "tcp", "begins")
     last_unit = last_report = 0.0
     on_the_way: list[ReceivedUnit] = []
     packets = lost = 0
@@ -166,21 +165,22 @@ def drive(
         else:
             uplink, estimated = estimate(uplink, what)
             if estimated:
-                cap = advanced(cap, _measured(t, estimated, link), t, Fraction(limit(t)), Fraction(1, 2))
+                measured = _measured(t, estimated, 2 * link.one_way_s)
+                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2))
             trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
 
 
-def _measured(t: float, estimated: LinkEstimate, link: Link) -> LinkMeasured:
+def _measured(t: float, estimated: LinkEstimate, rtt_s: float) -> LinkMeasured:
     return LinkMeasured(
         t=t,
         kbps=None if estimated.kbps is None else Fraction(round(estimated.kbps, 1)).limit_denominator(10),
         queue_ms=round(estimated.queue_ms, 1),
         loss=round(estimated.loss, 4),
         state=estimated.state,
-        rtt_ms=2000 * link.one_way_s,
+        rtt_ms=1000 * rtt_s,
     )
 
 

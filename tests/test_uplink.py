@@ -85,6 +85,13 @@ def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
     assert done.wait_ms(0.95) <= 100
 
 
+@pytest.mark.parametrize("kbps", [300, 600, 1000, 1200, 1250, 1300])
+def test_a_link_that_falls_far_is_not_taken_for_one_that_others_fill(kbps: float) -> None:
+    done = drive(Link(steps((0, 5000), (20, kbps)), one_way_s=0.05), steps((0, HIGH)), 60, fps=15)
+    assert done.wait_ms(0.95, since=20) <= 100
+    assert done.kbps(25, 60) >= 0.9 * kbps
+
+
 @pytest.mark.parametrize("fps", [15, 40])
 def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
     """Case 5.6 of RFC 8867, rates times two: a quarter of the fair share at least. TCP itself fills the queue."""

@@ -36,15 +36,16 @@ LATE_S = 2.5  # ... and at least this long after the first: a prediction that is
 REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
 LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
-VAIN = (Fraction(17, 20), Fraction(23, 20))  # times the last cut: where all that is sent arrives, the cut has effect
-UNDRAINED = 0.8  # of the wait at the last cut: where it is still as long, the queue is not the cameras' own
-CONTENDED, CONTENDED_S = (
-    2,
-    10.0,
-)  # others fill the link after so many such cuts, each within this time of the one before
-YIELDED = Fraction(1, 4)  # of the most that arrived lately: to others the cameras yield down to this
-NARROW = Fraction(4, 5)  # of what is sent: where less arrives, the link itself is narrower than that
-FADED = Fraction(99, 100)  # of the most that arrived is left after each second
+YIELDED = Fraction(
+    1, 4
+)  # of the most that arrived lately: to others that fill the link the cameras yield down to this,
+NARROW = (
+    (0.0, Fraction(1, 2)),
+    (1.0, Fraction(4, 5)),
+)  # unless a cap was held for so long, s, and less than this of it
+TRIED_S, TRIED = 2.0, Fraction(19, 20)  # arrives, or no more than this at any time: the link itself is narrower
+PROVEN = 2  # times what it then carries, as the most that arrived
+FADED = Fraction(997, 1000)  # is left of that most after each second
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
 
 
@@ -67,9 +68,8 @@ class LinkCap:
     trusted   t of its last change
     doubts    (t, share of the limit that the link carried) of the last cuts
     most      kbit/s that arrived at most, lately
-    faded     t at which that was lowered last
-    vain      number of cuts in a row that took effect and did not drain the queue
-    vain_at   t of the last of them
+    faded     t at which it faded last
+    passed    t of a change, and the kbit/s that have arrived at most since then
     """
 
     kbps: Kbps | None = None
@@ -88,8 +88,7 @@ class LinkCap:
     doubts: tuple[tuple[float, Fraction], ...] = ()
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
-    vain: int = 0
-    vain_at: float = -float("inf")
+    passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
 
 
 UNCAPPED = LinkCap()
@@ -108,7 +107,7 @@ def advanced(
     cap, full, limit = _trusting(cap, t), limit, believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
-    cap = _noting_most(replace(cap, measured=link.t), link, t)
+    cap = _noted(replace(cap, measured=link.t), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
     lossy = (link.loss or 0) > TOO_LOSSY and t - cap.changed >= LOSS_S + _rtt_s(link)
@@ -173,44 +172,44 @@ def idle(cap: LinkCap, t: float) -> LinkCap:
     return replace(cap, idle=t)
 
 
-def _noting_most(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The most that arrived lately; while others fill the link it does not fade."""
-    most = cap.most
+def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
+    """The most that arrived lately, and since the last change."""
     if t - cap.faded >= 1:
-        most = most if _is_contended(cap, t) else _short(most * FADED)
-        cap = replace(cap, faded=t)
-    return replace(cap, most=max(most, link.kbps or most))
+        cap = replace(cap, most=_short(cap.most * FADED), faded=t)
+    kbps = link.kbps or Fraction(0)
+    since, passed = cap.passed
+    passed = max(passed, kbps) if since == cap.changed else kbps
+    return replace(cap, most=max(cap.most, kbps), passed=(cap.changed, passed))
 
 
-def _is_contended(cap: LinkCap, t: float) -> bool:
-    """Whether others fill the link, so that cutting does not drain its queue."""
-    return cap.vain >= CONTENDED and t - cap.vain_at <= CONTENDED_S
-
-
-def _counting_vain(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """At a queue: whether the last cut has taken effect, in vain."""
-    if cap.kbps is None or link.kbps is None or t - max(cap.changed, cap.vain_at) < SETTLE_S + _rtt_s(link):
-        return cap
-    least, most = (share * cap.kbps for share in VAIN)
-    vain = least <= link.kbps <= most and (link.queue_ms or 0) >= UNDRAINED * cap.queue_ms
-    if not vain:
-        return cap
-    return replace(cap, vain=cap.vain + 1 if t - cap.vain_at <= CONTENDED_S else 1, vain_at=t)
+def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
+    """Whether less arrives than is sent: the link itself is full, not its queue of what others send."""
+    assert link.kbps is not None
+    held_s, sent = t - cap.changed, _in_force(cap, limit)
+    if held_s >= TRIED_S and cap.passed[1] < TRIED * sent:
+        return True
+    return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     assert link.kbps is not None
-    cap = _counting_vain(cap, link, t)
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     full = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
     target = link.kbps * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
-    if _is_contended(cap, t) and link.kbps >= NARROW * _in_force(cap, limit):
-        target = max(target, YIELDED * cap.most)
+    narrow = full or _is_narrow(cap, link, t, limit)
+    most = min(cap.most, PROVEN * link.kbps) if narrow else cap.most
+    target = max(target, YIELDED * most)
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return cap
     return replace(
-        cap, kbps=_short(target), carried=(link.kbps, limit), queue_ms=link.queue_ms or 0.0, steps=0, changed=t
+        cap,
+        kbps=_short(target),
+        carried=(link.kbps, limit),
+        queue_ms=link.queue_ms or 0.0,
+        steps=0,
+        changed=t,
+        most=most,
     )
 
 

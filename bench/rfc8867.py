@@ -1,0 +1,91 @@
+"""The test cases of RFC 8867 that `experiment=rfc8867` drives: what the link carried, and how long packets waited.
+
+  sudo python bench/rfc8867.py OUT                            all cases, 20 minutes
+  sudo python bench/rfc8867.py OUT --only 5_6_long_tcp --runs 5 --words modes=paper
+
+A row for each case: medians over the runs, and their range. OUT keeps the drives; what is there is not driven again.
+Run it on an otherwise idle machine, as root for the cases with TCP.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from uplinks import SETTLED_S, Figures, shown
+
+from runner.configuration.config import configuration
+from runner.drive.read import Drive, read_drive
+from runner.drive.series import series
+from runner.drive.statistics import statistics
+from runner.records import LinkSample
+
+EXPERIMENT = "experiment=rfc8867"
+FIGURES = {
+    "used": "link used %",
+    "tcp": "by TCP %",
+    "p50": "queue p50 ms",
+    "p95": "p95",
+    "p99": "p99",
+    "dropped": "packets dropped",
+    "lost": "lost",
+    "frozen": "frozen %",
+    "switches": "sizes/min",
+}
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("output", type=Path)
+    options.add_argument("--runs", type=int, default=1)
+    options.add_argument("--only", nargs="*", help="cases; all if not given")
+    options.add_argument("--words", nargs="*", default=[], help="further overrides")
+    asked = options.parse_args()
+    cases = configuration([EXPERIMENT]).experiment().runs
+    print("| case | " + " | ".join(FIGURES.values()) + " |")
+    print("| --- " * (len(FIGURES) + 1) + "|", flush=True)
+    for name in asked.only or cases:
+        paths = [asked.output / f"{name}.{number}" for number in range(asked.runs)]
+        drives = [figures(_driven(path, (*cases[name], *asked.words))) for path in paths]
+        cells = (shown(key, [drive[key] for drive in drives]) for key in FIGURES)
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def _driven(path: Path, words: Sequence[str]) -> Drive:
+    """A drive, made unless it is there; one that was cut short begins anew."""
+    done = path / "done"
+    if not done.exists():
+        shutil.rmtree(path, ignore_errors=True)
+        one = [EXPERIMENT, "~experiment.runs", *words, "page.serve=false", f"log={path}"]
+        subprocess.run([sys.executable, "-m", "runner", "demo", *one], check=True, stdout=subprocess.DEVNULL)
+        done.touch()
+    return read_drive(path)
+
+
+def figures(drive: Drive) -> Figures:
+    """What one drive showed, once settled."""
+    over_time = series(drive, "")
+    whole = statistics(over_time)
+    samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
+    t, kbps, queue = np.array([(sample.t, sample.kbps, sample.queue_ms) for sample in samples]).T
+    could = float(np.sum(np.diff(t) * kbps[:-1])) * 1000 / 8  # bytes
+    first, last = samples[0], samples[-1]
+    changes = sum(np.count_nonzero(np.diff(camera.decided.width)) for camera in over_time.cameras.values())
+    return {
+        "used": 100 * (last.bytes - first.bytes) / could,
+        "tcp": 100 * (last.tcp_bytes - first.tcp_bytes) / could,
+        **{f"p{share}": float(np.percentile(queue, share)) for share in (50, 95, 99)},
+        "dropped": last.dropped - first.dropped,
+        "lost": float(whole.lost or 0),
+        "frozen": 100 * whole.frozen,
+        "switches": 60 * changes / over_time.end,
+    }
+
+
+if __name__ == "__main__":
+    main()
