@@ -11,6 +11,7 @@ from runner.configuration.compose import compose
 from runner.configuration.config import configuration
 from runner.configuration.experiment import LinkSettings
 from runner.configuration.files import options
+from runner.errors import ConfigError
 from runner.resources import directory
 
 HEAD = "# @package _global_\n"
@@ -29,9 +30,37 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
     config = configuration([f"experiment={name}"], runnable=False)
     experiment, link = config.experiment(), config.link()
-    assert (link is not None) == (name in ("bottleneck", "loss", "wrong_prediction"))
+    assert (link is not None) == (name in ("bottleneck", "loss", "rfc8867", "wrong_prediction"))
     for words in ((), *experiment.runs.values()):
-        configuration([f"experiment={name}", *words], runnable=False).pqos()
+        run = configuration([f"experiment={name}", *words], runnable=False)
+        own = [word for word in words if word.startswith("experiment.duration_s=")]
+        assert run.experiment().duration_s == float(own[0].partition("=")[2] if own else experiment.duration_s)
+        assert (run.link() is not None) == (link is not None)
+        run.pqos()
+
+
+PAUSE = "{at_s: 9, request: {event: camera_switched, camera: rear_center, on: false}}"
+
+
+def test_requests_are_in_the_order_of_their_times() -> None:
+    early = "{at_s: 2.5, request: {event: mode_selected, mode: collective}}"
+    requests = configuration(
+        ["experiment=driving_test", f"+experiment.requests=[{PAUSE}, {early}]"], runnable=False
+    ).experiment()
+    assert [(request.at_s, request.event["event"]) for request in requests.requests] == [
+        (2.5, "mode_selected"),
+        (9, "camera_switched"),
+    ]
+
+
+def test_a_request_that_is_no_event_is_a_problem(tod: Command) -> None:
+    wrong = PAUSE.replace("rear_center, on: false", "rear_center")
+    result = tod("validate", "experiment=driving_test", f"+experiment.requests=[{wrong}]")
+    assert result.status == 2
+    assert "on: missing" in result.err
+    result = tod("validate", "experiment=driving_test", f"+experiment.requests=[{PAUSE.replace('rear_c', 'raer_c')}]")
+    assert result.status == 2
+    assert "raer_center: unknown camera, did you mean rear_center?" in result.err
 
 
 def test_the_command_line_has_the_last_word() -> None:
@@ -125,11 +154,29 @@ def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> Non
     assert "did you mean paper?" in tod("validate", conf.word, *NARROW).err
 
 
-def test_a_link_joins_rtsp_only(tod: Command) -> None:
+def test_a_relay_joins_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2
-    rule = "joins sides over RTSP, the graph of front_left uses its own transport"
+    rule = "joins sides over RTSP, the graph of front_left uses its own transport; choose link=netns"
     assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
+
+
+def test_the_way_back_has_one_rate(tmp_path: Path) -> None:
+    trace = tmp_path / "downlink.csv"
+    trace.write_text("t_s,kbps\n0,500\n1,50\n")
+    back = "link.reverse={{{}, queue_ms: 100, delay_ms: 5}}"
+    limit = limited("link=netns", "link.loop=false", back.format(f"file: {trace}")).limit
+    assert [limit.rates(t).down for t in (0, 0.9, 1, 90)] == [500, 500, 50, 50]
+    assert limited("link=relay", back.format("kbps: 70")).limit.rates(3).down == 70
+    with pytest.raises(ConfigError, match=r"reverse\.file: donwlink.csv: no such file"):
+        limited("link=netns", back.format("file: donwlink.csv"))
+    with pytest.raises(ConfigError, match=r"tcp\.bytes: .*: must be at least and at most"):
+        limited("link=netns", "link.tcp={flows: 1, bytes: [9, 3]}")
+    with pytest.raises(ConfigError, match="choose link=netns"):
+        limited("link=relay", "+link.tcp={flows: 1}")
+    for words in ("kbps: null", f"kbps: 5, file: {trace}"):
+        with pytest.raises(ConfigError, match="must give either kbps or file"):
+            limited("link=relay", back.format(words))
 
 
 def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:

@@ -92,6 +92,12 @@ def test_a_link_that_falls_far_is_not_taken_for_one_that_others_fill(kbps: float
     assert done.kbps(25, 60) >= 0.9 * kbps
 
 
+def test_a_prediction_that_falls_and_is_still_too_high_fills_no_queue() -> None:
+    link = Link(steps((0, 6000), (20, 1190)), one_way_s=0.05)
+    done = drive(link, steps((0, 6000), (20, 1400)), 60, fps=15)
+    assert done.wait_ms(0.95, since=22) <= 100
+
+
 @pytest.mark.parametrize("fps", [15, 40])
 def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
     """Case 5.6 of RFC 8867, rates times two: a quarter of the fair share at least. TCP itself fills the queue."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import schema
 from runner.clips import view
@@ -41,6 +41,9 @@ from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
 from runner.system.files import file_problem
+
+if TYPE_CHECKING:
+    from runner.configuration.experiment import LinkSettings, TimedRequest
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip")
@@ -246,17 +249,30 @@ class Builder:
             data = data[key]
         return self.attempt(path, lambda: make(data))
 
-    def check_link(self, kind: str) -> None:
-        """Check that all cameras can use a limited link of a kind."""
+    def check_link(self, link: LinkSettings) -> None:
+        """Check that all cameras can use a limited link, and that its kind can do what is asked for."""
         cameras = tuple(self.vehicle.cameras.values()) if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
-        if dialling and kind == "relay":
+        if dialling and link.kind == "relay":
             rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport; choose link=netns"
+            self._refuse_link("kind", link.kind, rule)
         elif dialling and len(dialling) < len(cameras):
             rule = f"joins cameras that all use RTSP, or none: the graph of {dialling[0]} uses its own transport"
-        else:
-            return
-        self.problems.append(self.composed.problem(("link", "kind"), kind, rule))
+            self._refuse_link("kind", link.kind, rule)
+        if link.limit.tcp and link.kind == "relay":
+            self._refuse_link("tcp", None, "needs packets of any protocol: choose link=netns")
+
+    def _refuse_link(self, key: str, found: str | None, rule: str) -> None:
+        self.problems.append(self.composed.problem(("link", key), found, rule))
+
+    def check_requests(self, requests: Sequence[TimedRequest]) -> None:
+        """Check that the cameras that requests name are mounted."""
+        known = self.composed.document.get("cameras") or {}
+        for index, request in enumerate(requests):
+            for name in {request.event.get("camera"), *request.event.get("weights", ())} - {None}:
+                if name not in known:
+                    path = ("experiment", "requests", index, "request")
+                    self.problems.append(self.composed.problem(path, name, f"unknown camera{suggest(name, known)}"))
 
     def _check_inputs(self, camera: Camera) -> None:
         """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""

@@ -82,7 +82,10 @@ class Configuration:
 
         builder = self._builder
         given = "experiment" in self.document
-        return builder.finished(builder.part(("experiment",), read_experiment) if given else Experiment())
+        experiment = builder.part(("experiment",), read_experiment) if given else Experiment()
+        if experiment:
+            builder.check_requests(experiment.requests)
+        return builder.finished(experiment)
 
     def link(self) -> LinkSettings | None:
         """The limited link between the demo's sides, if there is one."""
@@ -94,7 +97,7 @@ class Configuration:
         rates = builder.part(("pqos",), lambda settings: truth(settings, self._bases))
         link = builder.part(("link",), lambda settings: read_link(settings, rates, self._bases)) if rates else None
         if link:
-            builder.check_link(link.kind)
+            builder.check_link(link)
         return builder.finished(link)
 
     @cached_property

@@ -11,7 +11,7 @@ from runner.core.events import ClockAdvanced, Event
 from runner.core.model import Kbps, ModelError, exact
 from runner.link.limit import Limit, Reverse, TcpFlows
 from runner.pqos import Pqos, build_pqos, trace
-from runner.pqos.table import find_file
+from runner.pqos.table import find_file, within
 from runner.pqos.track import Track, build_track
 from runner.schema import event_problem
 
@@ -20,7 +20,7 @@ STEP_S = 0.1  # interval at which the rate of a link follows a map
 
 
 class TimedRequest(NamedTuple):
-    """What the operator asks for at a time of the drive, s: an event in JSON without its time."""
+    """What the operator asks for, s after the vehicle came online to it: an event in JSON without its time."""
 
     at_s: float
     event: Mapping[str, Any]
@@ -62,6 +62,8 @@ def read_experiment(data: Mapping[str, Any]) -> Experiment:
 
 def _request(index: int, data: Mapping[str, Any]) -> TimedRequest:
     event = dict(data["request"])
+    if "t" in event:
+        raise ModelError(f"requests[{index}].request.t", event["t"], "must not be given: at_s is the time")
     if problem := event_problem({"t": 0, **event}):
         raise ModelError(f"requests[{index}].request", event, problem)
     return TimedRequest(float(data["at_s"]), event)
@@ -96,12 +98,15 @@ def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reve
     if (kbps is None) == (file is None):
         raise ModelError("reverse", dict(data), "must give either kbps or file")
     constant = exact(kbps or 0)
-    rates = _recorded(data, loop, bases) if file else lambda _: constant
+    with within("reverse"):
+        rates = _recorded(data, loop, bases) if file else lambda _: constant
     return Reverse(lambda t: float(rates(t)), **_path(data))
 
 
 def _tcp(data: Mapping[str, Any]) -> TcpFlows:
     sizes = data.get("bytes")
+    if sizes and sizes[0] > sizes[1]:
+        raise ModelError("tcp.bytes", sizes, "must be at least and at most")
     return TcpFlows(
         data["flows"], (sizes[0], sizes[1]) if sizes else None, data.get("pause_s", 10), data.get("start_s", 0)
     )

@@ -44,6 +44,7 @@ NARROW = (
     (1.0, Fraction(4, 5)),
 )  # unless a cap was held for so long, s, and less than this of it
 TRIED_S, TRIED = 2.0, Fraction(19, 20)  # arrives, or no more than this at any time: the link itself is narrower
+SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change
 PROVEN = 2  # times what it then carries, as the most that arrived
 FADED = Fraction(997, 1000)  # is left of that most after each second
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
@@ -69,7 +70,7 @@ class LinkCap:
     doubts    (t, share of the limit that the link carried) of the last cuts
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
-    passed    t of a change, and the kbit/s that have arrived at most since then
+    passed    t of a change, and the kbit/s that have arrived at most since it took effect
     """
 
     kbps: Kbps | None = None
@@ -173,12 +174,14 @@ def idle(cap: LinkCap, t: float) -> LinkCap:
 
 
 def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The most that arrived lately, and since the last change."""
+    """The most that arrived lately, and since the last change took effect."""
     if t - cap.faded >= 1:
         cap = replace(cap, most=_short(cap.most * FADED), faded=t)
     kbps = link.kbps or Fraction(0)
     since, passed = cap.passed
-    passed = max(passed, kbps) if since == cap.changed else kbps
+    passed = passed if since == cap.changed else Fraction(0)
+    if t - cap.changed >= SEEN_S + _rtt_s(link):
+        passed = max(passed, kbps)
     return replace(cap, most=max(cap.most, kbps), passed=(cap.changed, passed))
 
 
@@ -196,8 +199,9 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     full = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
     target = link.kbps * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
-    narrow = full or _is_narrow(cap, link, t, limit)
-    most = min(cap.most, PROVEN * link.kbps) if narrow else cap.most
+    most = min(cap.most, limit)
+    if full or _is_narrow(cap, link, t, limit):
+        most = min(most, PROVEN * link.kbps)
     target = max(target, YIELDED * most)
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):

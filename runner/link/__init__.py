@@ -18,15 +18,15 @@ from contextlib import contextmanager
 
 from runner.core.model import Endpoint, suggest
 from runner.errors import RunError
+from runner.link import netns
 from runner.link.ends import Ends
 from runner.link.limit import Limit, LinkCounters
-from runner.link.netns import namespaced
 from runner.link.relayed import relayed
 from runner.records import LinkSample
 
-__all__ = ["KINDS", "Limit", "LimitedLink", "limited_link"]
+__all__ = ["KINDS", "Limit", "LimitedLink", "check_possible", "limited_link"]
 
-KINDS = {"netns": namespaced, "relay": relayed}
+KINDS = {"netns": netns.namespaced, "relay": relayed}
 LOG_S = 0.1  # between two lines of the log
 LOOK_S = 0.02  # how late a rate change may be
 STOP_S = 0.5  # how long the last line of the log may take
@@ -106,6 +106,12 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
         lost=counters.lost,
         tcp_bytes=counters.tcp,
     )
+
+
+def check_possible(kind: str) -> None:
+    """raises RunError if this machine or its user cannot make a link of that kind"""
+    if kind == "netns":
+        netns.check_possible()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A drop-tail queue behind a token bucket: the relay's limit, like the kernel's tbf. Pure: time is passed in."""
+"""A drop-tail queue behind a token bucket: the limit of relay and tunnel. Pure: time is passed in."""
 
 from __future__ import annotations
 

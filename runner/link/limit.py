@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 PACKET_BYTES = 1500  # the largest IP packet on Ethernet
@@ -74,7 +74,7 @@ class Limit:
         """Both directions at the start, for a process that passes packets on (`runner.link.direction`)."""
         rates = self.rates(0)
         back = None if self.reverse is None else _direction(self.reverse, rates.down)
-        return {"up": _direction(self, rates.up), "down": back, "tcp": asdict(self.tcp) if self.tcp else None}
+        return {"up": _direction(self, rates.up), "down": back}
 
 
 def _direction(one: Limit | Reverse, kbps: float | None) -> dict[str, float | None]:

@@ -48,8 +48,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
     dials           whether the vehicle dials the operator for media, as with SRT
     raises          RunError with the remedy
     """
-    ip = _find("ip")
-    _check_allowed()
+    ip = check_possible()
     with _claimed(ip) as (name, network), urgent(lambda: _remove(ip, name)):
         machine, vehicle = map(str, network.hosts())
         devices = (name, f"{name}-far")
@@ -90,7 +89,7 @@ def _competing(
         congestion = tcp.answer()["congestion"]
         yield (
             tcp,
-            (f"{flows.flows} competing TCP flow{'s' if flows.flows > 1 else ''}, congestion control {congestion}",),
+            (f"competing TCP flows: {flows.flows}, congestion control {congestion}",),
         )
 
 
@@ -157,6 +156,13 @@ def _addresses(ip: str) -> list[ipaddress.IPv4Address]:
     devices = json.loads(_run(ip, "-json", "-4", "addr", "show"))
     addresses = (address["local"] for device in devices for address in device.get("addr_info", ()))
     return [ipaddress.IPv4Address(address) for address in addresses]
+
+
+def check_possible() -> str:
+    """raises RunError if this machine or its user cannot make such a link; returns the path of ip"""
+    ip = _find("ip")
+    _check_allowed()
+    return ip
 
 
 def _find(program: str) -> str:

@@ -56,6 +56,7 @@ async def flow(number: int, settings: dict[str, Any]) -> None:
             await transfer((to[0], to[1]), size)
         except OSError:
             await asyncio.sleep(AGAIN_S)
+            continue
         await asyncio.sleep(chance.expovariate(1 / settings["pause_s"]) if settings["pause_s"] else 0)
 
 

@@ -42,12 +42,14 @@ def create(name: str) -> int:
 
 
 def read(source: int, direction: Direction, sink: int) -> None:
-    """Take what waits at one device; the link is gone if that fails."""
+    """Take what waits at one device; ends the process if the device is gone."""
     for _ in range(PACKETS_PER_TURN):
         try:
             packet = os.read(source, 65_536)
         except BlockingIOError:
             return
+        except OSError as error:
+            sys.exit(f"the network device is gone: {error.strerror}")
         direction.put(len(packet), partial(write, sink, packet))
 
 

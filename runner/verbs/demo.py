@@ -39,7 +39,7 @@ from runner.configuration.files import conf_directories
 from runner.core.model import Vehicle
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
 from runner.errors import UserError
-from runner.link import LimitedLink, limited_link
+from runner.link import LimitedLink, check_possible, limited_link
 from runner.mqtt.broker import private_broker
 from runner.plans import render_missing
 from runner.system import children, signals
@@ -58,9 +58,10 @@ DRIVE = "drive"  # where a drive is stored below output=
 class _Run(NamedTuple):
     """One of the drives.
 
-    arguments  with the overrides of this one
-    directory  where it is logged; None: not logged
-    document   its composed configuration
+    arguments   with the overrides of this one
+    directory   where it is logged; None: not logged
+    document    its composed configuration
+    duration_s  of the drive
     """
 
     name: str
@@ -69,14 +70,13 @@ class _Run(NamedTuple):
     directory: Path | None
     link: LinkSettings | None
     document: dict[str, Any]
+    duration_s: float
 
 
 def run(arguments: Arguments) -> int:
     apply = streaming()
     arguments, config = _with_rate(arguments)
     experiment, link = config.experiment(), config.link()
-    duration_s = arguments.number("duration_s")
-    duration_s = experiment.duration_s if duration_s is None else duration_s
     output, models = arguments.path("output"), arguments.path("models")
     if output:
         check_report(output, models)
@@ -91,8 +91,8 @@ def run(arguments: Arguments) -> int:
     driven = list[Path]()
     for number, one in enumerate(runs, 1):
         if one.name:
-            say(f"drive {number} of {len(runs)}: {one.name}, {duration_s:g} s")
-        _drive(one, duration_s)
+            say(f"drive {number} of {len(runs)}: {one.name}, {one.duration_s:g} s")
+        _drive(one)
         driven += [one.directory] if one.directory else []
     if output and driven:
         bases = [base / "cameras" for base in conf_directories(arguments.conf)]
@@ -131,12 +131,16 @@ def _prepared(
         link = config.link()
     if link and directory is None:
         raise UserError("command line", "link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
+    if link:
+        check_possible(link.kind)
     config = config.drivable(apply.check_plan)
     config.pqos()
     vehicle = config.vehicle()
+    duration_s = arguments.number("duration_s")
+    duration_s = config.experiment().duration_s if duration_s is None else duration_s
     with progress_bar() as progress:
         render_missing(vehicle, progress)
-    return _Run(name, own, vehicle, directory, link, config.document)
+    return _Run(name, own, vehicle, directory, link, config.document, duration_s)
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
@@ -166,7 +170,7 @@ def _directory(arguments: Arguments, run: str) -> Path | None:
     return directory
 
 
-def _drive(run: _Run, duration_s: float) -> None:
+def _drive(run: _Run) -> None:
     """Run one drive of both sides.
 
     raises  RunError if a part of it ends early, KeyboardInterrupt after a signal
@@ -178,7 +182,7 @@ def _drive(run: _Run, duration_s: float) -> None:
         signals.stopping(END_S),
         _link(run) as (link, log),
         private_broker(link.broker if link else run.vehicle.control) as broker,
-        _sides(own, link, duration_s) as (vehicle, operator),
+        _sides(own, link, run.duration_s) as (vehicle, operator),
     ):
         for note in link.notes if link else ():
             say(note)
@@ -189,7 +193,7 @@ def _drive(run: _Run, duration_s: float) -> None:
                 if part:
                     part.check()
             status = operator.poll()  # asked once: it may end at any moment, and at the end that is no fault
-            if status == 0 and time.monotonic() >= began + duration_s:
+            if status == 0 and time.monotonic() >= began + run.duration_s:
                 break
             if status is not None:
                 operator.check()

@@ -5,7 +5,7 @@ machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the 
 bitrates and factors, charts, the drive, and why each decision was made. The terminal shows the same as a table. Ends
 with Ctrl-C or duration_s after the vehicle came online, with a summary of how well the received video followed the
 decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR all that is received is written to
-DIR/operator.jsonl, for `report` and `export`.
+DIR/operator.jsonl, for `report` and `export`. With experiment= it sends that experiment's requests at their times.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7

@@ -20,7 +20,7 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
-from runner.link.limit import Rates, Reverse
+from runner.link.limit import Rates, Reverse, TcpFlows
 from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
@@ -362,6 +362,26 @@ def test_both_ways_of_a_namespace_lose_and_delay_any_packet():
     assert 60 < passed < 140
     assert 0.3 * passed < returned < 0.7 * passed
     assert counters.lost == 200 - passed
+
+
+@needs_root
+def test_tcp_flows_compete_from_the_start_of_the_drive_on():
+    """Some that end, under cubic, share the link with everything else."""
+    lines = []
+    flows = TcpFlows(2, size=(20_000, 60_000), pause_s=0.1)
+    with limited_link("netns", replace(WIDE, delay_ms=20, tcp=flows), *_ends(), lines.append) as link:
+        assert link.notes == ("competing TCP flows: 2, congestion control cubic",)
+        time.sleep(0.3)
+        link.start(time.time())
+        until(lambda: lines and lines[-1].tcp_bytes > 500_000)
+        link.check()
+    assert lines[0].tcp_bytes < 100_000
+    assert lines[-1].bytes > 1.02 * lines[-1].tcp_bytes  # headers
+
+
+def test_tcp_flows_need_a_namespace():
+    with pytest.raises(RunError, match="link=relay: tcp is not supported, choose link=netns"):
+        limited_link("relay", replace(WIDE, tcp=TcpFlows(1)), *_ends(), print).__enter__()
 
 
 def test_a_relay_stays_on_this_machine():

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from rig import CLIPS, ROBOT, SHARED, SMALL_ROBOT, Operator, free_port, process, run, until
-from runner.core.events import BitratePredicted
+from runner.core.events import BitratePredicted, CameraSwitched
 from runner.core.model import Endpoint
 from runner.drive.read import read_drive
 from runner.errors import RunError
@@ -248,7 +248,8 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         "# @package _global_\n"
         "defaults: [{override /vehicle: delivery_robot}, {override /source: test}, {override /link: relay}, _self_]\n"
         "link: {share: 0.7}\n"
-        "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]}}\n"
+        "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]},"
+        " requests: [{at_s: 3, request: {event: camera_switched, camera: mast, on: false}}]}\n"
     )
     ports = ("page.serve=false", f"media.port={free_port()}", f"control.port={free_port()}")
     words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
@@ -260,6 +261,7 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         link = drive.sides["link"].lines
         assert len(link) > 5 * (link[-1].t - link[0].t)  # ten a second, unless the machine is busy
         assert link[-1].bytes > 500_000
+        assert [(e.camera, e.on) for e in drive.sides["vehicle"].of(CameraSwitched)] == [("mast", False)]
         predicted = [event.kbps for event in drive.sides["vehicle"].of(BitratePredicted)]
         assert link[20].kbps <= 0.75 * max(predicted)
         assert link[-1].dropped > 0  # more was sent than it carries
