@@ -102,6 +102,19 @@ class CameraPipeline:
         sent = self._pipeline.get_by_name("sent")
         return counted(sent) if sent else (0, 0)
 
+    @property
+    def frame_s(self) -> float:
+        """Interval between two frames."""
+        return 1 / float(self._plan.camera.fps)
+
+    def drop_waiting(self) -> None:
+        """Drop the packet that waits for an interleaved viewer, if there is one."""
+        pipeline = self._pipeline
+        while parent := pipeline.get_parent():
+            pipeline = parent
+        sinks = pipeline.iterate_all_by_element_factory_name("appsink")
+        sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
+
     def send_key_frame(self) -> None:
         """Let the encoder start anew with its next picture, if the graph states how."""
         match self._plan.camera.graph.key_frame:

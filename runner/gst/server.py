@@ -32,6 +32,8 @@ GONE_S = 5.0  # how long a camera that is reopened waits for the end of its prev
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
+BLOCKED_S = 0.4  # a camera that sends nothing for that long, and three frame intervals, although it should
+LEFT_S = 10.0  # how long a camera that a viewer has left is looked after
 SESSIONS_EVERY_S = 1.0
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
 OK, REFUSED, UNAVAILABLE, MOVED = (
@@ -103,7 +105,8 @@ class CameraServer:
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
-        self._left: set[str] = set()  # cameras that a viewer has left recently
+        self._left: dict[str, float] = {}  # cameras that a viewer has left, and until when they are looked after
+        self._moved: dict[str, tuple[int, float]] = {}  # by such a camera, its frames, and since when it is so many
         self._stopped = threading.Event()
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
@@ -273,7 +276,7 @@ class CameraServer:
         with self._changed:
             connection = self._connections.pop(client, None)
             if connection:
-                self._left |= connection.cameras.keys()
+                self._note_left(connection.cameras)
                 connection.forget()
 
     def _on_session(self, _client: object, session: GstRtspServer.RTSPSession) -> None:
@@ -352,12 +355,32 @@ class CameraServer:
                 if transport:
                     transport.message_sent()
 
+    def _unblock(self, name: str, now: float) -> None:
+        """Let a camera stream on after its last interleaved viewer, whose next packet still waits and stops all others.
+
+        Only where nothing moves: a packet that the library is about to take must not be taken from it.
+        """
+        pipeline, watching = self.pipelines.get(name), self._watching(name)
+        if not pipeline or not watching or any(connection.interleaved for connection in watching):
+            self._moved.pop(name, None)
+            return
+        frames, since = pipeline.counters()[0], now
+        if self._moved.get(name, (-1, now))[0] == frames and not (pipeline.paused or pipeline.source_fault):
+            since = self._moved[name][1]
+        if now - since > BLOCKED_S + 3 * pipeline.frame_s:
+            pipeline.drop_waiting()
+            since = now
+        self._moved[name] = (frames, since)
+
     def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._connection(client)
         if connection:
             with self._changed:
                 connection.cameras.pop(_camera_name(context), None)
-            self._left.add(_camera_name(context))
+                self._note_left((_camera_name(context),))
+
+    def _note_left(self, cameras: Iterable[str]) -> None:
+        self._left |= dict.fromkeys(cameras, time.monotonic() + LEFT_S)
 
     def _connection(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
         with self._changed:
@@ -383,9 +406,12 @@ class CameraServer:
         with self._changed:
             connections = list(self._connections.items())
             lags = {connection: self._lag(connection) for _, connection in connections if connection.interleaved}
-            left, self._left = self._left, set()
+            now = time.monotonic()
+            self._left = {name: until for name, until in self._left.items() if now < until}
+            left = tuple(self._left)
         self._wake(left)
-        now = time.monotonic()
+        for name in left:
+            self._unblock(name, now)
         for client, connection in connections:
             if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")

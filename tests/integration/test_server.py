@@ -351,11 +351,18 @@ def test_a_viewer_that_joins_while_the_only_other_has_stopped_gets_the_picture(u
         vehicle.turn(size=(960, 520), bitrate=6000)
         with RtspClient(vehicle.url(), small=True) as stopped:
             assert stopped.open() == [200, 200, 200]
-            time.sleep(0.5)
+            until(lambda: stands_still(vehicle), every_s=0)
             with RtspClient(vehicle.url()) as viewer:
                 assert viewer.open(udp=udp) == [200, 200, 200]
                 viewer.read()
                 until(lambda: viewer.frames > 80)
+
+
+def stands_still(vehicle):
+    """Whether the encoder waits for a reader."""
+    frames = vehicle.frames()
+    time.sleep(6 * FRAME_S)
+    return frames > 5 and vehicle.frames() == frames
 
 
 @pytest.mark.alone
