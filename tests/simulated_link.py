@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
-from runner.core.events import LinkMeasured
+from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LinkCap, advanced, believed
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
@@ -111,11 +111,13 @@ def drive(
     noise: float = 0.15,
     seed: int = 1,
     tcp_s: tuple[float, float] | None = None,
+    position: Callable[[float], PositionReported] | None = None,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
     noise  share by which sizes of access units vary
     tcp_s  begin and end of a TCP flow over the same link
+    position  of the vehicle over time
     """
     chance, order = random.Random(seed), itertools.count()
     begin, end = tcp_s or (seconds, seconds)
@@ -166,7 +168,8 @@ def drive(
             uplink, estimated = estimate(uplink, what)
             if estimated:
                 measured = _measured(t, estimated, 2 * link.one_way_s)
-                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2))
+                here = position(t) if position else None
+                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), here)
             trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))

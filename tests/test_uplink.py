@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from simulated_link import Link, drive, stalls, steps, utilisation
 from soak import reports
 
-from runner.core.events import LinkMeasured
+from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LEAST, LinkCap, advanced
+from runner.core.trust import METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, is_near, regained
 from runner.core.uplink import LinkState
 
 pytestmark = pytest.mark.slow  # simulates drives
@@ -107,6 +108,46 @@ def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
     assert sum(size for t, size in done.tcp if 15 <= t < 60) * 8 / 1000 / 45 >= 500
     assert done.kbps(70, 80) >= 3000
     assert done.wait_ms(0.95, since=65) <= 100
+
+
+def laps(t: float) -> PositionReported:
+    """500 m northwards at 10 m/s, again and again."""
+    return PositionReported(t=t, lat=48 + 10 * t % 500 / METRES_PER_DEGREE, lon=11)
+
+
+def test_a_place_where_predictions_proved_too_high_is_remembered() -> None:
+    """From 100 to 220 m the link carries half of the prediction. The second lap is careful if positions are known."""
+    link = Link(steps((0, 4000), (10, 2000), (22, 4000), (60, 2000), (72, 4000)))
+    unknown, known = (drive(link, steps((0, RIGHT)), 100, position=position) for position in (None, laps))
+    assert known.lowest(9, 10) == unknown.lowest(59, 60) == RIGHT
+    assert known.lowest(59, 60) < 0.8 * RIGHT
+    assert known.lowest(50, 52) == known.lowest(95, 100) == RIGHT, "far from there all is believed"
+    assert known.wait_ms(0.99, since=60) < 0.8 * unknown.wait_ms(0.99, since=60)
+
+
+def test_a_place_is_forgotten() -> None:
+    here = laps(0)
+    trust = Trust(places=(DoubtedPlace(here, 0.0, Fraction(1, 2)),))
+    assert regained(trust, REMEMBERED_S, here).share == Fraction(1, 2)
+    assert regained(trust, REMEMBERED_S + 1, here) == Trust()
+
+
+def test_a_place_recovers_only_while_the_vehicle_is_near() -> None:
+    trust = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2)),))
+    for t in range(1, 60):
+        trust = regained(trust, t, laps(30))
+    assert trust.share == 1 and trust.places[0].share == Fraction(1, 2)
+    for t in range(60, 120):
+        trust = regained(trust, t, laps(0))
+    assert trust == Trust(changed=trust.changed)
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "other", "near"), [(0, 180, -179.9992, True), (0, 10, 10.001, False), (60, 10, 10.001, True)]
+)
+def test_distance(lat: float, lon: float, other: float, near: bool) -> None:
+    """0.001 degrees of longitude are 111 m at the equator and 56 m at 60 degrees north."""
+    assert is_near(PositionReported(t=0, lat=lat, lon=lon), PositionReported(t=0, lat=lat, lon=other)) is near
 
 
 MEASURED = st.tuples(

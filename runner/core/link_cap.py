@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from runner.core.events import LinkMeasured
+from runner.core.events import LinkMeasured, PositionReported
 from runner.core.model import Kbps, exact
+from runner.core.trust import UNDOUBTED, Trust, doubted, regained
 from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue is to be drained within about this time ...
@@ -30,20 +31,14 @@ STEP_S = 0.1  # of recovery, on top of the round trip
 UNMEASURED_S = 2.0  # an operator that is present and reports nothing for longer does not measure the link
 FRESH_S = 1.0  # a measurement that is older does not stand in for a prediction
 BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
-FALL_S = 1.0  # cuts within this time answer the same fall of the link
-EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many falls within this time ...
-LATE_S = 2.5  # ... and at least this long after the first: a prediction that is only late is right by then
-REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
 LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
-YIELDED = Fraction(
-    1, 4
-)  # of the most that arrived lately: to others that fill the link the cameras yield down to this,
-NARROW = (
-    (0.0, Fraction(1, 2)),
-    (1.0, Fraction(4, 5)),
-)  # unless a cap was held for so long, s, and less than this of it
-TRIED_S, TRIED = 2.0, Fraction(19, 20)  # arrives, or no more than this at any time: the link itself is narrower
+# To others that fill the link the cameras yield, down to a share of the most that arrived lately ...
+YIELDED = Fraction(1, 4)
+# ... unless a cap was held for so long, s, and less than a share of it arrives, or never more than TRIED of it: the
+# link itself is narrower.
+NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
+TRIED_S, TRIED = 2.0, Fraction(19, 20)
 SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change
 PROVEN = 2  # times what it then carries, as the most that arrived
 FADED = Fraction(997, 1000)  # is left of that most after each second
@@ -65,9 +60,7 @@ class LinkCap:
     measured  t of the last measurement
     idle      t at which nothing was to be sent, last
     alone     whether nothing else limits the total
-    trust     share of the limit that is believed
-    trusted   t of its last change
-    doubts    (t, share of the limit that the link carried) of the last cuts
+    trust     in the limit
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
     passed    t of a change, and the kbit/s that have arrived at most since it took effect
@@ -84,9 +77,7 @@ class LinkCap:
     measured: float = -float("inf")
     idle: float = -float("inf")
     alone: bool = False
-    trust: Fraction = Fraction(1)
-    trusted: float = -float("inf")
-    doubts: tuple[tuple[float, Fraction], ...] = ()
+    trust: Trust = UNDOUBTED
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
@@ -96,16 +87,23 @@ UNCAPPED = LinkCap()
 
 
 def advanced(
-    cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps, least_trust: Fraction = Fraction(1)
+    cap: LinkCap,
+    link: LinkMeasured | None,
+    t: float,
+    limit: Kbps,
+    least_trust: Fraction = Fraction(1),
+    position: PositionReported | None = None,
 ) -> LinkCap:
     """The cap at time t under a limit, with the newest measurement. The limit that holds is the one `believed`.
 
     least_trust  share of the limit that is believed at least, however often it proved too high; 1: it is not doubted
+    position     of the vehicle, if known
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
-        return UNCAPPED if unmeasured > UNMEASURED_S else cap
-    cap, full, limit = _trusting(cap, t), limit, believed(cap, limit, least_trust)
+        return LinkCap(trust=cap.trust) if unmeasured > UNMEASURED_S else cap
+    cap, full = replace(cap, trust=regained(cap.trust, t, position)), limit
+    limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
     cap = _noted(replace(cap, measured=link.t), link, t)
@@ -113,7 +111,7 @@ def advanced(
         return _stalled(cap, link, t, limit)
     lossy = (link.loss or 0) > TOO_LOSSY and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or lossy) and link.kbps:
-        return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust)
+        return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust, position)
     if link.state is LinkState.CLEAR:
         return _recovered(_resumed(cap, limit), link, t, limit)
     return cap
@@ -121,29 +119,17 @@ def advanced(
 
 def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
     """The share of a limit that is believed, after limits that proved too high; see `advanced`."""
-    return limit if cap.trust == 1 or least_trust == 1 or cap.alone else limit * cap.trust
+    return limit if cap.trust.share == 1 or least_trust == 1 or cap.alone else limit * cap.trust.share
 
 
-def _doubting(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction) -> LinkCap:
+def _doubting(
+    cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction, position: PositionReported | None
+) -> LinkCap:
     """After a cut: believe less of a limit that has been too high for some time."""
     if cap.changed != t or link.kbps is None or cap.alone or least == 1:
         return cap
-    share = min(Fraction(1), _thousandths(BELIEVED * link.kbps / limit))
-    doubts = tuple(doubt for doubt in cap.doubts if t - doubt[0] <= EPISODE_S)
-    if doubts and t - doubts[-1][0] < FALL_S:
-        doubts, share = doubts[:-1], max(share, doubts[-1][1])
-    doubts, trust = (*doubts, (t, share)), cap.trust
-    if len(doubts) >= FEW and t - doubts[0][0] >= LATE_S:
-        # By the mildest: a limit that is only late is far off at first, and almost right soon after.
-        trust = max(least, min(trust, max(share for _, share in doubts)))
-    return replace(cap, doubts=doubts, trust=trust, trusted=t)
-
-
-def _trusting(cap: LinkCap, t: float) -> LinkCap:
-    """Trust returns while nothing speaks against the limit."""
-    if cap.trust == 1 or t - cap.trusted < 1:
-        return cap
-    return replace(cap, trust=min(Fraction(1), cap.trust + REGAINED), trusted=t)
+    carried = min(Fraction(1), _thousandths(BELIEVED * link.kbps / limit))
+    return replace(cap, trust=doubted(cap.trust, t, carried, least, position))
 
 
 def _thousandths(share: Fraction) -> Fraction:

@@ -297,7 +297,7 @@ def fade_when_stale(
     return draft.noted(note, total=total), memory
 
 
-@rule(needs=["total"], gives=["total"], reads=["copies", "link", "on", "operator_lost", "prediction", "t"])
+@rule(needs=["total"], gives=["total"], reads=["copies", "link", "on", "operator_lost", "position", "prediction", "t"])
 def cap_by_link(
     vehicle: Vehicle,
     state: State,
@@ -314,7 +314,8 @@ def cap_by_link(
     measures its own copy of each camera; others that leave the vehicle occupy the link in proportion. While
     nothing is to be sent, nothing can be measured. A prediction older than its own `valid_s`, otherwise than
     `alone_after_s`, is left aside while the link is measured: the total then follows the measurement alone. Of one
-    that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time.
+    that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time,
+    and falls again where it had fallen lately; see `runner.core.trust`.
 
     Memory: the cap, `LinkCap`.
     """
@@ -331,10 +332,13 @@ def cap_by_link(
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
             cap = probing(cap, asked, limit)
-        cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust)
+        cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
         cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
     memory = {**memory, "cap_by_link": cap}
-    carried, why = believed(cap, limit, least_trust), f"{float(cap.trust):.0%} of a prediction that proved too high"
+    carried, why = (
+        believed(cap, limit, least_trust),
+        f"{float(cap.trust.share):.0%} of a prediction that proved too high",
+    )
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"

@@ -34,6 +34,7 @@ class State:
     total_set         kbit/s, the operator's last total
     collective_total  kbit/s, total of mode collective
     link              the newest measurement of the uplink; None: no operator measures it
+    position          the newest one
     copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
     operator_lost     t at which the operator's side disconnected
     """
@@ -49,6 +50,7 @@ class State:
     collective_total: Kbps | None = None
     operator_lost: float | None = None
     link: ev.LinkMeasured | None = None
+    position: ev.PositionReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
 
     @staticmethod
@@ -116,7 +118,9 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"operator_lost": None}
         case ev.OperatorDisconnected():
             return {} if state.operator_lost is not None else {"operator_lost": event.t, "link": None}
-        case ev.PositionReported() | ev.ClockAdvanced():
+        case ev.PositionReported():
+            return {"position": event}
+        case ev.ClockAdvanced():
             return {}
         case _:
             assert_never(event)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import random
 from concurrent.futures import ProcessPoolExecutor
 from fractions import Fraction
 
-from runner.core.events import LinkMeasured
+from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LEAST, REPORT_S, LinkCap, advanced, believed
 from runner.core.model import exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
@@ -16,6 +16,7 @@ SEQUENCES, BATCH = 200_000, 500
 RECOVERED = 100  # one sequence in so many is followed until the link is clear again
 RECOVERY_S = 60.0
 CAMERAS = ("front", "left", "right")
+PLACES = tuple((48 + north / 2000, 11.5) for north in range(4))  # 56 m apart
 LIMIT, LEAST_TRUST = Fraction(4000), Fraction(1, 2)
 
 
@@ -41,15 +42,15 @@ def sequence(seed: int) -> str:
         t, at = t + passed, at + passed
         if chance.random() < 0.02:  # another operator, with another clock
             uplink, at = UplinkMemory(), chance.uniform(-1e6, 1e6)
-        uplink, cap, wrong = _step(uplink, cap, t, _report(chance, at))
+        uplink, cap, wrong = _step(uplink, cap, t, _report(chance, at), chance.choice(PLACES))
         if wrong:
             return wrong
     until = t + (0 if seed % RECOVERED else RECOVERY_S)
-    while t < until and (cap.kbps is not None or cap.trust < 1):
+    while t < until and (cap.kbps is not None or cap.trust.share < 1):
         t, at = t + REPORT_S, at + REPORT_S
         size = int(float(min(LIMIT, cap.kbps or LIMIT)) * REPORT_S * 125 / len(CAMERAS))
         units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size, 3) for name in CAMERAS)
-        uplink, cap, wrong = _step(uplink, cap, t, LinkReport(at, units, 9, 0))
+        uplink, cap, wrong = _step(uplink, cap, t, LinkReport(at, units, 9, 0), PLACES[0])
         if wrong:
             return wrong
     return f"not recovered within {RECOVERY_S:g} s: {cap}" if seed % RECOVERED == 0 and t >= until else ""
@@ -68,7 +69,9 @@ def _report(chance: random.Random, at: float) -> LinkReport:
     )
 
 
-def _step(uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport) -> tuple[UplinkMemory, LinkCap, str]:
+def _step(
+    uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport, place: tuple[float, float]
+) -> tuple[UplinkMemory, LinkCap, str]:
     """The next estimate and cap, and what is wrong with them."""
     uplink, link = estimate(uplink, report)
     if link is None:
@@ -78,7 +81,8 @@ def _step(uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport) -> t
         return uplink, cap, f"estimate {link}"
     kbps = None if link.kbps is None else exact(round(link.kbps, 1))
     measured = LinkMeasured(t=t, kbps=kbps, queue_ms=link.queue_ms, loss=link.loss, state=link.state, rtt_ms=30.0)
-    cap = advanced(cap, measured, t, LIMIT, LEAST_TRUST)
+    position = PositionReported(t=t, lat=place[0], lon=place[1])
+    cap = advanced(cap, measured, t, LIMIT, LEAST_TRUST, position)
     total = min(believed(cap, LIMIT, LEAST_TRUST), cap.kbps or LIMIT)
     if not LEAST <= total <= LIMIT or (cap.kbps is not None and cap.kbps < LEAST):
         return uplink, cap, f"total {float(total)} under {cap}"
