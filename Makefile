@@ -11,6 +11,9 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
+# Tests start hundreds of processes; each would compile the project again where the environment forbids to keep bytecode.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak clean
 
 demo: $(READY)

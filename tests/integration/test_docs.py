@@ -28,7 +28,7 @@ SMALL = [
     for name in ("front_left", "front_center", "front_right", "rear_center")
     for key in ("width_px=480", "height_px=260")
 ]
-LOOP = "source.render.seconds=4"
+LOOP = "source.render.seconds={}"
 SHORT = {  # by verb: words that make it shorter
     "demo": ["duration_s=2", "fps_max=5", "page.serve=false"],
     "vehicle": ["fps_max=5"],
@@ -84,7 +84,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
     assert (
         run(
-            "demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}", "log.video=true"
+            "demo",
+            *SHORT["demo"],
+            *FEWER,
+            *SMALL,
+            LOOP.format(4),
+            *ports(),
+            f"log={directory / 'kept'}",
+            "log.video=true",
         ).returncode
         == 0
     )
@@ -110,7 +117,7 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     if robot:
         own += SMALL_ROBOT[1:]
     if "source=synthetic" in rest:
-        own.append(LOOP)
+        own.append(LOOP.format(1 if verb == "record" else 4))
     elif verb != "model" and not any(word.startswith("source=") for word in rest):
         own.append("source=test")  # a drive is rendered once, for `kept`
     if not robot:
@@ -148,7 +155,15 @@ def check_shell(lines: list[str], place: Path) -> None:
     words = ports()
     port = words[1].partition("=")[2]
     with process(
-        "demo", *SHORT["demo"], "duration_s=60", *FEWER, *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL
+        "demo",
+        *SHORT["demo"],
+        "duration_s=60",
+        *FEWER,
+        *SMALL,
+        LOOP.format(4),
+        *words,
+        cwd=place,
+        stdout=subprocess.DEVNULL,
     ):
         until(lambda: answers(int(port)), seconds=60)
         script = "\n".join(["set -e", *lines]).replace("-p 1884", f"-p {port}")
