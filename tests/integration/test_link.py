@@ -45,8 +45,8 @@ WIDE = Limit(lambda t: 5000, queue_ms=200, delay_ms=0)
 class Drive:
     """Both sides with a link between them; `lines` is its log."""
 
-    def __init__(self, link, lines, side, vehicle):
-        self.link, self.lines, self.side, self.vehicle = link, lines, side, vehicle
+    def __init__(self, link, lines, side, vehicle, plan):
+        self.link, self.lines, self.side, self.vehicle, self.plan = link, lines, side, vehicle, plan
 
     def received(self):
         return self.side.sample({})["rear"]
@@ -80,7 +80,7 @@ def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
     lines = []
     limit = Limit(kbps_at, queue_ms, delay_ms)
     media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
-    words = (*ROBOT, *NOISE, f"pqos.kbps={sent_kbps}")
+    words = (*ROBOT, *NOISE, f"pqos.kbps={sent_kbps}", "media.max_viewers=2")
     with (
         limited_link(kind, limit, media, control, lines.append) as link,
         private_broker(link.broker),
@@ -89,7 +89,7 @@ def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
         plans = compile_plans(configuration([*words, *link.operator_overrides]).vehicle())
         side = OperatorSide([_over_tcp(plan) if tcp else plan for plan in plans], lambda *_: None)
         try:
-            drive = Drive(link, lines, side, vehicle)
+            drive = Drive(link, lines, side, vehicle, plans[0])
             until(lambda: drive.received().decoded > 5)
             link.start(time.time())
             until(lambda: lines)
@@ -162,6 +162,45 @@ def test_rtsp_over_tcp_waits_where_udp_is_dropped():
     assert rate(first, last) == pytest.approx(1000, rel=0.1)
     assert (last.dropped, received.lost) == (0, 0)
     assert frames > MEASURE_S
+
+
+@needs_root
+@pytest.mark.alone
+def test_two_viewers_share_the_total_though_one_has_a_narrow_link():
+    """Both copies leave the vehicle over one link; most packets of the second one are lost behind it."""
+    with driving("netns", lambda t: 20_000, sent_kbps=1400) as drive:
+        drive.settle()
+        alone, before = drive.kbps(), drive.received()
+        with watching(drive.plan) as second:
+            passed = _narrow(second, kbps=200)
+            until(passed)
+            drive.settle()
+            first, last, frames = drive.measure()
+        after = drive.received()
+    assert alone == pytest.approx(1400, rel=0.15)
+    assert rate(first, last) == pytest.approx(alone, rel=0.15)
+    assert frames == pytest.approx(15 * (last.t - first.t), rel=0.1)
+    assert after.lost == before.lost == 0
+
+
+def _narrow(client, kbps):
+    """Drop what the client receives beyond a rate; returns a function that counts what has passed, bytes."""
+    passed, began = 0, time.monotonic()
+
+    def take(_pad, info):
+        nonlocal passed
+        size = info.get_buffer().get_size()
+        if passed + size > (time.monotonic() - began) * kbps * 125:
+            return client._gst.PadProbeReturn.DROP
+        passed += size
+        return client._gst.PadProbeReturn.OK
+
+    def limit(_pipeline, _bin, element):
+        if element.get_factory().get_name() == "udpsrc":
+            element.get_static_pad("src").add_probe(client._gst.PadProbeType.BUFFER, take)
+
+    client.pipeline.connect("deep-element-added", limit)
+    return lambda: passed
 
 
 @pytest.mark.parametrize("kind", KINDS)
