@@ -68,20 +68,26 @@ SHIFTED = """\
 #include <sys/time.h>
 #include <time.h>
 #include <unistd.h>
-static long ahead_ns; /* 0 in a process whose command line lacks SIDE */
+static long ahead_ns, began_ns; /* 0 in a process whose command line lacks SIDE */
+static int (*own)(clockid_t, struct timespec *);
+static long monotonic_ns(void) {
+  struct timespec now;
+  own(CLOCK_MONOTONIC, &now);
+  return now.tv_sec * 1000000000 + now.tv_nsec;
+}
 __attribute__((constructor)) static void look(void) {
   char line[4096];
   int file = open("/proc/self/cmdline", O_RDONLY), size = (int)read(file, line, sizeof line);
   close(file);
   for (int at = 0; at < size; at += (int)strlen(line + at) + 1)
-    if (!strcmp(line + at, SIDE)) ahead_ns = AHEAD_MS * 1000000L;
+    if (!strcmp(line + at, SIDE)) ahead_ns = AHEAD_MS * 1000000L, began_ns = BEGAN_NS;
 }
 int clock_gettime(clockid_t id, struct timespec *t) {
-  static int (*own)(clockid_t, struct timespec *);
   if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
   int failed = own(id, t);
   if (failed || id != CLOCK_REALTIME) return failed;
-  long ns = t->tv_nsec + ahead_ns;
+  long drift_ns = began_ns ? (monotonic_ns() - began_ns) / 1000 * FAST_PPM / 1000 : 0;
+  long ns = t->tv_nsec + ahead_ns + drift_ns;
   t->tv_sec += ns / 1000000000, t->tv_nsec = ns % 1000000000;
   return 0;
 }
@@ -101,10 +107,11 @@ time_t time(time_t *at) {
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 
 
-def clock_ahead(directory: Path, seconds: float, verb: str = "vehicle") -> dict[str, str]:
-    """The environment in which CLOCK_REALTIME of one verb, alone or in a demo, is ahead."""
+def clock_ahead(directory: Path, seconds: float, verb: str = "vehicle", fast_ppm: int = 0) -> dict[str, str]:
+    """The environment in which CLOCK_REALTIME of one verb, alone or in a demo, is ahead, and too fast from now on."""
     (directory / "shifted.c").write_text(SHIFTED)
-    values = (f'-DSIDE="{verb}"', f"-DAHEAD_MS={round(1000 * seconds)}")
+    began = f"-DBEGAN_NS={time.monotonic_ns()}L"
+    values = (f'-DSIDE="{verb}"', f"-DAHEAD_MS={round(1000 * seconds)}", began, f"-DFAST_PPM={fast_ppm}")
     command = ["cc", "-shared", "-fPIC", *values, "-o", "shifted.so", "shifted.c", "-ldl"]
     subprocess.run(command, cwd=directory, check=True)
     return {"LD_PRELOAD": str(directory / "shifted.so")}

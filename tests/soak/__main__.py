@@ -1,5 +1,5 @@
 """Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports of any kind.
+new sizes, garbage, reports of any kind, clocks that drift apart.
 
     make soak                           everything, at most 45 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 
+import clocks
 import hostile
 import ip_camera
 import kills
@@ -38,6 +39,7 @@ PARTS: dict[str, Part] = {
     "sizes": sizes.soak,
     "hostile": hostile.soak,
     "reports": reports.soak,
+    "clocks": clocks.soak,
 }
 
 
