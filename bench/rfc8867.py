@@ -14,16 +14,18 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, shown
+from uplinks import SETTLED_S, Figures, queue_ms, shown, switches
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.records import LinkSample
+from runner.records import DecisionMade, LinkSample
 
 EXPERIMENT = "experiment=rfc8867"
 FIGURES = {
@@ -36,7 +38,10 @@ FIGURES = {
     "lost": "lost",
     "frozen": "frozen %",
     "switches": "sizes/min",
+    "down": "settled down s",
+    "up": "up s",
 }
+TAKEN = 0.8  # share of the new rate
 
 
 def main() -> None:
@@ -72,19 +77,33 @@ def figures(drive: Drive) -> Figures:
     over_time = series(drive, "")
     whole = statistics(over_time)
     samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
-    t, kbps, queue = np.array([(sample.t, sample.kbps, sample.queue_ms) for sample in samples]).T
+    t, kbps = np.array([(sample.t, sample.kbps) for sample in samples]).T
     could = float(np.sum(np.diff(t) * kbps[:-1])) * 1000 / 8  # bytes
     first, last = samples[0], samples[-1]
-    changes = sum(np.count_nonzero(np.diff(camera.decided.width)) for camera in over_time.cameras.values())
     return {
         "used": 100 * (last.bytes - first.bytes) / could,
         "tcp": 100 * (last.tcp_bytes - first.tcp_bytes) / could,
-        **{f"p{share}": float(np.percentile(queue, share)) for share in (50, 95, 99)},
+        **queue_ms(drive),
         "dropped": last.dropped - first.dropped,
         "lost": float(whole.lost or 0),
         "frozen": 100 * whole.frozen,
-        "switches": 60 * changes / over_time.end,
+        "switches": switches(over_time),
+        **settling(drive),
     }
+
+
+def settling(drive: Drive) -> Figures:
+    """Time from a step of the link's rate until the total is at most a fifth below it, s: medians by direction."""
+    ahead = drive.sides["link"].began.time - drive.sides["vehicle"].began.time
+    samples = [(sample.t + ahead, sample.kbps) for sample in drive.sides["link"].of(LinkSample)]
+    totals = [(line.t, line.total_kbps) for line in drive.sides["vehicle"].of(DecisionMade)]
+    waits: dict[str, list[float]] = {"down": [], "up": []}
+    for (_, before), (t, now) in pairwise(samples):
+        if before == now:
+            continue
+        until = next((since for since, total in totals if since >= t and TAKEN * now <= total <= now), np.nan)
+        waits["down" if now < before else "up"].append(until - t)
+    return {name: median(found) if found else np.nan for name, found in waits.items()}
 
 
 if __name__ == "__main__":

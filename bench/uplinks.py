@@ -4,8 +4,8 @@
   python bench/uplinks.py OUT UPLINK.csv --runs 1 --seconds 30 --only right high_50
 
 Drives `experiment=wrong_prediction` over each uplink, measures each drive, and prints a table: medians over the runs,
-and their range. OUT keeps the drives and OUT/uplinks.json all figures; what is there is not driven again. Run it on an
-otherwise idle machine.
+and their range. OUT keeps the drives, OUT/uplinks.json all figures and OUT/uplinks.png a picture of them; what is there
+is not driven again. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from pathlib import Path
 from statistics import fmean, median
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
@@ -41,12 +43,24 @@ FIGURES = {
     "back_s": "back after outage, p95 s",
     "p50_ms": "p50 ms",
     "p99_ms": "p99 ms",
+    "queue_p50": "queue p50 ms",
+    "queue_p95": "p95",
+    "queue_p99": "p99",
     "used": "used %",
     "damaged": "damaged %",
     "lost": "lost",
     "mssim": "MSSIM mean",
     "worst": "MSSIM worst",
+    "switches": "sizes/min",
 }
+# Panels of the picture: their scale, and which way is better.
+PANELS = {
+    "frozen": ("frozen, % of the time (less is better)", "linear"),
+    "p99_ms": ("capture to arrival, p99, ms (less is better)", "log"),
+    "used": ("link used, % (more is better)", "linear"),
+    "mssim": ("MSSIM of delivered pictures (more is better)", "linear"),
+}
+COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#8C564B", "#7F7F7F", "#000000")
 Figures = dict[str, float]
 Floats = NDArray[np.float64]
 
@@ -71,6 +85,7 @@ def main() -> None:
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in drives[-1].items()}, flush=True)
             found.setdefault(uplink.stem, {})[name] = drives
             write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
+    picture(found).savefig(asked.output / "uplinks.png", dpi=100)
     print("\n".join(table(found)))
 
 
@@ -120,7 +135,21 @@ def figures(path: Path) -> Figures:
         "lost": float(whole.lost or 0),
         "mssim": fmean(means),
         "worst": min(means),
+        **queue_ms(drive, "queue_"),
+        "switches": switches(over_time),
     }
+
+
+def queue_ms(drive: Drive, name: str = "") -> Figures:
+    """Percentiles of the wait in front of the link, by its own log."""
+    waits = [sample.queue_ms for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
+    return {f"{name}p{share}": float(np.percentile(waits, share)) for share in (50, 95, 99)}
+
+
+def switches(over_time: Series) -> float:
+    """Changes of the size of any picture, in a minute."""
+    changes = sum(np.count_nonzero(np.diff(camera.decided.width)) for camera in over_time.cameras.values())
+    return 60 * changes / over_time.end
 
 
 def _link(drive: Drive) -> tuple[Floats, Floats]:
@@ -180,8 +209,28 @@ def table(found: dict[str, dict[str, list[Figures]]]) -> Iterator[str]:
             yield f"| {uplink} | {name} | " + " | ".join(cells) + " |"
 
 
+def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
+    """Each run a dot, by uplink and condition, and a line at the median of the runs."""
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    names = list(dict.fromkeys(name for conditions in found.values() for name in conditions))
+    colours = dict(zip(names, COLOURS, strict=False))
+    for axes, (key, (title, scale)) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
+        for place, conditions in enumerate(found.values()):
+            for number, (name, drives) in enumerate(conditions.items()):
+                x = place + 0.8 * ((number + 0.5) / len(names) - 0.5)
+                values = [drive[key] for drive in drives]
+                axes.plot([x] * len(values), values, "o", color=colours[name], markersize=4, alpha=0.5)
+                axes.plot([x - 0.03, x + 0.03], [median(values)] * 2, color=colours[name], linewidth=3)
+        axes.set(title=title, yscale=scale, xticks=range(len(found)), xlim=(-0.5, len(found) - 0.5))
+        axes.set_xticklabels([name.removesuffix("_uplink_1s").replace("_", " ") for name in found], fontsize=8)
+        axes.grid(axis="y", alpha=0.3)
+    handles = [Line2D([], [], color=colours[name], marker="o", label=name.replace("_", " ")) for name in names]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(names), title="prediction, or policy")
+    return figure
+
+
 def shown(key: str, values: Sequence[float]) -> str:
-    digits = 3 if key in ("mssim", "worst") else 0 if key in ("p50_ms", "p99_ms", "used", "lost") else 1
+    digits = 3 if key in ("mssim", "worst") else 0 if key in ("p50_ms", "p99_ms", "used", "lost", "switches") else 1
     known = [value for value in values if np.isfinite(value)]
     if not known:
         return "–"
