@@ -28,12 +28,12 @@ SMALL = [
     for name in ("front_left", "front_center", "front_right", "rear_center")
     for key in ("width_px=480", "height_px=260")
 ]
-LOOP = "source.render.seconds={}"
+LOOP = "source.render.seconds=4"
 SHORT = {  # by verb: words that make it shorter
     "demo": ["duration_s=2", "fps_max=5", "page.serve=false"],
     "vehicle": ["fps_max=5"],
     "operator": ["fps_max=5", "page.serve=false"],
-    "record": ["duration_s=1.2", "fps_max=25"],
+    "record": ["duration_s=1.2", "fps_max=5"],
     "model": ["scalings=[1.0]", "bitrates_kbps=[100,400]", "plan=full"],
 }
 STANDS_FOR = {
@@ -88,7 +88,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             *SHORT["demo"],
             *FEWER,
             *SMALL,
-            LOOP.format(4),
+            LOOP,
             *ports(),
             f"log={directory / 'kept'}",
             "log.video=true",
@@ -117,7 +117,7 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     if robot:
         own += SMALL_ROBOT[1:]
     if "source=synthetic" in rest:
-        own.append(LOOP.format(1 if verb == "record" else 4))
+        own.append(LOOP)
     elif verb != "model" and not any(word.startswith("source=") for word in rest):
         own.append("source=test")  # a drive is rendered once, for `kept`
     if not robot:
@@ -160,7 +160,7 @@ def check_shell(lines: list[str], place: Path) -> None:
         "duration_s=60",
         *FEWER,
         *SMALL,
-        LOOP.format(4),
+        LOOP,
         *words,
         cwd=place,
         stdout=subprocess.DEVNULL,
