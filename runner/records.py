@@ -8,6 +8,7 @@ has no such start, from 1970.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
@@ -468,7 +469,20 @@ def from_json(kind: type[T], document: Mapping[str, Any]) -> T:
 
     raises  msgspec.ValidationError, a ValueError
     """
+    if kind not in _prepared:
+        _prepare(kind)
     return msgspec.convert(document, kind)
+
+
+_preparing = threading.Lock()
+_prepared = set[type[Any]]()
+
+
+def _prepare(kind: type[Any]) -> None:
+    """Make msgspec look at a type: it does so at the first use, and crashes if two threads are the first (0.22)."""
+    with _preparing:
+        msgspec.json.Decoder(kind)
+        _prepared.add(kind)
 
 
 def state_to_json(state: VehicleState | None) -> Json:

@@ -1,8 +1,11 @@
-"""Messages of the control link as they are received: size, form."""
+"""Messages of the control link as they are received: size, form, and that threads may read them at the same time."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from textwrap import dedent
 
 import pytest
 
@@ -27,3 +30,28 @@ def test_a_request_has_a_limited_size() -> None:
 def test_an_invalid_message_is_refused(payload: bytes, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         read_message(payload)
+
+
+def test_records_are_read_by_several_threads_from_their_first_use_on() -> None:
+    """In a process of its own, which would crash."""
+    program = dedent(
+        """\
+        import sys, threading
+        from dataclasses import make_dataclass
+        from runner.records import from_json
+        sys.setswitchinterval(1e-6)
+        for number in range(200):
+            inner = make_dataclass(f"Inner{number}", [(f"field{i}", float) for i in range(8)])
+            outer = make_dataclass(f"Outer{number}", [("inner", inner), ("inners", dict[str, inner])])
+            document = {f"field{i}": 1.0 for i in range(8)}
+            start = threading.Barrier(4)
+            def read(odd):
+                start.wait()
+                from_json(outer, {"inner": document, "inners": {}}) if odd else from_json(inner, document)
+            threads = [threading.Thread(target=read, args=(i % 2,)) for i in range(4)]
+            for thread in threads: thread.start()
+            for thread in threads: thread.join()
+        """
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

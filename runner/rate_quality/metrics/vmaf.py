@@ -60,6 +60,9 @@ class VmafLog(msgspec.Struct):
     pictures: list[LoggedPicture] = msgspec.field(name="frames")
 
 
+READER = msgspec.json.Decoder(VmafLog)  # made by one thread: msgspec 0.22 crashes where several make it
+
+
 def metric(model: str) -> Metric:
     """VMAF with a model that is built into libvmaf. Raises UserError for an unknown model, RunError without a tool."""
     if not re.fullmatch(r"[\w.]+", model):
@@ -171,7 +174,7 @@ def read_log(directory: Path, status: int) -> Scores:
     if status:
         raise complaint(directory, status)
     try:
-        log = msgspec.json.decode((directory / LOG).read_bytes(), type=VmafLog)
+        log = READER.decode((directory / LOG).read_bytes())
         return Scores(log.version, {picture.number: picture.metrics.vmaf for picture in log.pictures})
     except (OSError, msgspec.ValidationError, msgspec.DecodeError):
         raise complaint(directory, status) from None
