@@ -16,7 +16,7 @@ from runner.system.signals import END_S, LIFELINE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timed]  # starts and ends processes, within a limit
 # 128 and the signal's number; or the signal itself, if it arrives after the interpreter has put back its handlers
-BY_SIGNALS = (130, 143, -signal.SIGTERM)
+BY_SIGNALS = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: blocks for ever
