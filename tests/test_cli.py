@@ -56,7 +56,10 @@ def test_words_that_are_no_command(tod: Command, words: list[str], expected: str
 @pytest.mark.parametrize(
     "words, expected",
     [
-        (["print", "duration_s=3"], "duration_s: is an argument of vehicle, operator, demo, record; print has "),
+        (
+            ["print", "duration_s=3"],
+            "duration_s: is an argument of vehicle, operator, latency, demo, record; print has ",
+        ),
         (["print", "input=a.jsonl"], "input: is an argument of replay; print has total_kbps, format, conf"),
         (["print", "vehcle=mine"], "vehcle: unknown name, did you mean vehicle?"),
         (["print", "totl_kbps=3"], "totl_kbps: unknown name, did you mean total_kbps?"),

@@ -24,6 +24,7 @@ from runner.h264.access_unit import AccessUnit, Recent
 from runner.mqtt.messages import read_message
 from runner.operator.station import Listener, Station
 from runner.page.control import Control
+from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
 from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
@@ -53,11 +54,15 @@ class PageServer(Listener):
 
     A listener of the station; it and `show` may be called from any thread, everything else runs in the page's own.
 
-    raises  RunError if the port is in use or plotly is not installed
+    on_counter  called, in the page's thread, with what a page read of the counter that a camera films; None: pages may
+                not say so
+    raises      RunError if the port is in use or plotly is not installed
     """
 
-    def __init__(self, vehicle: Vehicle, station: Station) -> None:
-        self._vehicle, self._station = vehicle, station
+    def __init__(
+        self, vehicle: Vehicle, station: Station, on_counter: Callable[[CounterReading], None] | None = None
+    ) -> None:
+        self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
         check_port_free(vehicle.page.endpoint)
         self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
         self._plotly = plotly_script("page")
@@ -106,6 +111,7 @@ class PageServer(Listener):
         app.router.add_get("/live", self._on_viewer)
         app.router.add_get("/plotly.js", lambda _: _script(self._plotly))
         app.router.add_get("/", _served(STATIC / "index.html"))
+        app.router.add_get("/counter", _served(STATIC / "counter.html"))
         for file in STATIC.iterdir():
             app.router.add_get(f"/static/{file.name}", _served(file))
         self._runner = web.AppRunner(
@@ -224,6 +230,8 @@ class PageServer(Listener):
                 viewer.tell("clock", {"page_ms": page_ms, "server_ms": time.time() * 1000})
             case {"resync": str(name)} if name in self._index:
                 viewer.restart(self._index[name])
+            case {"counter": dict(found)} if self._on_counter and (reading := counter_reading(found)):
+                self._on_counter(reading)
             case {"take_control": True}:
                 self._control.take(viewer.token)
                 self._tell_control()

@@ -25,10 +25,11 @@ from runner.system.ports import check_port_free
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
 CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
-STREAMING = ("vehicle", "operator", "demo", "record", "model", "quality")  # verbs that need GStreamer
+STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
 NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
+    "latency": ("live", "page"),
     "demo": ("live",),
     "record": ("live",),
     "model": ("model",),
@@ -134,7 +135,7 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
         ports["media.port"] = vehicle.media
     if verb == "demo":
         ports["control.port"] = vehicle.control
-    if verb in ("operator", "demo") and vehicle.page.serve:
+    if verb == "latency" or (verb in ("operator", "demo") and vehicle.page.serve):
         ports["page.port"] = vehicle.page.endpoint
     for key, endpoint in ports.items():
         try:

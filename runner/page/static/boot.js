@@ -17,6 +17,7 @@ worker.postMessage({
   origin: performance.timeOrigin,
   video: canShowVideo,
   keep: location.hash === "#measure",
+  counted: new URLSearchParams(location.hash.slice(1)).get("counter"),
 });
 
 function liveUrl() {

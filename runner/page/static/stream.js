@@ -2,6 +2,7 @@
 
 import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
+import { elapsed, read } from "./counter.js";
 import { pictureOf } from "./picture.js";
 import { judge, words } from "./status.js";
 import { drawOverlay } from "./overlay.js";
@@ -235,6 +236,7 @@ export class Stream {
     this.paint(now());
     this.note(this.shown.meta, now());
     if (this.station.keep) this.first ??= this.picture();
+    if (this.station.counted === this.name) this.readCounter(this.shown);
   }
 
   age({ captured }, time) {
@@ -249,6 +251,22 @@ export class Stream {
     const page = [meta.received, meta.decoded, drawn].map((time) => this.station.clock.server(time));
     this.stages.push([meta.captured, meta.arrived, ...page]);
     if (this.stages.length > STAGES) this.stages.shift();
+  }
+
+  /** Tell the station how long ago the counter in a picture that was just drawn had been on the screen. */
+  async readCounter({ picture, meta: { captured } }) {
+    const { clock, bound } = this.station;
+    const drawn = now();
+    const shape = await picture.decoded().catch(() => null); // it may be closed by now
+    if (!shape) return;
+    const [{ offset, stride }] = shape.planes;
+    const counter = read(shape.bytes.subarray(offset), shape.width, shape.height, stride);
+    this.station.count({
+      camera: this.name,
+      elapsed_ms: counter === null ? null : elapsed(counter, drawn),
+      age_ms: finite(clock.server(drawn) - captured),
+      bound_ms: finite(bound + clock.bound),
+    });
   }
 
   times() {
@@ -327,6 +345,9 @@ export class Stream {
     this.shown = null;
   }
 }
+
+/** JSON has no other numbers. */
+const finite = (ms) => (Number.isFinite(ms) ? ms : null);
 
 function blank(context, width, height) {
   context.fillStyle = "#0b0e11";

@@ -9,6 +9,7 @@ import { hasGpu } from "./picture.js";
 import { Stream } from "./stream.js";
 // Imported here, though used only by other modules, so that all modules are fetched at once.
 import "./codec.js";
+import "./counter.js";
 import "./overlay.js";
 import "./status.js";
 import "./yuv.js";
@@ -27,6 +28,8 @@ const station = {
   online: true,
   bound: NaN, // by how much capture times may be wrong on the station's clock, ms
   video: true,
+  counted: null, // name of the camera that films the counter, if the page is to read it
+  count: (counter) => send({ counter }),
   resync: (name) => send({ resync: name }),
   wake,
 };
@@ -178,6 +181,7 @@ const orders = {
   start(message) {
     settings = message;
     station.keep = message.keep;
+    station.counted = message.counted;
     station.video = message.video && typeof VideoDecoder !== "undefined";
     connect();
     setInterval(watch, WATCH_MS);

@@ -1,0 +1,65 @@
+"""Latency from light to light, read by the page from the picture of a counter, agrees with what the page states."""
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from helpers import Command
+
+from browser import measure, opened
+from rig import ROBOT, answers, free_port, process, until
+
+pytestmark = pytest.mark.gst
+RESULT = re.compile(
+    r"rear: counter read in (\d+) of (\d+) pictures\n"
+    r"  light to light +(\d+) ms median, \d+ ms p95\n"
+    r"  capture to drawing +(\d+) ± (\d+) ms, as the page states it\n"
+    r"  camera and screen +(-?\d+) ± \d+ ms, the difference\n"
+    r"  latency.fixed_ms=(\d+), as the vehicle knows of (\d+) ms from capture to decoding\n"
+)
+
+
+def test_the_stated_latency_is_what_a_counter_in_the_picture_shows(chromium, tmp_path: Path) -> None:
+    port = free_port()
+    words = (*ROBOT, f"page.port={port}", f"media.port={free_port()}")
+    output, own = tmp_path / "output", ("camera=rear", "loop=true", "duration_s=3", f"control.port={free_port()}")
+    with output.open("w") as file, process("latency", *own, *words, stdout=file.fileno()) as measuring:
+        until(lambda: answers(port))
+        assert measuring.poll() is None, output.read_text()
+        with opened(chromium, f"http://127.0.0.1:{port}/#counter=rear"):
+            assert measuring.wait(timeout=60) == 0, output.read_text()
+    found = RESULT.search(output.read_text())
+    assert found, output.read_text()
+    read, pictures, light, stated, bound, outside, fixed, decoded = map(int, found.groups())
+    assert read > 0.8 * pictures > 20
+    assert abs(light - stated - outside) <= 1
+    assert abs(outside) <= bound + 10, "nothing is between the counter and its capture"
+    assert abs(max(0, light - decoded) - fixed) <= 1
+
+
+def test_a_counter_that_is_not_in_the_picture_is_an_error(chromium) -> None:
+    port, control = free_port(), free_port()
+    words = (*ROBOT, f"page.port={port}", f"media.port={free_port()}")
+    with process(
+        "latency", "camera=front", "loop=true", *words, f"control.port={control}", "cameras.front.width_px=64"
+    ) as measuring:
+        until(lambda: answers(port))
+        with opened(chromium, f"http://127.0.0.1:{port}/#counter=front") as page:
+            until(lambda: measure(page)["front"]["drawn"] > 5)
+        measuring.send_signal(signal.SIGINT)
+        assert measuring.wait(timeout=30) == 1
+        assert "must be sharp, upright, whole, and at least 130 px wide in the picture" in measuring.stdout.read()
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ([], "camera: must be given: one of front, rear, mast"),
+        (["camera=raer"], "camera: 'raer': unknown camera, did you mean rear?"),
+        (["camera=rear", "loop=yes"], "loop: 'yes': must be one of false, true"),
+    ],
+)
+def test_mistakes_are_explained(tod: Command, words: list[str], error: str) -> None:
+    result = tod("latency", "vehicle=delivery_robot", *words)
+    assert (result.status, result.err) == (2, f"command line: {error}\n")
