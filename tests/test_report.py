@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
@@ -16,9 +17,11 @@ from helpers import CONF, Command, process
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
+from runner.drive import quality_file
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.figures import Figure, figures
+from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
@@ -116,6 +119,56 @@ def test_with_models_quality_is_estimated(tod: Command, drive: Path, tmp_path: P
 
 
 @pytest.mark.usefixtures("unprinted")
+def test_quality_that_was_measured_on_the_pictures_is_shown(
+    tod: Command, drive: Path, tmp_path: Path, unprinted: None
+) -> None:
+    path = tmp_path / "measured"
+    shutil.copytree(drive, path)
+    moments = tuple(np.arange(0.5, 19, 0.5))
+    found = {
+        "front_left": DeliveredQuality(moments, tuple(0.9 + 0.0012 * t for t in moments), 0.0, clip=True),
+        "top_rear": DeliveredQuality(moments, tuple(0.3 if 6 < t < 7.5 else 0.8 for t in moments), 0.1, clip=False),
+        "top_left": DeliveredQuality((), (), 0.0, clip=True),
+    }
+    (path / "quality.json").write_text(json.dumps(quality_file.to_json(found)))
+    status, out, _ = tod("report", str(path), f"output={tmp_path / 'out'}")
+    assert status == 0
+    content = document(tmp_path / "out")
+    (described,) = content["drives"]
+    cameras = {camera["name"]: camera["delivered"] for camera in described["cameras"]}
+    means = [np.mean(found[name].mssim) for name in ("front_left", "top_rear")]
+    assert described["delivered"] == {
+        "metric": "mssim",
+        "mean": pytest.approx(np.mean(means), abs=1e-5),
+        "worst": pytest.approx(min(means), abs=1e-5),
+    }
+    assert cameras["top_rear"]["lowest"] == 0.3
+    assert (cameras["top_rear"]["against"], cameras["front_left"]["against"]) == ("stream", "scene")
+    assert (cameras["top_left"]["mean"], cameras["top_left"]["moments"]) == (None, 0)
+    assert cameras["rear_center"] is None
+    assert "delivered" in content["figures"]
+    assert "delivered" in out
+    assert f"{means[0]:.3f}" in out
+
+
+def test_without_measured_quality_the_figure_is_left_out(tod: Command, drive: Path, tmp_path: Path) -> None:
+    assert tod("report", str(drive), f"output={tmp_path}").status == 0
+    content = document(tmp_path)
+    assert content["drives"][0]["delivered"] is None
+    assert any(each.startswith("delivered: left out, quality of delivered pictures") for each in content["left_out"])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"cameras": {"front_left": {"t": 1}}}', '{"cameras": 1}'])
+def test_measured_quality_that_cannot_be_read(tod: Command, drive: Path, tmp_path: Path, text: str) -> None:
+    path = tmp_path / "measured"
+    shutil.copytree(drive, path)
+    (path / "quality.json").write_text(text)
+    status, _, err = tod("report", str(path), f"output={tmp_path / 'out'}")
+    assert status == 2
+    rule = "must be as `tod-runner quality` writes it: run it again, or delete the file"
+    assert err.splitlines()[-1] == f"{path / 'quality.json'}: {rule}"
+
+
 def test_a_model_that_the_configuration_names(tod: Command, tmp_path: Path) -> None:
     def named(side: str, lines: Lines) -> Lines:
         return lines

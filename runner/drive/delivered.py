@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from runner.core.model import Camera
 from runner.drive.captures import SAME_NS, SECOND_NS, ReadVideo, UnitTimes, captured, files, lies_outside, received
+from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.rate_quality.metrics.interface import Luma
@@ -35,22 +36,6 @@ TELL_S = 0.25  # between two reports of progress
 BLOCKS = 32  # along the shorter side of a picture
 
 DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
-
-
-@dataclass(frozen=True, slots=True)
-class DeliveredQuality:
-    """Of one camera.
-
-    t      moments, s since the vehicle's side began
-    mssim  of each: the picture on show against the scene
-    stale  share of the moments at which an older picture stood for the one due
-    clip   whether the scene was known; otherwise it is the stream as sent
-    """
-
-    t: tuple[float, ...]
-    mssim: tuple[float, ...]
-    stale: float
-    clip: bool
 
 
 def measure(

@@ -87,6 +87,9 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, An
         }
         if drive.metric
         else None,
+        "delivered": None
+        if math.isnan(drive.delivered)
+        else {"metric": "mssim", "mean": number(drive.delivered, 5), "worst": number(drive.delivered_worst, 5)},
         "warnings": list(series.warnings),
         "notes": list(drive.notes),
         "checks": [check._asdict() for check in checks],
@@ -110,7 +113,7 @@ def _link(link: LinkSeries) -> dict[str, Any]:
 
 
 def _camera(camera: CameraStatistics) -> dict[str, Any]:
-    freezes, quality = camera.freezes, camera.quality
+    freezes, quality, delivered = camera.freezes, camera.quality, camera.delivered
     return {
         "name": camera.name,
         "frames": camera.frames,
@@ -141,5 +144,14 @@ def _camera(camera: CameraStatistics) -> dict[str, Any]:
             "moving": number(quality.moving, 5),
             "frozen_share": number(camera.frozen),
             "clamped": number(quality.clamped),
+        },
+        "delivered": delivered
+        and {
+            "metric": "mssim",
+            "mean": number(delivered.mean, 5),
+            "lowest": number(min(delivered.mssim, default=None), 5),
+            "moments": len(delivered.mssim),
+            "stale_share": number(delivered.stale),
+            "against": "scene" if delivered.clip else "stream",
         },
     }

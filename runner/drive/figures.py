@@ -241,14 +241,37 @@ def quality(drives: Drives) -> Rows | str:
             if estimate and estimate.metric == metrics[0]:
                 yield Curve(name, *estimate.line, _place(drive, (name,)), dash)
 
+    axis = _quality_axis(f"estimated {METRICS.get(metrics[0], metrics[0])}")
+    return _by_panel(drives, curves, axis, "%{y:.4~g}", shared=True)
+
+
+def delivered(drives: Drives) -> Rows | str:
+    """Measured quality of the pictures that the operator saw."""
+    if not any(camera.delivered for drive in drives for camera in drive.cameras.values()):
+        return (
+            "quality of delivered pictures was not measured: that takes log.video=true and `tod-runner quality DRIVE`"
+        )
+
+    def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
+        for dash, name in enumerate(panel.cameras):
+            found = drive.cameras[name].delivered
+            if found:
+                yield Curve(name, np.array(found.t), np.array(found.mssim), _place(drive, (name,)), dash)
+
+    return _by_panel(drives, curves, _quality_axis("MSSIM delivered"), "%{y:.4~g}", shared=True)
+
+
+def _quality_axis(title: str) -> Callable[[int, Sequence[Sequence[Curve]]], Axis]:
+    """An axis that the values fill."""
+
     def axis(_: int, found: Sequence[Sequence[Curve]]) -> Axis:
         values = np.concatenate([np.empty(0), *(curve.y for each in found for curve in each)])
         known = values[np.isfinite(values)]
         low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
         room = 0.05 * (high - low or 1.0)
-        return Axis(f"estimated {METRICS.get(metrics[0], metrics[0])}", low - room, high + room)
+        return Axis(title, low - room, high + room)
 
-    return _by_panel(drives, curves, axis, "%{y:.4~g}", shared=True)
+    return axis
 
 
 FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
@@ -258,6 +281,7 @@ FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
     "totals": ("Predicted, allocated and actual total", totals),
     "latency": ("Latency and freezes", latency),
     "quality": ("Estimated quality over time", quality),
+    "delivered": ("Measured quality of delivered pictures", delivered),
 }
 
 

@@ -24,7 +24,7 @@ from runner.system.files import plotly_script
 STATIC = Path(__file__).parent / "static"
 MOST_POINTS = 2000  # of a curve; longer ones are thinned
 LAST_REASONS = 200
-ORDER = ("bitrate_on_track", "totals", "bitrates", "scaling", "latency", "quality")
+ORDER = ("bitrate_on_track", "totals", "bitrates", "scaling", "latency", "quality", "delivered")
 HtmlTable = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 

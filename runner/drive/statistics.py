@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from runner.drive.quality_file import DeliveredQuality
 from runner.drive.series import (
     RATE_WINDOW_S,
     CameraSeries,
@@ -118,6 +119,7 @@ class CameraStatistics:
     lost, rebuilt     packets, pipelines; None if no operator logged
     damaged           share of the frames whose picture shows a loss; nan if unknown
     quality           None without a rate-quality model
+    delivered         measured on the pictures; None if they were not
     """
 
     name: str
@@ -137,6 +139,7 @@ class CameraStatistics:
     rebuilt: int | None
     damaged: float
     quality: Estimate | None
+    delivered: DeliveredQuality | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +164,28 @@ class DriveStatistics:
     metric: str
     quality: float
     moving: float
+    delivered: float
+    delivered_worst: float
     notes: tuple[str, ...]
 
 
-def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> DriveStatistics:
+def statistics(
+    drive: Series,
+    models: Mapping[str, Model] | None = None,
+    delivered: Mapping[str, DeliveredQuality] | None = None,
+) -> DriveStatistics:
     """All figures of a drive.
 
-    models  by camera, if there is one
+    models     by camera, if there is one
+    delivered  by camera, quality measured on its pictures, if it was
     """
-    models = models or {}
-    cameras = {name: camera_statistics(c, drive.end, models.get(name)) for name, c in drive.cameras.items()}
+    models, delivered = models or {}, delivered or {}
+    cameras = {
+        name: camera_statistics(c, drive.end, models.get(name), delivered.get(name))
+        for name, c in drive.cameras.items()
+    }
+    seen = [camera.delivered.mean for camera in cameras.values() if camera.delivered]
+    means = np.array([value for value in seen if value is not None])
     each = list(cameras.values())
     received = [c.received for c in drive.cameras.values() if c.received]
     clock_bound = received[0].bound_ms if received else UNKNOWN  # of all: they share the vehicle's clock
@@ -199,11 +214,15 @@ def statistics(drive: Series, models: Mapping[str, Model] | None = None) -> Driv
         metric=next(iter(metrics)) if len(metrics) == 1 else "",
         quality=mean(np.array([e.mean for e in estimates])) if len(metrics) == 1 else NAN,
         moving=mean(np.array([e.moving for e in estimates])) if len(metrics) == 1 else NAN,
+        delivered=mean(means),
+        delivered_worst=float(means.min()) if means.size else NAN,
         notes=tuple(_notes(drive, cameras)),
     )
 
 
-def camera_statistics(camera: CameraSeries, end: float, model: Model | None = None) -> CameraStatistics:
+def camera_statistics(
+    camera: CameraSeries, end: float, model: Model | None = None, delivered: DeliveredQuality | None = None
+) -> CameraStatistics:
     source, received, decided = camera.received or camera.sent, camera.received, camera.decided
     begin, until = (float(source.t[0]), float(source.t[-1])) if source else (0.0, end)
     sending = [(max(a, begin), min(b, until)) for a, b in sending_spans(decided, end)]
@@ -230,6 +249,7 @@ def camera_statistics(camera: CameraSeries, end: float, model: Model | None = No
         rebuilt=int(received.rebuilt[-1]) if received else None,
         damaged=ratio(float(received.damaged[-1]), float(received.frames[-1])) if received else NAN,
         quality=estimate(camera, model, frozen_spans or ()) if model else None,
+        delivered=delivered,
     )
 
 

@@ -15,18 +15,18 @@ MEANING = (
     " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
     " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
     " Quality is estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the"
-    " time beside it."
+    " time beside it. Delivered: MSSIM, twice a second, of the picture on show against the scene at that time."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 
 
 def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     """Headings, and a row for each camera."""
-    kind = f"{drive.metric.upper()}\nestimated" if drive.metric else "quality\nestimated"
+    kind = f"{drive.metric.upper() if drive.metric else 'quality'}\nestimated"
     headings: TableRow = ("camera", "frames", "Hz", "kbit/s", "allocated", "share", "factor: time", "sizes px")
     bound = next((_bound(camera.arrival) for camera in drive.cameras.values()), "")  # of all: they share two clocks
     headings += (f"arrival, ms{bound}\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
-    headings += ("freezes", "frozen s", "longest s", "lost\ndamaged", "rebuilt", kind)
+    headings += ("freezes", "frozen s", "longest s", "lost\ndamaged", "rebuilt", f"{kind}\ndelivered")
     headings += ("of the time\nfrozen",)
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
@@ -36,6 +36,7 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
     headings = (
         "drive",
         "s",
+        "MSSIM delivered, worst camera",
         "quality estimated",
         "of the time frozen",
         "latency ms (median, p95, p99)",
@@ -67,7 +68,7 @@ def _camera(camera: CameraStatistics) -> TableRow:
         shown(max(frozen), 2) if frozen else NOTHING,
         f"{counted(camera.lost)}\n{percent(camera.damaged)}",
         counted(camera.rebuilt),
-        shown(camera.quality.mean, 3) if camera.quality else NOTHING,
+        "\n".join(shown(quality.mean if quality else None, 3) for quality in (camera.quality, camera.delivered)),
         percent(camera.frozen),
     )
 
@@ -77,6 +78,7 @@ def _drive(drive: DriveStatistics) -> TableRow:
     return (
         drive.series.label,
         shown(drive.series.end, 1),
+        NOTHING if math.isnan(drive.delivered) else f"{drive.delivered:.3f}, {drive.delivered_worst:.3f}",
         f"{shown(drive.quality, 3)} {drive.metric.upper()}" if drive.metric else NOTHING,
         percent(drive.frozen),
         _latency(arrived) + _bound(arrived),

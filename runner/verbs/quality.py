@@ -5,7 +5,7 @@ then (MSSIM of luma at the camera's full size). Frozen, late and damaged picture
 with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise it is
 the stream as sent, and what the encoder lost is not included.
 
-Writes the score of each moment to DRIVE/quality.json.
+Writes the score of each moment to DRIVE/quality.json, which `report` shows.
 
   tod-runner demo log=monday log.video=true duration_s=60
   tod-runner quality monday
@@ -24,10 +24,9 @@ from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
 if TYPE_CHECKING:
-    from runner.drive.delivered import DeliveredQuality
+    from runner.drive.quality_file import DeliveredQuality
     from runner.drive.read import Drive
 
-DOCUMENT = "quality.json"
 SIDES = ("vehicle", "operator")
 
 
@@ -43,6 +42,7 @@ def run(arguments: Arguments) -> int:
 
 def _one(path: Path) -> None:
     from runner.drive.delivered import measure
+    from runner.drive.quality_file import DOCUMENT, to_json
     from runner.drive.read import read_drive
     from runner.rate_quality.artefact import dumps
     from runner.system.files import write_whole
@@ -66,7 +66,7 @@ def _one(path: Path) -> None:
         raise UserError(str(path), "", None, rule)
     if clips and len({quality.clip for quality in found.values()}) > 1:
         _warn(f"{path}: the clips of some cameras are missing: these are compared with the stream as sent")
-    write_whole(path / DOCUMENT, dumps(_document(found)))
+    write_whole(path / DOCUMENT, dumps(to_json(found)))
     _show(path, found)
 
 
@@ -92,19 +92,6 @@ def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
     return vehicle.cameras, {name: clip for name, clip in clips.items() if clip.is_file()}
 
 
-def _document(found: Mapping[str, DeliveredQuality]) -> dict[str, Any]:
-    from dataclasses import asdict
-    from statistics import fmean
-
-    means = {name: fmean(quality.mssim) for name, quality in found.items() if quality.mssim}
-    return {
-        "metric": "mssim",
-        "mean": fmean(means.values()) if means else None,
-        "worst": min(means, key=lambda name: means[name], default=None),
-        "cameras": {name: {"mean": means.get(name), **asdict(quality)} for name, quality in found.items()},
-    }
-
-
 def _show(path: Path, found: Mapping[str, DeliveredQuality]) -> None:
     from statistics import fmean
 
@@ -117,10 +104,10 @@ def _show(path: Path, found: Mapping[str, DeliveredQuality]) -> None:
         table.add_column(heading, justify="right" if 0 < number < 5 else "left")
     for name, quality in found.items():
         scores = quality.mssim
-        figures = (f"{fmean(scores):.4f}", f"{min(scores):.4f}") if scores else ("–", "–")
+        figures = (f"{quality.mean:.4f}", f"{min(scores):.4f}") if scores else ("–", "–")
         against = "the scene" if quality.clip else "the stream as sent"
         table.add_row(name, *figures, str(len(scores)), f"{100 * quality.stale:.1f} %", against)
-    means = [fmean(quality.mssim) for quality in found.values() if quality.mssim]
+    means = [quality.mean for quality in found.values() if quality.mean is not None]
     Console().print(table)
     if means:
         print(f"mean {fmean(means):.4f}, worst camera {min(means):.4f}")

@@ -7,7 +7,8 @@ Writes DIR/index.html, one self-contained page that needs no network; each figur
 and DIR/report.json with all statistics (schemas/report.schema.json), for CI.
 
 models= is a directory with CAMERA.model.json, as `tod-runner model` writes them: quality is then estimated. Without it
-the models named by the drive's configuration are used, if they are beside conf/cameras/.
+the models named by the drive's configuration are used, if they are beside conf/cameras/. Quality that the verb quality
+has measured on the pictures of a drive is shown, too.
 
   tod-runner demo log=drive duration_s=100; tod-runner report drive output=report
   tod-runner report drives/adaptive drives/static output=compared models=models
@@ -119,6 +120,7 @@ def _measured(
     from dataclasses import replace
 
     from runner.drive.models import find_models
+    from runner.drive.quality_file import read_quality
     from runner.drive.read import read_drive
     from runner.drive.series import series
     from runner.drive.statistics import statistics
@@ -131,7 +133,7 @@ def _measured(
     for drive, label in zip(drives, labels(drives), strict=True):
         over_time = series(drive, label)
         curves, notes = find_models(over_time.config, models, [*bases, drive.path, Path.cwd()])
-        measured = statistics(over_time, curves)
+        measured = statistics(over_time, curves, read_quality(drive.path))
         found.append(replace(measured, notes=(*measured.notes, *notes)))
     progress(1.0)
     return found
