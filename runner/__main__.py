@@ -91,7 +91,7 @@ def _run(words: list[str]) -> int:
     if name not in VERBS:
         from runner.core.model import suggest
 
-        raise UserError("command line", "", name, f"unknown verb{suggest(name, VERBS)}")
+        raise UserError("command line", "", name, f"unknown verb{suggest(name, VERBS, len(VERBS))}")
     verb = VERBS[name]
     module = import_module(verb.module)
     if any(word in ("-h", "--help") for word in rest):

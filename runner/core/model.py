@@ -20,7 +20,6 @@ Value = bool | int | float | str  # type of an element's property in YAML
 
 PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
-MOST_SHOWN = 14  # known words in a message about an unknown one
 
 
 class ModelError(ValueError):
@@ -46,11 +45,14 @@ def plain(number: Fraction) -> int | float:
     return number.numerator if number.denominator == 1 else float(number)
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
-    """End of a message about an unknown word, with its separator: the closest known word, otherwise all known words."""
+def suggest(word: str, known: Iterable[str], most: int = 13) -> str:
+    """End of a message about an unknown word, with its separator: the closest known word, otherwise known words.
+
+    most  that are listed
+    """
     known = list(known)
     near = get_close_matches(word, known, 1)
-    shown = [*known[:MOST_SHOWN], "..."] if len(known) > MOST_SHOWN else known
+    shown = [*known[:most], "..."] if len(known) > most else known
     if near:
         return f", did you mean {near[0]}?"
     return f"; expected {'one of ' if len(shown) > 1 else ''}{', '.join(shown)}" if shown else ""
