@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
-# Tests start hundreds of processes; each would compile the project again where the environment forbids to keep bytecode.
+# Tests start hundreds of processes; each would compile the project again where the environment forbids keeping bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak clean

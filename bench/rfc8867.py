@@ -93,17 +93,22 @@ def figures(drive: Drive) -> Figures:
 
 
 def settling(drive: Drive) -> Figures:
-    """Time from a step of the link's rate until the total is at most a fifth below it, s: medians by direction."""
+    """Time from a step of the link's rate until the total is at most the new rate and at least TAKEN of it, s.
+
+    returns  medians by direction; inf: it never was before the next step. nan: no such step
+    """
     ahead = drive.sides["link"].began.time - drive.sides["vehicle"].began.time
     samples = [(sample.t + ahead, sample.kbps) for sample in drive.sides["link"].of(LinkSample)]
     totals = [(line.t, line.total_kbps) for line in drive.sides["vehicle"].of(DecisionMade)]
-    waits: dict[str, list[float]] = {"down": [], "up": []}
-    for (_, before), (t, now) in pairwise(samples):
-        if before == now:
-            continue
-        until = next((since for since, total in totals if since >= t and TAKEN * now <= total <= now), np.nan)
-        waits["down" if now < before else "up"].append(until - t)
-    return {name: median(found) if found else np.nan for name, found in waits.items()}
+    steps = [(t, now, now < was) for (_, was), (t, now) in pairwise(samples) if now != was]
+    ends = [*(t for t, _, _ in steps[1:]), np.inf]
+    waits: dict[bool, list[float]] = {True: [], False: []}
+    for (t, kbps, down), end in zip(steps, ends, strict=True):
+        in_force = [total for since, total in totals if since <= t][-1:]
+        after = [(t, total) for total in in_force] + [(since, total) for since, total in totals if t < since < end]
+        settled = (since for since, total in after if TAKEN * kbps <= total <= kbps)
+        waits[down].append(next(settled, np.inf) - t)
+    return {name: median(waits[down]) if waits[down] else np.nan for name, down in (("down", True), ("up", False))}
 
 
 if __name__ == "__main__":

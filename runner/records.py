@@ -479,7 +479,7 @@ _prepared = set[type[Any]]()
 
 
 def _prepare(kind: type[Any]) -> None:
-    """Make msgspec look at a type: it does so at the first use, and crashes if two threads are the first (0.22)."""
+    """Let msgspec build its description of a type: at the first use it crashes if two threads do so at once (0.22)."""
     with _preparing:
         msgspec.json.Decoder(kind)
         _prepared.add(kind)

@@ -44,7 +44,13 @@ RUNNING = {  # modules of the project and heavy packages; `validate` reads maps 
     "replay": (44, COMPOSING),
     "validate": (80, COMPOSING | {"numpy", "gi"}),
 }
-HELP = {"vehicle": {"numpy", "paho"}, "operator": {"rich", "paho"}, "demo": {"numpy"}, "map": {"numpy"}}
+HELP = {
+    "vehicle": {"numpy", "paho"},
+    "operator": {"rich", "paho"},
+    "latency": {"paho"},
+    "demo": {"numpy"},
+    "map": {"numpy"},
+}
 
 
 @pytest.mark.parametrize("verb", RUNNING)

@@ -13,7 +13,7 @@ from fractions import Fraction
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.model import Kbps, exact
-from runner.core.trust import UNDOUBTED, Trust, doubted, regained
+from runner.core.trust import UNDOUBTED, Trust, doubted, regained, thousandths
 from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue is to be drained within about this time ...
@@ -60,7 +60,7 @@ class LinkCap:
     measured  t of the last measurement
     idle      t at which nothing was to be sent, last
     alone     whether nothing else limits the total
-    trust     in the limit
+    trust     how far the limit is trusted
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
     passed    t of a change, and the kbit/s that have arrived at most since it took effect
@@ -101,7 +101,7 @@ def advanced(
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
-        return LinkCap(trust=cap.trust) if unmeasured > UNMEASURED_S else cap
+        return LinkCap(trust=Trust(places=cap.trust.places)) if unmeasured > UNMEASURED_S else cap
     cap, full = replace(cap, trust=regained(cap.trust, t, position)), limit
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
@@ -128,12 +128,8 @@ def _doubting(
     """After a cut: believe less of a limit that has been too high for some time."""
     if cap.changed != t or link.kbps is None or cap.alone or least == 1:
         return cap
-    carried = min(Fraction(1), _thousandths(BELIEVED * link.kbps / limit))
+    carried = min(Fraction(1), thousandths(BELIEVED * link.kbps / limit))
     return replace(cap, trust=doubted(cap.trust, t, carried, least, position))
-
-
-def _thousandths(share: Fraction) -> Fraction:
-    return Fraction(share.numerator * 1000 // share.denominator, 1000)
 
 
 def raised(cap: LinkCap, least: Kbps) -> LinkCap:

@@ -17,18 +17,28 @@ EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many falls within this 
 LATE_S = 2.5  # ... and at least this long after the first: a prediction that is only late is right by then
 REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
 NEAR_M = 100.0  # a place reaches this far: about as far as the shadow of a building
-REMEMBERED_S = 600.0  # a place is forgotten after this time: load and coverage of a cell change
+REMEMBERED_S = 600  # a place is forgotten, little by little, in this time: load and coverage of a cell change
+KNOWN_S = 2.0  # a position that is older is not where the vehicle is
 MOST_PLACES = 50
 METRES_PER_DEGREE = 111_195.0  # of latitude
 
 
 @dataclass(frozen=True, slots=True)
 class DoubtedPlace:
-    """Where a limit proved too high, when (t), and the share of limits that is believed there."""
+    """Where a limit proved too high, when (t), and the share of limits that was believed then.
+
+    near  whether the vehicle was near it at its last known position
+    """
 
     at: PositionReported
     t: float
     share: Fraction
+    near: bool = True
+
+    def believed(self, t: float) -> Fraction:
+        """Share of limits that is believed when the vehicle comes there again."""
+        age = Fraction(min(REMEMBERED_S, int(t - self.t)), REMEMBERED_S)
+        return thousandths(self.share + (1 - self.share) * age)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,22 +61,20 @@ UNDOUBTED = Trust()
 
 
 def regained(trust: Trust, t: float, position: PositionReported | None) -> Trust:
-    """Trust at time t: it returns while nothing speaks against the limit, and falls where it had fallen before.
-
-    While the vehicle is near such a place, the place's share returns with it.
-    """
-    share, changed = trust.share, trust.changed
-    if share < 1 and t - changed >= 1:
-        share, changed = min(Fraction(1), share + REGAINED), t
-    if position is None or not trust.places:
-        return trust if share is trust.share else replace(trust, share=share, changed=changed)
-    places = tuple(place for place in trust.places if t - place.t <= REMEMBERED_S)
-    near = [place for place in places if is_near(place.at, position)]
-    lowest = min((place.share for place in near), default=share)
-    if share is trust.share and lowest < share:
-        share, changed = lowest, t
-    places = tuple(replace(place, share=max(place.share, share)) if place in near else place for place in places)
-    return replace(trust, share=share, changed=changed, places=tuple(p for p in places if p.share < 1))
+    """Trust at time t: it returns while nothing speaks against the limit, and falls at a place where it had fallen."""
+    places, share = trust.places, trust.share
+    if position is not None and places and t - position.t <= KNOWN_S:
+        places = tuple(
+            replace(place, near=is_near(place.at, position)) for place in places if t - place.t <= REMEMBERED_S
+        )
+        known = {place.at: place.near for place in trust.places}
+        entered = [place.believed(t) for place in places if place.near and not known[place.at]]
+        share = min((share, *entered))
+    if share < trust.share:
+        return replace(trust, share=share, changed=t, places=places)
+    if share < 1 and t - trust.changed >= 1:
+        return replace(trust, share=min(Fraction(1), share + REGAINED), changed=t, places=places)
+    return trust if places is trust.places else replace(trust, places=places)
 
 
 def doubted(trust: Trust, t: float, carried: Fraction, least: Fraction, position: PositionReported | None) -> Trust:
@@ -80,10 +88,10 @@ def doubted(trust: Trust, t: float, carried: Fraction, least: Fraction, position
         doubts, carried = doubts[:-1], max(carried, doubts[-1][1])
     doubts, share = (*doubts, (t, carried)), trust.share
     if len(doubts) >= FEW and t - doubts[0][0] >= LATE_S:
-        # By the mildest: a limit that is only late is far off at first, and almost right soon after.
+        # Use the mildest of these falls: a limit that is only late is far off at first, and almost right soon after.
         share = max(least, min(share, max(part for _, part in doubts)))
     places = trust.places
-    if position is not None and share < trust.share:
+    if position is not None and t - position.t <= KNOWN_S and share < trust.share:
         places = _with(places, DoubtedPlace(position, t, share))
     return Trust(share, t, doubts, places)
 
@@ -91,15 +99,19 @@ def doubted(trust: Trust, t: float, carried: Fraction, least: Fraction, position
 def _with(places: tuple[DoubtedPlace, ...], new: DoubtedPlace) -> tuple[DoubtedPlace, ...]:
     """Places with a new one, or with its share where known ones are close: they stay where the fall began."""
     close = [place for place in places if is_near(place.at, new.at, NEAR_M / 2)]
-    if not close:
-        return (*places, new)[-MOST_PLACES:]
-    return tuple(replace(new, at=place.at) if place in close else place for place in places)
+    others = [place for place in places if place not in close]
+    return (*others, *(replace(new, at=place.at) for place in close or [new]))[-MOST_PLACES:]
 
 
 def is_near(a: PositionReported, b: PositionReported, metres: float = NEAR_M) -> bool:
-    """Whether two positions are that close, on a sphere that is flat between them."""
+    """Whether two positions are at most that far apart; the curvature between them is neglected."""
     north = abs(a.lat - b.lat) * METRES_PER_DEGREE
     if north > metres:
         return False
     degrees = (a.lon - b.lon + 180) % 360 - 180
     return hypot(north, degrees * METRES_PER_DEGREE * cos(radians(a.lat))) <= metres
+
+
+def thousandths(share: Fraction) -> Fraction:
+    """Rounded down: products of many shares would become long numbers."""
+    return Fraction(share.numerator * 1000 // share.denominator, 1000)

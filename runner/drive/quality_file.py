@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from runner.errors import UserError
 from runner.records import from_json
+from runner.schema import read_json
 
 DOCUMENT = "quality.json"
 
@@ -53,10 +53,18 @@ def read_quality(directory: Path) -> dict[str, DeliveredQuality]:
     """
     path = directory / DOCUMENT
     try:
-        document = json.loads(path.read_bytes())
-        return {name: from_json(DeliveredQuality, camera) for name, camera in document["cameras"].items()}
+        document = read_json(path.read_bytes())
+        return {name: _camera(camera) for name, camera in document["cameras"].items()}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         rule = "must be as `tod-runner quality` writes it: run it again, or delete the file"
         raise UserError(str(path), "", None, rule) from None
+
+
+def _camera(document: Mapping[str, Any]) -> DeliveredQuality:
+    """raises  ValueError"""
+    quality = from_json(DeliveredQuality, document)
+    if len(quality.t) != len(quality.mssim):
+        raise ValueError(f"{len(quality.t)} moments, {len(quality.mssim)} values")
+    return quality

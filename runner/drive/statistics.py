@@ -269,6 +269,10 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     if frozen:
         rule = "a frozen picture counts as its last frame, whatever moves meanwhile: an upper bound"
         yield f"estimated quality: {rule}; frozen {frozen} of the time"
+    unseen = [name for name, camera in cameras.items() if camera.delivered and not camera.delivered.clip]
+    if unseen:
+        names = ", ".join(unseen)
+        yield f"quality delivered: {names} compared with the stream as sent: what the encoder lost is not included"
     clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
         yield f"estimated quality: bitrates outside the measured range, the nearest one used: {clamped} of the time"

@@ -15,7 +15,8 @@ MEANING = (
     " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
     " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
     " Quality is estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the"
-    " time beside it. Delivered: MSSIM, twice a second, of the picture on show against the scene at that time."
+    " time beside it. Delivered: MSSIM of the picture on show, twice a second, against the scene at that time;"
+    " of sources that are not rendered, against the stream as sent."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 

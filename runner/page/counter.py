@@ -32,7 +32,7 @@ class CounterReading:
 
 
 def counter_reading(message: Mapping[str, Any]) -> CounterReading | None:
-    """A reading from a page's message; None if the message is none."""
+    """A reading from a page's message; None if it is not a valid one."""
     camera, times = message.get("camera"), [message.get(key) for key in ("elapsed_ms", "age_ms", "bound_ms")]
     if not isinstance(camera, str) or not all(time is None or type(time) in (int, float) for time in times):
         return None
@@ -84,7 +84,7 @@ def light_to_light(readings: Sequence[CounterReading], decoded_ms: Sequence[floa
         pictures=len(readings),
         read=len(found),
         median=median(elapsed),
-        p95=quantiles(elapsed, n=20)[-1],
+        p95=quantiles(elapsed, n=20, method="inclusive")[-1],
         stated=median(ages) if ages else None,
         bound=median(bounds) if ages and bounds else None,
         decoded=median(decoded_ms) if decoded_ms else None,

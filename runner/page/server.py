@@ -54,8 +54,8 @@ class PageServer(Listener):
 
     A listener of the station; it and `show` may be called from any thread, everything else runs in the page's own.
 
-    on_counter  called, in the page's thread, with what a page read of the counter that a camera films; None: pages may
-                not say so
+    on_counter  called, in the page's thread, with what a page read of the counter that a camera films; None: such
+                messages are refused
     raises      RunError if the port is in use or plotly is not installed
     """
 

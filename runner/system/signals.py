@@ -85,12 +85,13 @@ class _Watch:
         try:
             yield
         finally:
+            self._over = True
+            self._wake()
+            # First, since the kernel may have given it a signal: Python complains of one whose handler is gone.
+            thread.join(END_S)
             signal.set_wakeup_fd(wakeup)
             for number, handler in zip(NUMBERS, before, strict=True):
                 signal.signal(number, handler)
-            self._over = True
-            self._wake()
-            thread.join(END_S)
             if not thread.is_alive():
                 os.close(write)
                 os.close(read)

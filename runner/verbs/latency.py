@@ -2,7 +2,8 @@
 
 Measures latency from light to light: a camera of the vehicle films this machine's screen, on which one page shows a
 counter, and another page shows the camera's picture and reads the counter in it. Both pages use this machine's clock:
-no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, or with Ctrl-C.
+no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, with Ctrl-C, or
+if no counter was read for five minutes.
 
 Prints what was measured, what the operator's page states for the same pictures, from capture to drawing, what camera
 and screen add, which is the difference, and latency.fixed_ms for the vehicle's YAML.
@@ -19,26 +20,38 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle, suggest
 from runner.errors import UserError
-from runner.system.signals import Stop, stopping
+from runner.operator.station import Listener
+from runner.records import Note
+from runner.system.signals import stopping
 from runner.verbs import Arguments
-from runner.verbs.screen import SWITCH_S, say, streaming
+from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
 
 if TYPE_CHECKING:
-    from runner.operator.station import Station
+    from runner.operator.live import LiveOperator
     from runner.page.counter import CounterReading, LightToLight
     from runner.vehicle.live import LiveVehicle
 
 DURATION_S = 20.0
 SHOWN_S = 300.0  # how long the user may take to show the counter to the camera
 SAY_S = 2.0  # between two lines of progress
+LOOK_S = 0.1
 JOIN_S = 1.0
+MOST_READINGS = 20_000  # the newest ones count
+
+
+class _Notes(Listener):
+    """Shows what the operator's side notes."""
+
+    def on_note(self, note: Note) -> None:
+        say(note.text)
 
 
 def run(arguments: Arguments) -> int:
@@ -52,23 +65,30 @@ def run(arguments: Arguments) -> int:
     vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
     camera = _camera(vehicle, arguments.values.get("camera"))
     sys.setswitchinterval(SWITCH_S)
-    readings: list[CounterReading] = []
+    readings: deque[CounterReading] = deque(maxlen=MOST_READINGS)
+
+    def on_counter(reading: CounterReading) -> None:
+        if reading.camera == camera.name:
+            readings.append(reading)
+
     with ExitStack() as stack:
         if looped:
             stack.enter_context(private_broker(vehicle.control))
             stack.enter_context(_filmed(arguments, camera))
         operator = stack.enter_context(live_operator(arguments.overrides, arguments.conf))
-        page = PageServer(operator.vehicle, operator.station, on_counter=readings.append)
+        page = PageServer(operator.vehicle, operator.station, on_counter)
         stack.callback(page.stop)
         page.start()
-        operator.station.listeners.append(page)
+        operator.station.listeners += [page, _Notes()]
         if not looped:
-            say(f"show {page.url}counter on this screen, full screen, to camera {camera.name}")
-        say(f"open {page.url}#counter={camera.name} on this machine, and keep it visible")
+            say(f"show {page.url}counter on this machine's screen to camera {camera.name}")
+        say(f"open {page.url}#counter={camera.name} on this machine; a page must not be covered by another")
         operator.start(page.show)
         stop = stack.enter_context(stopping(action=operator.end))
-        decoded_ms = _collect(stop, readings, DURATION_S if duration is None else duration, operator.station, camera)
-    return _result(camera.name, readings, decoded_ms) or stop.status
+        decoded_ms = _collect(operator, camera.name, readings, DURATION_S if duration is None else duration)
+        # Before both sides end: that takes a while, and a second signal would lose the result.
+        status = _show(camera.name, list(readings), decoded_ms, looped)
+    return status or stop.status
 
 
 def _camera(vehicle: Vehicle, name: str | None) -> Camera:
@@ -86,7 +106,10 @@ def _filmed(arguments: Arguments, camera: Camera) -> Iterator[None]:
     from runner.vehicle.live import live_vehicle
 
     words = [*arguments.overrides, f"+source@cameras.{camera.name}.source=appsrc"]
-    with live_vehicle(words, arguments.conf, say=lambda line: None) as vehicle:
+    with (
+        progress_bar() as progress,
+        live_vehicle(words, arguments.conf, say=say, progress=progress) as vehicle,
+    ):
         ended = threading.Event()
         thread = threading.Thread(target=_film, args=(vehicle, camera, ended), name="counter", daemon=True)
         vehicle.start()
@@ -111,58 +134,64 @@ def _film(vehicle: LiveVehicle, camera: Camera, ended: threading.Event) -> None:
 
 
 def _collect(
-    stop: Stop, readings: Sequence[CounterReading], duration_s: float, station: Station, camera: Camera
+    operator: LiveOperator, camera: str, readings: Collection[CounterReading], duration_s: float
 ) -> list[float]:
     """Wait until the counter was read for long enough, or was not read at all.
 
-    returns  capture to decoding, ms, ten times a second
+    returns  capture to decoding, ms, of each sample since the counter was first read
+    raises   RunError if receiving has ended
     """
     decoded_ms: list[float] = []
     first: float | None = None
     began = said = time.monotonic()
-    while not stop.wait(0.1):
-        now = time.monotonic()
-        sampled = station.samples.get(camera.name)
-        if sampled and sampled.latency_ms is not None:
-            decoded_ms.append(sampled.latency_ms)
-        if first is None and any(reading.elapsed_ms is not None for reading in readings):
+    before = None
+    while operator.runs(LOOK_S):
+        now, sampled = time.monotonic(), operator.station.samples
+        if first is None and _read(readings):
             first = said = now
+        if first and sampled is not before and (received := sampled.get(camera)) and received.latency_ms is not None:
+            decoded_ms.append(received.latency_ms)
+        before = sampled
         if now - said >= SAY_S and readings:
             said = now
-            read = sum(reading.elapsed_ms is not None for reading in readings)
-            say(f"counter read in {read} of {len(readings)} pictures")
+            say(f"counter read in {_read(readings)} of {len(readings)} pictures")
         if now - began > SHOWN_S if first is None else now - first > duration_s:
             break
     return decoded_ms
 
 
-def _result(name: str, readings: Sequence[CounterReading], decoded_ms: Sequence[float]) -> int:
+def _read(readings: Collection[CounterReading]) -> int:
+    """Pictures in which the counter was found."""
+    return sum(reading.elapsed_ms is not None for reading in tuple(readings))
+
+
+def _show(name: str, readings: Sequence[CounterReading], decoded_ms: Sequence[float], looped: bool) -> int:
     """Print what was measured; returns the exit status."""
     from runner.page.counter import FEWEST, light_to_light
 
-    own = [reading for reading in readings if reading.camera == name]
-    if not own:
+    if not readings:
         say(f"no page drew a picture of {name}")
         return 1
-    found = light_to_light(own, decoded_ms)
+    found = light_to_light(readings, decoded_ms)
     if found is None:
         say(
-            f"the counter was read in fewer than {FEWEST} of {len(own)} pictures of {name}: "
+            f"the counter was read in fewer than {FEWEST} of {len(readings)} pictures of {name}: "
             "it must be sharp, upright, whole, and at least 130 px wide in the picture"
         )
         return 1
-    print("\n".join(_lines(name, found)))
+    print("\n".join(_lines(name, found, looped)), flush=True)
     return 0
 
 
-def _lines(name: str, found: LightToLight) -> Iterator[str]:
+def _lines(name: str, found: LightToLight, looped: bool) -> Iterator[str]:
     yield f"{name}: counter read in {found.read} of {found.pictures} pictures"
     yield f"  light to light      {found.median:4.0f} ms median, {found.p95:.0f} ms p95"
     if found.stated is None or found.bound is None or found.outside is None:
         yield "  capture to drawing  unknown: no clocks were compared"
         return
     yield f"  capture to drawing  {found.stated:4.0f} ± {found.bound:.0f} ms, as the page states it"
-    yield f"  camera and screen   {found.outside:4.0f} ± {found.bound:.0f} ms, the difference"
-    if found.fixed is not None:
+    between = "the difference; nothing is in between" if looped else "the difference"
+    yield f"  camera and screen   {found.outside:4.0f} ± {found.bound:.0f} ms, {between}"
+    if found.fixed is not None and not looped:
         known = f"{found.decoded:.0f} ms from capture to decoding"
-        yield f"  latency.fixed_ms={max(0, round(found.fixed))}, as the vehicle knows of {known}"
+        yield f"  latency.fixed_ms={found.fixed:.0f}, as the vehicle knows of {known}"

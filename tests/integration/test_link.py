@@ -195,11 +195,11 @@ def _narrow(client, kbps):
         passed += size
         return client._gst.PadProbeReturn.OK
 
-    def limit(_pipeline, _bin, element):
-        if element.get_factory().get_name() == "udpsrc":
+    def limit(element):
+        if element.get_factory() and element.get_factory().get_name() == "udpsrc":
             element.get_static_pad("src").add_probe(client._gst.PadProbeType.BUFFER, take)
 
-    client.pipeline.connect("deep-element-added", limit)
+    client.pipeline.connect("deep-element-added", lambda _pipeline, _bin, element: limit(element))
     return lambda: passed
 
 

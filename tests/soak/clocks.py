@@ -28,6 +28,8 @@ def soak(seed: int, scale: float) -> list[str]:
     # The operator's clock is this process's own.
     started = operator.began.time - time.time() + time.monotonic() - began
     samples = [sample for sample in operator.of(Sample) if sample.clock_bound_ms is not None]
+    if not samples:
+        return ["the clocks were never compared"]
     truth = [1000 * AHEAD_S + FAST_PPM / 1000 * (started + sample.t) for sample in samples]
     wrong = [abs(sample.clock_ahead_ms - true) for sample, true in zip(samples, truth, strict=True)]
     bounds = [sample.clock_bound_ms for sample in samples]

@@ -20,6 +20,8 @@ worker.postMessage({
   counted: new URLSearchParams(location.hash.slice(1)).get("counter"),
 });
 
+addEventListener("hashchange", () => location.reload()); // another camera is to be read
+
 function liveUrl() {
   const url = new URL(`/live?viewer=${token()}`, location.href);
   url.protocol = url.protocol.replace("http", "ws");

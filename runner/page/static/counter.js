@@ -1,6 +1,6 @@
 /**
  * A clock as a row of black and white cells, which a screen shows and a camera films, and its reading from the picture.
- * Of the milliseconds only the last 18 bits are shown: it repeats after about four minutes. Pure.
+ * Only the low 18 bits of the time in ms are shown: it repeats after about four minutes. Pure.
  */
 
 export const CYCLE_MS = 2 ** 18;

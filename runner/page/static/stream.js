@@ -258,9 +258,9 @@ export class Stream {
     const { clock, bound } = this.station;
     const drawn = now();
     const shape = await picture.decoded().catch(() => null); // it may be closed by now
-    if (!shape) return;
-    const [{ offset, stride }] = shape.planes;
-    const counter = read(shape.bytes.subarray(offset), shape.width, shape.height, stride);
+    const [{ offset, stride }] = shape?.planes ?? [{}];
+    const isLuma = ["I420", "NV12"].includes(shape?.format);
+    const counter = isLuma ? read(shape.bytes.subarray(offset), shape.width, shape.height, stride) : null;
     this.station.count({
       camera: this.name,
       elapsed_ms: counter === null ? null : elapsed(counter, drawn),
