@@ -76,14 +76,14 @@ def main() -> None:
     found: dict[str, dict[str, list[Figures]]] = {}
     for uplink in asked.uplinks:
         conditions = _conditions(uplink)
-        for name in asked.only or conditions:
-            drives = []
-            for number in range(asked.runs):
+        drives: dict[str, list[Figures]] = {name: [] for name in asked.only or conditions}
+        found[uplink.stem] = drives
+        for number in range(asked.runs):  # paired: what the machine does meanwhile meets all conditions
+            for name, done in drives.items():
                 path = asked.output / uplink.stem / f"{name}.{number}"
                 _drive(path, uplink, conditions[name], asked.seconds)
-                drives.append(figures(path))
-                print(uplink.stem, path.name, {key: round(value, 3) for key, value in drives[-1].items()}, flush=True)
-            found.setdefault(uplink.stem, {})[name] = drives
+                done.append(figures(path))
+                print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
     picture(found).savefig(asked.output / "uplinks.png", dpi=100)
     print("\n".join(table(found)))
@@ -149,7 +149,7 @@ def queue_ms(drive: Drive, name: str = "") -> Figures:
 def switches(over_time: Series) -> float:
     """Changes of the size of any picture, in a minute."""
     changes = sum(np.count_nonzero(np.diff(camera.decided.width)) for camera in over_time.cameras.values())
-    return 60 * changes / over_time.end
+    return float(60 * changes / over_time.end)
 
 
 def _link(drive: Drive) -> tuple[Floats, Floats]:
