@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
 from runner.core.model import plain
+from runner.drive.quality_file import DOCUMENT, read_quality
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import Series, series
 from runner.drive.statistics import statistics
@@ -81,7 +82,7 @@ def main() -> None:
         for number in range(asked.runs):  # paired: what the machine does meanwhile meets all conditions
             for name, done in drives.items():
                 path = asked.output / uplink.stem / f"{name}.{number}"
-                _drive(path, uplink, conditions[name], asked.seconds)
+                drive(path, [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)], asked.seconds)
                 done.append(figures(path))
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
@@ -91,51 +92,52 @@ def main() -> None:
 
 def _conditions(uplink: Path) -> dict[str, list[str]]:
     """The overrides of each run of the experiment, by name."""
-    experiment = configuration([EXPERIMENT, f"pqos.file={uplink.resolve()}"]).experiment()
+    experiment = configuration([EXPERIMENT, _trace(uplink)]).experiment()
     return {name: list(words) for name, words in experiment.runs.items()}
 
 
-def _drive(path: Path, uplink: Path, words: Sequence[str], seconds: int) -> None:
-    """Drive once, unless it was driven before; one that was cut short begins anew."""
-    done = path / "quality.json"
-    if done.exists():
+def _trace(uplink: Path) -> str:
+    return f"pqos.file={uplink.resolve()}"
+
+
+def drive(path: Path, words: Sequence[str], seconds: int) -> None:
+    """Drive once and measure the pictures, unless that was done; a drive that was cut short begins anew."""
+    if (path / DOCUMENT).exists():
         return
     shutil.rmtree(path, ignore_errors=True)
     runner = [sys.executable, "-m", "runner"]
-    own = [f"pqos.file={uplink.resolve()}", f"fps_max={FPS}", "page.serve=false", "log.video=true"]
-    one = [EXPERIMENT, "~experiment.runs", *words, *own, f"duration_s={seconds}", f"log={path}"]
-    subprocess.run([*runner, "demo", *one], check=True, stdout=subprocess.DEVNULL)
+    own = [f"fps_max={FPS}", "page.serve=false", "log.video=true", f"duration_s={seconds}", f"log={path}"]
+    subprocess.run([*runner, "demo", *words, *own], check=True, stdout=subprocess.DEVNULL)
     subprocess.run([*runner, "quality", str(path)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     shutil.rmtree(path / "video")
 
 
 def figures(path: Path) -> Figures:
     """What one drive showed."""
-    drive = read_drive(path)
-    over_time = series(drive, path.name)
+    logged = read_drive(path)
+    over_time = series(logged, path.name)
     whole = statistics(over_time)
-    link_t, link_kbps = _link(drive)
+    link_t, link_kbps = _link(logged)
     arrived = [camera.received for camera in over_time.cameras.values() if camera.received]
     times = np.concatenate([received.arrival_t for received in arrived])
     ms = np.concatenate([received.arrival_ms for received in arrived])
     usable = _at(link_t, link_kbps, times) >= USABLE_KBPS
     counts = usable & (times > SETTLED_S) & np.isfinite(ms)
-    quality = json.loads((path / "quality.json").read_text())
     means = [
-        fmean(score for t, score in zip(camera["t"], camera["mssim"], strict=True) if t > SETTLED_S)
-        for camera in quality["cameras"].values()
+        fmean(score for t, score in zip(camera.t, camera.mssim, strict=True) if t > SETTLED_S)
+        for camera in read_quality(path).values()
     ]
     return {
         "frozen": 100 * whole.frozen,
         "back_s": _back(over_time, link_t, link_kbps),
         "p50_ms": float(np.percentile(ms[counts], 50)),
         "p99_ms": float(np.percentile(ms[counts], 99)),
-        "used": 100 * _used(drive, over_time),
+        "used": 100 * _used(logged, over_time),
         "damaged": 100 * whole.damaged,
         "lost": float(whole.lost or 0),
         "mssim": fmean(means),
         "worst": min(means),
-        **queue_ms(drive, "queue_"),
+        **queue_ms(logged, "queue_"),
         "switches": switches(over_time),
     }
 

@@ -1,0 +1,67 @@
+"""What the repair of lost packets leaves to be gained: by shorter refresh waves, or by forward error correction.
+
+  python bench/repair.py OUT                     20 minutes
+  python bench/repair.py OUT --runs 1 --seconds 15
+
+Forward error correction sends more packets in place of better pictures. `fec` is a drive that loses nothing, at the
+bitrate that a fifth of redundancy would leave to the pictures: error correction that repaired everything could be no
+better. A row for each case: medians over paired runs, and their range. OUT keeps the drives; what is there is not
+driven again. Run it on an otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from uplinks import FIGURES, Figures, drive, figures, shown
+
+KBPS, REDUNDANCY = 3000, 0.2
+LOSSES = (0.01, 0.03)
+ROUND_TRIPS_MS = (30, 80)
+OWN_WAVE_S = 1.5  # of the graph
+WAVES_S = (0.5, OWN_WAVE_S, 3.0)
+COLUMNS = ("mssim", "worst", "damaged", "frozen", "lost", "p50_ms", "p99_ms")
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("output", type=Path)
+    options.add_argument("--runs", type=int, default=3)
+    options.add_argument("--seconds", type=int, default=20)
+    asked = options.parse_args()
+    cases = dict(_cases())
+    drives: dict[str, list[Figures]] = {name: [] for name in cases}
+    for number in range(asked.runs):
+        for name, done in drives.items():
+            path = asked.output / f"{name}.{number}"
+            drive(path, [*BASE, *cases[name]], asked.seconds)
+            done.append(figures(path))
+            print(path.name, {key: round(done[-1][key], 4) for key in COLUMNS}, flush=True)
+    print("| case | " + " | ".join(FIGURES[key] for key in COLUMNS) + " |")
+    print("| --- " * (len(COLUMNS) + 1) + "|")
+    for name, done in drives.items():
+        cells = (shown(key, [one[key] for one in done]) for key in COLUMNS)
+        print(f"| {name} | " + " | ".join(cells) + " |")
+
+
+BASE = ("vehicle=tum_q7", "modes=open_loop", "pqos=constant", f"pqos.kbps={KBPS}", "link=relay", "link.share=3")
+
+
+def _cases() -> list[tuple[str, tuple[str, ...]]]:
+    """Overrides by name."""
+    cases: list[tuple[str, tuple[str, ...]]] = []
+    for round_trip in ROUND_TRIPS_MS:
+        way = f"link.delay_ms={round_trip // 2}"
+        back = f"link.reverse={{kbps: 20000, queue_ms: 200, delay_ms: {round_trip // 2}}}"
+        cases.append((f"nothing lost, {round_trip} ms", (way, back)))
+        cases.append((f"fec, {round_trip} ms", (way, back, f"pqos.kbps={KBPS / (1 + REDUNDANCY):.0f}")))
+        for loss in LOSSES:
+            for wave in WAVES_S if round_trip == ROUND_TRIPS_MS[0] else (OWN_WAVE_S,):
+                words = (way, back, f"link.loss={loss}", f"graph.key_interval_s={wave}")
+                cases.append((f"{loss:.0%} lost, {round_trip} ms, waves of {wave:g} s", words))
+    return cases
+
+
+if __name__ == "__main__":
+    main()
