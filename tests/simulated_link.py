@@ -37,8 +37,8 @@ class Link:
 class Queue:
     """The queue in front of a link: when the last bit of what it has taken leaves."""
 
-    def __init__(self, link: Link) -> None:
-        self._link, self.free = link, 0.0
+    def __init__(self, link: Link, free: float) -> None:
+        self._link, self.free = link, free
 
     def put(self, t: float, size: int) -> float | None:
         """When that many bytes have left; None: dropped."""
@@ -112,16 +112,18 @@ def drive(
     seed: int = 1,
     tcp_s: tuple[float, float] | None = None,
     position: Callable[[float], PositionReported] | None = None,
+    queued_s: float = 0.0,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
     noise  share by which sizes of access units vary
     tcp_s  begin and end of a TCP flow over the same link
     position  of the vehicle over time
+    queued_s  length of the queue before the cameras begin
     """
     chance, order = random.Random(seed), itertools.count()
     begin, end = tcp_s or (seconds, seconds)
-    waiting, tcp = Queue(link), Tcp(end, 2 * link.one_way_s)
+    waiting, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
     uplink, cap, done = UplinkMemory(), LinkCap(), Drive(tcp=tcp.delivered)
     queue: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)

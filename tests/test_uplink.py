@@ -35,6 +35,15 @@ def test_a_prediction_that_is_too_high_fills_no_queue() -> None:
     assert utilisation(done, link, limit, 2, 59) >= 0.9
 
 
+@pytest.mark.parametrize("fps", [15, 30])
+def test_a_queue_that_was_full_before_the_first_picture_is_seen_by_its_losses(fps: float) -> None:
+    """As where all cameras begin with a key frame: its delay is taken for the path's."""
+    link = Link(steps((0, 2300)), queue_s=0.2)
+    done = drive(link, steps((0, 3100)), 20, fps=fps, queued_s=0.2)
+    assert done.wait_ms(0.95, since=4) <= 100
+    assert done.kbps(4, 20) >= 0.85 * 2300
+
+
 def test_a_link_that_halves_is_answered_at_once() -> None:
     done = drive(Link(steps((0, 4000), (5, 2000))), steps((0, RIGHT)), 10)
     assert done.first(5, lambda cap: cap <= 2000) <= 0.03 + 0.25

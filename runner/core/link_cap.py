@@ -109,10 +109,11 @@ def advanced(
     cap = _noted(replace(cap, measured=link.t), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
-    lossy = (link.loss or 0) > TOO_LOSSY and t - cap.changed >= LOSS_S + _rtt_s(link)
-    if (link.state is LinkState.FILLING or lossy) and link.kbps:
+    lossy = (link.loss or 0) > TOO_LOSSY
+    unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
+    if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust, position)
-    if link.state is LinkState.CLEAR:
+    if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
         return _recovered(_resumed(cap, limit), link, t, limit)
     return cap
 

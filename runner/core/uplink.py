@@ -23,6 +23,8 @@ KEPT_S = 1.0  # units are kept for this long
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is lost or late makes it look lower
 MOST_INCOMPLETE = 2.0  # times what arrived in whole units
 MOST_UNITS = 5000  # and no more of them
+FEW_UNITS, COUNTED_S = 50, 0.9  # of fewer units, or in less time, packets are not counted
+MOST_EXTRA = 5.0
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
@@ -152,6 +154,8 @@ class UplinkMemory:
     onset      when the queue was last empty; None: it is empty
     peak       kbit/s, highest rate since the onset
     rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
+    extra      packets of a unit beyond those that its size takes: headers of the stream come in packets of their own.
+               None: unknown, since packets have been lost all the time
     """
 
     paths: Mapping[str, _Path] = field(default_factory=lambda: MappingProxyType({}))
@@ -164,6 +168,7 @@ class UplinkMemory:
     onset: float | None = None
     peak: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
+    extra: float | None = None
 
 
 def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
@@ -175,7 +180,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     packets = (*_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
     if uplink.resumed != before.resumed:
         packets = ()  # what was lost in a stall says nothing about the link after it
-    uplink = replace(uplink, packets=packets)
+    uplink = _calibrated(replace(uplink, packets=packets))
     if not uplink.units:
         return uplink, None
     frame, last = _frame_interval(uplink.intervals), uplink.units[-1].arrived
@@ -252,9 +257,21 @@ def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
 
 def _incomplete(uplink: UplinkMemory) -> float:
     """By how much more has arrived in the last second than whole units: of one that misses a packet all are dropped."""
-    whole, received = sum(unit.packets for unit in uplink.units), sum(received for _, received, _ in uplink.packets)
-    lost = sum(lost for _, _, lost in uplink.packets)
-    return min(MOST_INCOMPLETE, max(1.0, received / whole)) if whole and lost else 1.0
+    received, lost = _counted(uplink.packets)
+    if uplink.extra is None or not lost:
+        return 1.0
+    whole = sum(unit.packets + uplink.extra for unit in uplink.units)
+    return min(MOST_INCOMPLETE, max(1.0, received / whole))
+
+
+def _calibrated(uplink: UplinkMemory) -> UplinkMemory:
+    """Packets of a unit, counted while none is lost."""
+    received, lost = _counted(uplink.packets)
+    counted_s = uplink.packets[-1][0] - uplink.packets[0][0] if uplink.packets else 0.0
+    if len(uplink.units) < FEW_UNITS or lost or counted_s < COUNTED_S:
+        return uplink
+    more = received - sum(unit.packets for unit in uplink.units)
+    return replace(uplink, extra=min(MOST_EXTRA, max(0.0, more / len(uplink.units))))
 
 
 def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float | None) -> LinkState:
@@ -294,8 +311,14 @@ def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     return replace(uplink, paths=paths, onset=None, queues=(), units=units)
 
 
+def _counted(packets: Iterable[tuple[float, int, int]]) -> tuple[int, int]:
+    """Packets received, and missing."""
+    entries = list(packets)
+    return sum(received for _, received, _ in entries), sum(lost for _, _, lost in entries)
+
+
 def _loss(packets: Sequence[tuple[float, int, int]]) -> float:
-    received, lost = sum(got for _, got, _ in packets), sum(gone for _, _, gone in packets)
+    received, lost = _counted(packets)
     return lost / (received + lost) if received + lost >= FEW_PACKETS else 0.0
 
 
