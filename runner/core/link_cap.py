@@ -19,7 +19,7 @@ from runner.core.uplink import LinkState
 DRAIN_MS = 400  # a queue is to be drained within about this time ...
 DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
 LOSSY = 0.03  # share of packets; with a queue that grows, from here on the queue is full
-LOSS_S = 1.0  # over which losses are measured; those before a cut say nothing about what followed
+LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they say nothing about a cut
 TOO_LOSSY = 0.1  # share of packets; random loss on the radio link stays below
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
