@@ -25,6 +25,7 @@ RESERVE = Fraction(23, 25)  # share of what the link carried up to which recover
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
 TESTED = 3  # times what arrives, up to which a cap grows
+BEGIN_S = 2.0  # what the link carried is too uncertain before; recovery is fast then, up to FAST times what arrives
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
@@ -63,6 +64,7 @@ class LinkCap:
     trust     how far the limit is trusted
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
+    began     t of the first measurement; None: there was none
     passed    t of a change, and the kbit/s that have arrived at most since it took effect
     """
 
@@ -80,6 +82,7 @@ class LinkCap:
     trust: Trust = UNDOUBTED
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
+    began: float | None = None
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
 
 
@@ -106,7 +109,7 @@ def advanced(
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
-    cap = _noted(replace(cap, measured=link.t), link, t)
+    cap = _noted(replace(cap, measured=link.t, began=t if cap.began is None else cap.began), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
     lossy = (link.loss or 0) > TOO_LOSSY
@@ -181,10 +184,13 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     full = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
-    target = link.kbps * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
+    carried = link.kbps
+    if full and t - cap.changed >= LOSS_S + _rtt_s(link):  # of pictures that miss packets the rate is uncertain
+        carried = min(carried, _in_force(cap, limit) * (1 - exact(link.loss or 0)))
+    target = carried * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
     most = min(cap.most, limit)
     if full or _is_narrow(cap, link, t, limit):
-        most = min(most, PROVEN * link.kbps)
+        most = min(most, PROVEN * carried)
     target = max(target, YIELDED * most)
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
@@ -192,7 +198,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     return replace(
         cap,
         kbps=_short(target),
-        carried=(link.kbps, limit),
+        carried=(carried, limit) if cap.began is not None and t - cap.began >= BEGIN_S else None,
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
@@ -212,6 +218,8 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
         factor = min(FAST, RESERVE * carried * limit / limit_then / cap.kbps)
         if factor < 1 + CAREFUL:
             factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
+    elif link.kbps is not None:
+        factor = max(Fraction(1), min(FAST, FAST * link.kbps / cap.kbps))
     kbps = _short(cap.kbps * factor)
     return replace(cap, kbps=None if kbps >= limit else kbps, steps=steps, changed=t)
 

@@ -21,10 +21,10 @@ BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time
 NEW_S = 1.0  # how long a new camera has to send before its own path is measured
 KEPT_S = 1.0  # units are kept for this long
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is lost or late makes it look lower
-MOST_INCOMPLETE = 2.0  # times what arrived in whole units
+MOST_INCOMPLETE = 4.0  # times what arrived in whole units
 MOST_UNITS = 5000  # and no more of them
 FEW_UNITS, COUNTED_S = 50, 0.9  # of fewer units, or in less time, packets are not counted
-MOST_EXTRA = 5.0
+EXTRA, MOST_EXTRA = 1.25, 5.0  # packets of a unit beyond those that its size takes, until they are counted, and at most
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
@@ -154,8 +154,7 @@ class UplinkMemory:
     onset      when the queue was last empty; None: it is empty
     peak       kbit/s, highest rate since the onset
     rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
-    extra      packets of a unit beyond those that its size takes: headers of the stream come in packets of their own.
-               None: unknown, since packets have been lost all the time
+    extra      packets of a unit beyond those that its size takes: headers of the stream come in packets of their own
     """
 
     paths: Mapping[str, _Path] = field(default_factory=lambda: MappingProxyType({}))
@@ -168,7 +167,7 @@ class UplinkMemory:
     onset: float | None = None
     peak: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
-    extra: float | None = None
+    extra: float = EXTRA
 
 
 def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
@@ -258,10 +257,8 @@ def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
 def _incomplete(uplink: UplinkMemory) -> float:
     """By how much more has arrived in the last second than whole units: of one that misses a packet all are dropped."""
     received, lost = _counted(uplink.packets)
-    if uplink.extra is None or not lost:
-        return 1.0
     whole = sum(unit.packets + uplink.extra for unit in uplink.units)
-    return min(MOST_INCOMPLETE, max(1.0, received / whole))
+    return min(MOST_INCOMPLETE, max(1.0, received / whole)) if lost else 1.0
 
 
 def _calibrated(uplink: UplinkMemory) -> UplinkMemory:
