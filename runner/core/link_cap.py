@@ -25,7 +25,7 @@ RESERVE = Fraction(23, 25)  # share of what the link carried up to which recover
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
 TESTED = 3  # times what arrives, up to which a cap grows
-BEGIN_S = 2.0  # what the link carried is too uncertain before; recovery is fast then, up to FAST times what arrives
+BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # before, what the link carried is too uncertain: the cap is tied to what arrives
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
@@ -219,7 +219,7 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
         if factor < 1 + CAREFUL:
             factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     elif link.kbps is not None:
-        factor = max(Fraction(1), min(FAST, FAST * link.kbps / cap.kbps))
+        factor = max(Fraction(1), min(FAST, BEGIN * link.kbps / cap.kbps))
     kbps = _short(cap.kbps * factor)
     return replace(cap, kbps=None if kbps >= limit else kbps, steps=steps, changed=t)
 

@@ -193,7 +193,8 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue))
     uplink = replace(uplink, onset=onset, queues=queues)
     kbps = _rate(uplink, last, max(RATE_S, 3 * frame))
-    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
+    certain = kbps if kbps is not None and not _counted(packets)[1] else 0.0  # of pictures that miss packets it is not
+    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, certain))
     if _is_stuck(uplink, kbps):
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
