@@ -225,6 +225,9 @@ def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
                 axes.plot([x - 0.03, x + 0.03], [median(values)] * 2, color=colours[name], linewidth=3)
         axes.set(title=title, yscale=scale, xticks=range(len(found)), xlim=(-0.5, len(found) - 0.5))
         axes.set_xticklabels([name.removesuffix("_uplink_1s").replace("_", " ") for name in found], fontsize=8)
+        if scale == "log":
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
         axes.grid(axis="y", alpha=0.3)
     handles = [Line2D([], [], color=colours[name], marker="o", label=name.replace("_", " ")) for name in names]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(names), title="prediction, or policy")
