@@ -4,8 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, UnitTimes
+from runner.drive.captures import SAME_NS, UnitTimes, matched
 from runner.drive.delivered import _nearest, _thumbnail, due
+from runner.h264.access_unit import coded_picture
 
 MS = 1_000_000
 DEADLINE = 300 * MS
@@ -47,6 +48,23 @@ def test_what_stands_was_captured_by_then_and_had_arrived(times: list[tuple[int,
     (number,) = due([at * MS], came, DEADLINE)
     fits = [n for n, u in enumerate(came) if u.captured <= at * MS + SAME_NS // 2 and u.arrived <= at * MS + DEADLINE]
     assert number == (fits[-1] if fits else -1)
+
+
+def test_a_picture_was_captured_when_one_alike_was_sent() -> None:
+    """Whatever the log says: its clock is off by more than a frame at first, and one picture was damaged."""
+    sent = {b"a": [0], b"b": [66 * MS, 6600 * MS], b"c": [133 * MS], b"e": [266 * MS]}
+    logged = [ns * MS + 85 * MS for ns in (0, 66, 133, 200)] + [266 * MS + 10 * MS]
+    assert list(matched(sent, [b"a", b"b", b"c", b"?", b"e"], logged)) == [ns * MS for ns in (0, 66, 133, 200, 266)]
+    assert list(matched({}, [b"a"], [5 * MS])) == [5 * MS]
+
+
+def test_parameter_sets_and_start_codes_do_not_tell_pictures_apart() -> None:
+    slices = b"\x41\x9a\x01", b"\x01\x9b\x02"
+    sent = b"\0\0\0\1\x67\x42\0\0\0\1\x68\xce\0\0\1" + slices[0] + b"\0\0\1" + slices[1]
+    came = b"\0\0\0\1" + slices[0] + b"\0\0\0\1" + slices[1] + b"\0"
+    assert coded_picture(sent, "h264") == coded_picture(came, "h264") != b""
+    assert coded_picture(sent.replace(b"\x9b", b"\x9c"), "h264") != coded_picture(came, "h264")
+    assert coded_picture(b"\0\0\1\x67\x42", "h264") == b""
 
 
 def test_a_coarse_copy_is_found_among_the_pictures_of_a_clip() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -69,6 +69,24 @@ def captured(known: Sequence[int], first: int, after: Iterable[int]) -> Iterator
         offset = follow(known, first + ns, offset)
         last = max(first + ns + offset, last + 1)
         yield last
+
+
+def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], logged: Sequence[int]) -> Iterator[int]:
+    """Capture times of received pictures, by those that were sent alike, ns since 1970.
+
+    The log's own times are as uncertain as the difference of the clocks, which may be more than a frame interval in
+    the first seconds. A picture that was damaged, so that none was sent alike, is as far off as the one before it.
+
+    sent      by coded picture, when such pictures were captured, increasing
+    pictures  coded pictures as received
+    logged    their capture times by the log
+    """
+    off = 0
+    for picture, ns in zip(pictures, logged, strict=True):
+        alike = sent.get(picture)
+        if alike:
+            off = min(alike, key=lambda capture: abs(capture - ns - off)) - ns
+        yield ns + off
 
 
 def follow(known: Sequence[int], ns: int, offset: int) -> int:

@@ -16,16 +16,28 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.core.model import Camera
-from runner.drive.captures import SAME_NS, SECOND_NS, ReadVideo, UnitTimes, captured, files, lies_outside, received
+from runner.drive.captures import (
+    SAME_NS,
+    SECOND_NS,
+    ReadVideo,
+    UnitTimes,
+    captured,
+    files,
+    lies_outside,
+    matched,
+    received,
+)
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
+from runner.h264.access_unit import coded_picture
 from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
 from runner.records import DecisionMade, Sample, VideoBegan
@@ -106,15 +118,24 @@ class _Videos:
         after = [unit.after_ns for unit in self.read(self.directory / line.file)]
         return dict(zip(after, captured(known, round(line.captured * SECOND_NS), after), strict=True))
 
+    def coded(self, line: VideoBegan) -> dict[int, bytes]:
+        """Digests of the pictures of a file, as they are coded, by time as above."""
+        if lies_outside(line):
+            return {}
+        units = self.read(self.directory / line.file)
+        return {u.after_ns: blake2b(coded_picture(u.data, u.codec), digest_size=16).digest() for u in units}
+
     def pictures(
-        self, lines: Sequence[VideoBegan], known: Sequence[int], size: tuple[int, int]
+        self, captures: Sequence[tuple[VideoBegan, Mapping[int, int]]], size: tuple[int, int]
     ) -> Iterator[tuple[int, Luma]]:
-        """The decoded pictures of some files, with their capture times."""
-        for line in lines:
-            captures = self.captures(line, known)
-            for after, picture in self.decode(self.directory / line.file, *size) if captures else ():
-                if after in captures:
-                    yield captures[after], picture
+        """The decoded pictures of some files, with their capture times.
+
+        captures  of each file, by time since its first access unit, ns
+        """
+        for line, times in captures:
+            for after, picture in self.decode(self.directory / line.file, *size) if times else ():
+                if after in times:
+                    yield times[after], picture
 
 
 def _camera(
@@ -127,21 +148,29 @@ def _camera(
     clip: Path | None,
 ) -> DeliveredQuality:
     times = received(operator, camera.name)
-    known = [unit.captured for unit in times]
-    arrived = dict(times)
-    units = [
-        UnitTimes(ns, arrived[ns]) for line in came for ns in videos.captures(line, known).values() if ns in arrived
-    ]
-    captures = [ns for line in sent for ns in videos.captures(line, ()).values()]
+    known, arrived = [unit.captured for unit in times], dict(times)
+    exact = [(line, videos.captures(line, ())) for line in sent]
+    alike: dict[bytes, list[int]] = {}
+    for line, captures in exact:
+        for after, coded in videos.coded(line).items():
+            alike.setdefault(coded, []).append(captures[after])
+    on_time: list[tuple[VideoBegan, Mapping[int, int]]] = []
+    units: list[UnitTimes] = []
+    for line in came:
+        logged = videos.captures(line, known)
+        own = dict(zip(logged, matched(alike, list(videos.coded(line).values()), list(logged.values())), strict=True))
+        on_time.append((line, own))
+        units += [UnitTimes(own[after], arrived[ns]) for after, ns in logged.items() if ns in arrived]
+    units.sort()
     whole = _whole(vehicle, camera)
-    moments = _moments(captures, units, _last(operator), whole)
+    moments = _moments([ns for _, found in exact for ns in found.values()], units, _last(operator), whole)
     numbers = due(moments, units, round(DEADLINE_S * SECOND_NS))
     pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
     pairs = [(moment, on_show) for moment, on_show in pairs if whole(on_show)]
-    scenes = _scenes(camera, videos, sent, [moment for moment, _ in pairs], clip)
+    scenes = _scenes(camera, videos, exact, [moment for moment, _ in pairs], clip)
     size = (camera.width, camera.height)
     meter = metric().meter(size, camera.fps)
-    for number, picture in _on_show(pairs, videos.pictures(came, known, size) if pairs else ()):
+    for number, picture in _on_show(pairs, videos.pictures(on_time, size) if pairs else ()):
         if pairs[number][0] in scenes:
             meter.add(number, scenes[pairs[number][0]], picture)
     scores = meter.close()
@@ -198,7 +227,11 @@ def _whole(vehicle: Side, camera: Camera) -> Callable[[int], bool]:
 
 
 def _scenes(
-    camera: Camera, videos: _Videos, sent: Sequence[VideoBegan], moments: Sequence[int], clip: Path | None
+    camera: Camera,
+    videos: _Videos,
+    sent: Sequence[tuple[VideoBegan, Mapping[int, int]]],
+    moments: Sequence[int],
+    clip: Path | None,
 ) -> dict[int, Luma]:
     """The scene at each moment."""
     wanted = set(moments)
@@ -206,14 +239,14 @@ def _scenes(
         return {}
     if clip is None:
         size = (camera.width, camera.height)
-        return {ns: picture for ns, picture in videos.pictures(sent, (), size) if ns in wanted}
+        return {ns: picture for ns, picture in videos.pictures(sent, size) if ns in wanted}
     crop = camera.crop or camera.full_roi
     width, height = camera.source_size
     window = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
     clipped = [_thumbnail(picture[window]) for _, picture in videos.decode(clip, width, height)]
     numbers = {
         ns: _nearest(clipped, _thumbnail(picture))
-        for ns, picture in videos.pictures(sent, (), (camera.width, camera.height))
+        for ns, picture in videos.pictures(sent, (camera.width, camera.height))
         if ns in wanted
     }
     needed = set(numbers.values())  # a whole clip would not fit into memory

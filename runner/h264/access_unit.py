@@ -70,6 +70,14 @@ def starts(data: bytes, codec: str) -> tuple[bool, int | None]:
     return (unit.key, unit.recovery) if unit else (False, None)
 
 
+def coded_picture(data: bytes, codec: str) -> bytes:
+    """The part of an access unit that codes its picture: without parameter sets, with start codes of three bytes."""
+    for header, at in _nal_units(data):
+        if (header >> 1 & 0x3F) in H265_VCL if codec == "h265" else SLICE <= (header & 0x1F) <= IDR:
+            return data[at - 1 :].replace(b"\0\0\0\1", b"\0\0\1").rstrip(b"\0")
+    return b""
+
+
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
     """As `read_unit`. Recovery points are ignored: a viewer that joins waits for the next IRAP picture."""
     for header, _ in _nal_units(data):
