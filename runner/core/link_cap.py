@@ -216,10 +216,10 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     if cap.carried:
         carried, limit_then = cap.carried
         factor = min(FAST, RESERVE * carried * limit / limit_then / cap.kbps)
-        if factor < 1 + CAREFUL:
-            factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     elif link.kbps is not None:
-        factor = max(Fraction(1), min(FAST, BEGIN * link.kbps / cap.kbps))
+        factor = min(FAST, BEGIN * link.kbps / cap.kbps)
+    if factor < 1 + CAREFUL:
+        factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = _short(cap.kbps * factor)
     return replace(cap, kbps=None if kbps >= limit else kbps, steps=steps, changed=t)
 
