@@ -64,7 +64,7 @@ class LinkCap:
     trust     how far the limit is trusted
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
-    began     t of the first measurement; None: there was none
+    began     t of the first measurement
     passed    t of a change, and the kbit/s that have arrived at most since it took effect
     """
 
@@ -82,7 +82,7 @@ class LinkCap:
     trust: Trust = UNDOUBTED
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
-    began: float | None = None
+    began: float = float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
 
 
@@ -109,7 +109,7 @@ def advanced(
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
-    cap = _noted(replace(cap, measured=link.t, began=t if cap.began is None else cap.began), link, t)
+    cap = _noted(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
     lossy = (link.loss or 0) > TOO_LOSSY
@@ -198,7 +198,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     return replace(
         cap,
         kbps=_short(target),
-        carried=(carried, limit) if cap.began is not None and t - cap.began >= BEGIN_S else None,
+        carried=(carried, limit) if t - cap.began >= BEGIN_S else None,
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,

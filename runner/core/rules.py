@@ -335,10 +335,8 @@ def cap_by_link(
         cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
         cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
     memory = {**memory, "cap_by_link": cap}
-    carried, why = (
-        believed(cap, limit, least_trust),
-        f"{float(cap.trust.share):.0%} of a prediction that proved too high",
-    )
+    carried = believed(cap, limit, least_trust)
+    why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"

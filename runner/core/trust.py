@@ -64,12 +64,9 @@ def regained(trust: Trust, t: float, position: PositionReported | None) -> Trust
     """Trust at time t: it returns while nothing speaks against the limit, and falls at a place where it had fallen."""
     places, share = trust.places, trust.share
     if position is not None and places and t - position.t <= KNOWN_S:
-        places = tuple(
-            replace(place, near=is_near(place.at, position)) for place in places if t - place.t <= REMEMBERED_S
-        )
-        known = {place.at: place.near for place in trust.places}
-        entered = [place.believed(t) for place in places if place.near and not known[place.at]]
-        share = min((share, *entered))
+        seen = [(place, is_near(place.at, position)) for place in places if t - place.t <= REMEMBERED_S]
+        places = tuple(replace(place, near=near) for place, near in seen)
+        share = min((share, *(place.believed(t) for place, near in seen if near and not place.near)))
     if share < trust.share:
         return replace(trust, share=share, changed=t, places=places)
     if share < 1 and t - trust.changed >= 1:

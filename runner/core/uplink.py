@@ -309,10 +309,9 @@ def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     return replace(uplink, paths=paths, onset=None, queues=(), units=units)
 
 
-def _counted(packets: Iterable[tuple[float, int, int]]) -> tuple[int, int]:
+def _counted(packets: Sequence[tuple[float, int, int]]) -> tuple[int, int]:
     """Packets received, and missing."""
-    entries = list(packets)
-    return sum(received for _, received, _ in entries), sum(lost for _, _, lost in entries)
+    return sum(received for _, received, _ in packets), sum(lost for _, _, lost in packets)
 
 
 def _loss(packets: Sequence[tuple[float, int, int]]) -> float:

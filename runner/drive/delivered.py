@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +43,16 @@ from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
 from runner.records import DecisionMade, Sample, VideoBegan
 
+if TYPE_CHECKING:
+    from runner.apply import Unit
+
 DEADLINE_S = 0.3  # a later picture is of no use for driving
 EVERY_S = 0.5  # between two moments that are compared
 TELL_S = 0.25  # between two reports of progress
 BLOCKS = 32  # along the shorter side of a picture
 
 DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
+FileTimes = tuple[VideoBegan, Mapping[int, int]]  # a file; by time since its first unit, when each was captured, ns
 
 
 def measure(
@@ -103,6 +108,18 @@ def due(moments: Sequence[int], units: Sequence[UnitTimes], deadline_ns: int) ->
     return found
 
 
+class _FileUnit(NamedTuple):
+    """An access unit: time since the first one of its file, when it was captured, ns; digest of its coded picture."""
+
+    after: int
+    captured: int
+    coded: bytes
+
+
+def _digest(unit: Unit) -> bytes:
+    return blake2b(coded_picture(unit.data, unit.codec), digest_size=16).digest()
+
+
 @dataclass(frozen=True, slots=True)
 class _Videos:
     """The video files of a drive."""
@@ -111,31 +128,46 @@ class _Videos:
     read: ReadVideo
     decode: DecodeVideo
 
-    def captures(self, line: VideoBegan, known: Sequence[int]) -> dict[int, int]:
-        """By time since the first access unit of a file, ns: when the unit was captured."""
-        if lies_outside(line):
-            return {}
-        after = [unit.after_ns for unit in self.read(self.directory / line.file)]
-        return dict(zip(after, captured(known, round(line.captured * SECOND_NS), after), strict=True))
+    def units(self, line: VideoBegan, known: Sequence[int]) -> list[_FileUnit]:
+        """The access units of a file.
 
-    def coded(self, line: VideoBegan) -> dict[int, bytes]:
-        """Digests of the pictures of a file, as they are coded, by time as above."""
-        if lies_outside(line):
-            return {}
-        units = self.read(self.directory / line.file)
-        return {u.after_ns: blake2b(coded_picture(u.data, u.codec), digest_size=16).digest() for u in units}
-
-    def pictures(
-        self, captures: Sequence[tuple[VideoBegan, Mapping[int, int]]], size: tuple[int, int]
-    ) -> Iterator[tuple[int, Luma]]:
-        """The decoded pictures of some files, with their capture times.
-
-        captures  of each file, by time since its first access unit, ns
+        known  as in `captured`
         """
-        for line, times in captures:
+        if lies_outside(line):
+            return []
+        found = [(unit.after_ns, _digest(unit)) for unit in self.read(self.directory / line.file)]
+        times = captured(known, round(line.captured * SECOND_NS), [after for after, _ in found])
+        return [_FileUnit(after, ns, coded) for (after, coded), ns in zip(found, times, strict=True)]
+
+    def pictures(self, timed: Sequence[FileTimes], size: tuple[int, int]) -> Iterator[tuple[int, Luma]]:
+        """The decoded pictures of some files, with their capture times."""
+        for line, times in timed:
             for after, picture in self.decode(self.directory / line.file, *size) if times else ():
                 if after in times:
                     yield times[after], picture
+
+
+def _matched(
+    videos: _Videos, sent: Sequence[VideoBegan], came: Sequence[VideoBegan], log: Sequence[UnitTimes]
+) -> tuple[list[FileTimes], list[FileTimes], list[UnitTimes]]:
+    """Files as sent and as received, with the vehicle's own times of capture, and when each received unit arrived."""
+    exact: list[FileTimes] = []
+    alike: dict[bytes, list[int]] = {}
+    for line in sent:
+        found = videos.units(line, ())
+        exact.append((line, {unit.after: unit.captured for unit in found}))
+        for unit in found:
+            alike.setdefault(unit.coded, []).append(unit.captured)
+    shown: list[FileTimes] = []
+    units: list[UnitTimes] = []
+    known, arrived = [unit.captured for unit in log], dict(log)
+    for line in came:
+        found = videos.units(line, known)
+        own = list(matched(alike, [unit.coded for unit in found], [unit.captured for unit in found]))
+        shown.append((line, {unit.after: ns for unit, ns in zip(found, own, strict=True)}))
+        pairs = zip(own, found, strict=True)
+        units += [UnitTimes(ns, arrived[unit.captured]) for ns, unit in pairs if unit.captured in arrived]
+    return exact, shown, sorted(units)
 
 
 def _camera(
@@ -147,30 +179,16 @@ def _camera(
     came: Sequence[VideoBegan],
     clip: Path | None,
 ) -> DeliveredQuality:
-    times = received(operator, camera.name)
-    known, arrived = [unit.captured for unit in times], dict(times)
-    exact = [(line, videos.captures(line, ())) for line in sent]
-    alike: dict[bytes, list[int]] = {}
-    for line, captures in exact:
-        for after, coded in videos.coded(line).items():
-            alike.setdefault(coded, []).append(captures[after])
-    on_time: list[tuple[VideoBegan, Mapping[int, int]]] = []
-    units: list[UnitTimes] = []
-    for line in came:
-        logged = videos.captures(line, known)
-        own = dict(zip(logged, matched(alike, list(videos.coded(line).values()), list(logged.values())), strict=True))
-        on_time.append((line, own))
-        units += [UnitTimes(own[after], arrived[ns]) for after, ns in logged.items() if ns in arrived]
-    units.sort()
+    exact, shown, units = _matched(videos, sent, came, received(operator, camera.name))
     whole = _whole(vehicle, camera)
-    moments = _moments([ns for _, found in exact for ns in found.values()], units, _last(operator), whole)
+    moments = _moments([ns for _, times in exact for ns in times.values()], units, _last(operator), whole)
     numbers = due(moments, units, round(DEADLINE_S * SECOND_NS))
     pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
     pairs = [(moment, on_show) for moment, on_show in pairs if whole(on_show)]
     scenes = _scenes(camera, videos, exact, [moment for moment, _ in pairs], clip)
     size = (camera.width, camera.height)
     meter = metric().meter(size, camera.fps)
-    for number, picture in _on_show(pairs, videos.pictures(on_time, size) if pairs else ()):
+    for number, picture in _on_show(pairs, videos.pictures(shown, size) if pairs else ()):
         if pairs[number][0] in scenes:
             meter.add(number, scenes[pairs[number][0]], picture)
     scores = meter.close()
@@ -229,7 +247,7 @@ def _whole(vehicle: Side, camera: Camera) -> Callable[[int], bool]:
 def _scenes(
     camera: Camera,
     videos: _Videos,
-    sent: Sequence[tuple[VideoBegan, Mapping[int, int]]],
+    sent: Sequence[FileTimes],
     moments: Sequence[int],
     clip: Path | None,
 ) -> dict[int, Luma]:

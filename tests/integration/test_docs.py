@@ -84,14 +84,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
     assert (
         run(
-            "demo",
-            *SHORT["demo"],
-            *FEWER,
-            *SMALL,
-            LOOP,
-            *ports(),
-            f"log={directory / 'kept'}",
-            "log.video=true",
+            "demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}", "log.video=true"
         ).returncode
         == 0
     )
@@ -155,15 +148,7 @@ def check_shell(lines: list[str], place: Path) -> None:
     words = ports()
     port = words[1].partition("=")[2]
     with process(
-        "demo",
-        *SHORT["demo"],
-        "duration_s=60",
-        *FEWER,
-        *SMALL,
-        LOOP,
-        *words,
-        cwd=place,
-        stdout=subprocess.DEVNULL,
+        "demo", *SHORT["demo"], "duration_s=60", *FEWER, *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL
     ):
         until(lambda: answers(int(port)), seconds=60)
         script = "\n".join(["set -e", *lines]).replace("-p 1884", f"-p {port}")
