@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from uplinks import FIGURES, Figures, drive, figures, shown
+from uplinks import FIGURES, Figures, drive, figures, row, shown
 
 KBPS, REDUNDANCY = 3000, 0.2
 LOSSES = (0.01, 0.03)
@@ -38,11 +38,10 @@ def main() -> None:
             drive(path, [*BASE, *cases[name]], asked.seconds)
             done.append(figures(path))
             print(path.name, {key: round(done[-1][key], 4) for key in COLUMNS}, flush=True)
-    print("| case | " + " | ".join(FIGURES[key] for key in COLUMNS) + " |")
-    print("| --- " * (len(COLUMNS) + 1) + "|")
+    print(row("case", *(FIGURES[key] for key in COLUMNS)))
+    print(row(*["---"] * (len(COLUMNS) + 1)))
     for name, done in drives.items():
-        cells = (shown(key, [one[key] for one in done]) for key in COLUMNS)
-        print(f"| {name} | " + " | ".join(cells) + " |")
+        print(row(name, *(shown(key, [one[key] for one in done]) for key in COLUMNS)))
 
 
 BASE = ("vehicle=tum_q7", "modes=open_loop", "pqos=constant", f"pqos.kbps={KBPS}", "link=relay", "link.share=3")

@@ -10,16 +10,13 @@ Run it on an otherwise idle machine, as root for the cases with TCP.
 from __future__ import annotations
 
 import argparse
-import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, queue_ms, shown, switches
+from uplinks import SETTLED_S, Figures, driven, queue_ms, row, shown, switches
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
@@ -52,23 +49,16 @@ def main() -> None:
     options.add_argument("--words", nargs="*", default=[], help="further overrides")
     asked = options.parse_args()
     cases = configuration([EXPERIMENT]).experiment().runs
-    print("| case | " + " | ".join(FIGURES.values()) + " |")
-    print("| --- " * (len(FIGURES) + 1) + "|", flush=True)
+    print(row("case", *FIGURES.values()))
+    print(row(*["---"] * (len(FIGURES) + 1)), flush=True)
     for name in asked.only or cases:
         paths = [asked.output / f"{name}.{number}" for number in range(asked.runs)]
         drives = [figures(_driven(path, (*cases[name], *asked.words))) for path in paths]
-        cells = (shown(key, [drive[key] for drive in drives]) for key in FIGURES)
-        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+        print(row(name, *(shown(key, [drive[key] for drive in drives]) for key in FIGURES)), flush=True)
 
 
 def _driven(path: Path, words: Sequence[str]) -> Drive:
-    """A drive, made unless it is there; one that was cut short, or had other overrides, begins anew."""
-    done, asked = path / "done", "\n".join(words)
-    if not done.exists() or done.read_text() != asked:
-        shutil.rmtree(path, ignore_errors=True)
-        one = [EXPERIMENT, "~experiment.runs", *words, "page.serve=false", f"log={path}"]
-        subprocess.run([sys.executable, "-m", "runner", "demo", *one], check=True, stdout=subprocess.DEVNULL)
-        done.write_text(asked)
+    driven(path, [EXPERIMENT, "~experiment.runs", *words])
     return read_drive(path)
 
 
@@ -103,7 +93,7 @@ def settling(drive: Drive) -> Figures:
     steps = [(t, now, now < was) for (_, was), (t, now) in pairwise(samples) if now != was]
     ends = [*(t for t, _, _ in steps[1:]), np.inf]
     waits: dict[bool, list[float]] = {True: [], False: []}
-    for (t, kbps, down), end in zip(steps, ends, strict=True):
+    for (t, kbps, down), end in zip(steps, ends, strict=False):  # no step, no end
         in_force = [total for since, total in totals if since <= t][-1:]
         after = [(t, total) for total in in_force] + [(since, total) for since, total in totals if t < since < end]
         settled = (since for since, total in after if TAKEN * kbps <= total <= kbps)

@@ -101,15 +101,28 @@ def _trace(uplink: Path) -> str:
 
 
 def drive(path: Path, words: Sequence[str], seconds: int) -> None:
-    """Drive once and measure the pictures, unless that was done; a drive that was cut short begins anew."""
-    if (path / DOCUMENT).exists():
+    """Drive and measure the pictures, unless that was done."""
+    driven(path, [*words, f"fps_max={FPS}", "log.video=true", f"duration_s={seconds}"])
+    if not (path / DOCUMENT).exists():
+        run = [sys.executable, "-m", "runner", "quality", str(path)]
+        subprocess.run(run, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        shutil.rmtree(path / "video")
+
+
+def driven(path: Path, words: Sequence[str]) -> None:
+    """Drive, unless the drive is there; one that was cut short, or had other overrides, begins anew."""
+    done, asked = path / "done", "\n".join(words)
+    if done.exists() and done.read_text() == asked:
         return
     shutil.rmtree(path, ignore_errors=True)
-    runner = [sys.executable, "-m", "runner"]
-    own = [f"fps_max={FPS}", "page.serve=false", "log.video=true", f"duration_s={seconds}", f"log={path}"]
-    subprocess.run([*runner, "demo", *words, *own], check=True, stdout=subprocess.DEVNULL)
-    subprocess.run([*runner, "quality", str(path)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    shutil.rmtree(path / "video")
+    run = [sys.executable, "-m", "runner", "demo", *words, "page.serve=false", f"log={path}"]
+    subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
+    done.write_text(asked)
+
+
+def row(*cells: str) -> str:
+    """A row of a table in Markdown."""
+    return f"| {' | '.join(cells)} |"
 
 
 def figures(path: Path) -> Figures:
@@ -203,12 +216,11 @@ def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
 
 def table(found: dict[str, dict[str, list[Figures]]]) -> Iterator[str]:
     """Markdown: a row for each uplink and condition, median and range over its runs."""
-    yield "| uplink | prediction | " + " | ".join(FIGURES.values()) + " |"
-    yield "| --- " * (len(FIGURES) + 2) + "|"
+    yield row("uplink", "prediction", *FIGURES.values())
+    yield row(*["---"] * (len(FIGURES) + 2))
     for uplink, conditions in found.items():
         for name, drives in conditions.items():
-            cells = (shown(key, [drive[key] for drive in drives]) for key in FIGURES)
-            yield f"| {uplink} | {name} | " + " | ".join(cells) + " |"
+            yield row(uplink, name, *(shown(key, [one[key] for one in drives]) for key in FIGURES))
 
 
 def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
