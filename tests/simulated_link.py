@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LinkCap, advanced, believed
+from runner.core.link_cap import UNCAPPED, advanced, believed, started
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -78,12 +78,17 @@ class Tcp:
 
 @dataclass(repr=False)
 class Drive:
-    """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived."""
+    """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived, t of losses."""
 
     caps: list[tuple[float, float, str]] = field(default_factory=list)
     waits: list[tuple[float, float]] = field(default_factory=list)
     arrived: list[tuple[float, int]] = field(default_factory=list)
+    lost: list[float] = field(default_factory=list)
     tcp: Sequence[tuple[float, int]] = ()
+
+    def passed(self, t: float, wait: float, arrived: float, size: int) -> None:
+        self.waits.append((t, wait))
+        self.arrived.append((arrived, size))
 
     def wait_ms(self, share: float, since: float = 0.0) -> float:
         waits = sorted(wait for t, wait in self.waits if t >= since)
@@ -113,6 +118,8 @@ def drive(
     tcp_s: tuple[float, float] | None = None,
     position: Callable[[float], PositionReported] | None = None,
     queued_s: float = 0.0,
+    start: Fraction = Fraction(1),
+    key_frame: float = 1,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
@@ -120,11 +127,13 @@ def drive(
     tcp_s  begin and end of a TCP flow over the same link
     position  of the vehicle over time
     queued_s  length of the queue before the cameras begin
+    start  share of the limit until the link is measured
+    key_frame  times the size of others, by which each camera begins
     """
-    chance, order = random.Random(seed), itertools.count()
+    chance, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
     waiting, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
-    uplink, cap, done = UplinkMemory(), LinkCap(), Drive(tcp=tcp.delivered)
+    done, cap = Drive(tcp=tcp.delivered), started(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
     queue: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -137,22 +146,22 @@ def drive(
     last_unit = last_report = 0.0
     on_the_way: list[ReceivedUnit] = []
     packets = lost = 0
-    in_force = limit(0.0)
+    in_force = limit(0.0) if cap.kbps is None else float(cap.kbps)
     while queue and queue[0][0] < seconds:
         t, _, kind, what = heapq.heappop(queue)
         if kind == "frame":
             at(t + 1 / fps, "frame", what)
-            size = int(in_force * 1000 / 8 / fps / cameras * chance.uniform(1 - noise, 1 + noise))
+            varied = chance.uniform(1 - noise, 1 + noise) * (key_frame if t < 1 / fps else 1)
+            size = int(in_force * 1000 / 8 / fps / cameras * varied)
             count = -(-size // 1200)
             gone = sum(chance.random() < link.loss for _ in range(count)) if link.loss else 0
             left = None if gone else waiting.put(t, size)
             if left is None:
-                lost += gone or count
-                packets += count - gone if gone else 0
+                done.lost.append(t)
+                lost, packets = lost + (gone or count), packets + (count - gone if gone else 0)
                 continue
             last_unit = max(last_unit, left + link.one_way_s + link.delay_s(t))
-            done.waits.append((t, left - t))
-            done.arrived.append((last_unit, size))
+            done.passed(t, left - t, last_unit, size)
             on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size, count))
             packets += count
         elif kind == "tcp":

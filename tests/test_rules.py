@@ -191,8 +191,36 @@ def test_nothing_is_sent_while_the_operator_is_gone(mode: Mode) -> None:
     assert drive["front_left"].reason.endswith("not sending: operator gone for 1.1 s")
     assert drive["front_left"].on and drive["front_left"].kbps == 0
     drive.accept("operator_connected", t=11.2)
-    assert {(c.knob, c.value) for c in drive.run.commands} == {("sending", True)}
+    assert {c.value for c in drive.run.commands if c.knob == "sending"} == {True}
+    assert drive.total <= sum(kbps for kbps, _ in before.values()) / 2, "until the link is measured"
+    drive.accept("bitrate_predicted", t=13.3, kbps=3000)
     assert {name: drive.sent(name) for name in drive.vehicle.cameras} == before
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_half_of_the_total_is_sent_until_the_link_of_an_operator_is_measured(mode: Mode) -> None:
+    drive = Drive("modes=safe", "pqos=live", f"mode={mode}")
+    asked = drive.total
+    drive.accept("operator_connected", t=1)
+    assert drive.total <= asked / 2
+    assert "the link is not measured yet" in drive["front_left"].reason
+    for t in (1.1, 1.3, 1.5, 1.7):
+        measured = {"state": "clear", "queue_ms": 0, "loss": 0, "rtt_ms": 40}
+        drive.accept("link_measured", t=t, kbps=float(drive.total), **measured)
+    drive.accept("bitrate_predicted", t=1.8, kbps=3000)
+    assert asked / 2 < drive.total < asked
+    for t in (1.9, 2.1, 2.3, 2.5):
+        drive.accept("link_measured", t=t, kbps=float(drive.total), **measured)
+    assert drive.total == asked
+
+
+def test_an_operator_that_measures_nothing_gets_all_after_two_seconds() -> None:
+    drive = Drive("modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000, valid_s=100)
+    drive.accept("operator_connected", t=1)
+    half, whole = totals(drive, 2.9, 3.1)
+    assert half == pytest.approx(1500, rel=0.06), "half of what the link would carry, headers included"
+    assert whole == 3000
 
 
 def test_a_second_loss_does_not_restart_the_clock() -> None:
@@ -211,6 +239,7 @@ def test_settings_survive_the_operators_absence() -> None:
     drive.accept("mode_selected", mode="single")
     drive.accept("camera_switched", camera="top_left", on=False)
     drive.accept("operator_connected", t=7)
+    drive.accept("clock_advanced", t=9.1)
     drive.accept("camera_switched", camera="top_left", on=True)
     assert drive.sent("front_left") == (545, 0.25)
     assert drive.sent("top_left") == (272, 0.375)

@@ -3,7 +3,7 @@
 Overuse cuts it at once below what the link carries, low enough to drain the queue. It recovers in factors up to the
 limit, which is the prediction or the operator's total, and never beyond: the prediction saves the probing. Where the
 link proved narrower than the limit, recovery is fast up to what it carried, in proportion to the limit of that time,
-and careful from there on.
+and careful from there on. A share of the limit is enough until the link has been measured at all.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ class LinkCap:
     trust     how far the limit is trusted
     most      kbit/s that arrived at most, lately
     faded     t at which it faded last
+    started   t at which the operator connected, for whom the cap began at a share of the limit
     began     t of the first measurement
     passed    t of a change, and the kbit/s that have arrived at most since it took effect
     """
@@ -82,6 +83,7 @@ class LinkCap:
     trust: Trust = UNDOUBTED
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
+    started: float = -float("inf")
     began: float = float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
 
@@ -104,7 +106,7 @@ def advanced(
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
-        return LinkCap(trust=Trust(places=cap.trust.places)) if unmeasured > UNMEASURED_S else cap
+        return _forgotten(cap, cap.started) if unmeasured > UNMEASURED_S else cap
     cap, full = replace(cap, trust=regained(cap.trust, t, position)), limit
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
@@ -119,6 +121,24 @@ def advanced(
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
         return _recovered(_resumed(cap, limit), link, t, limit)
     return cap
+
+
+def started(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
+    """The cap after an operator connected at `since`: a share of the limit until the link is measured.
+
+    Every camera then begins with a key frame, and nothing is known of the link: with all of the limit, a link that is
+    narrower loses packets before the first measurement.
+    """
+    if since is None or since <= cap.started or share == 1:
+        return cap
+    if link is not None:
+        return replace(cap, started=since)
+    return replace(_forgotten(cap, since), kbps=_short(limit * share), changed=since)
+
+
+def _forgotten(cap: LinkCap, started: float) -> LinkCap:
+    """A cap that knows nothing of the link but the places where limits proved too high."""
+    return LinkCap(trust=Trust(places=cap.trust.places), started=started)
 
 
 def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
@@ -210,6 +230,8 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is not tested, and so does not grow
+    if cap.before is None and t - cap.began < BEGIN_S:
+        return cap  # nor does one before the first measured rate
     if link.kbps is not None and cap.kbps > TESTED * link.kbps:
         return cap  # nor does one that standing pictures are far from using
     steps, factor = cap.steps, FAST

@@ -18,7 +18,18 @@ from runner.core import allocation, scaling
 from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
 from runner.core.events import LinkMeasured
-from runner.core.link_cap import LEAST, UNCAPPED, advanced, believed, idle, is_fresh, probing, raised
+from runner.core.link_cap import (
+    LEAST,
+    UNCAPPED,
+    LinkCap,
+    advanced,
+    believed,
+    idle,
+    is_fresh,
+    probing,
+    raised,
+    started,
+)
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
 from runner.errors import RunError
@@ -297,7 +308,11 @@ def fade_when_stale(
     return draft.noted(note, total=total), memory
 
 
-@rule(needs=["total"], gives=["total"], reads=["copies", "link", "on", "operator_lost", "position", "prediction", "t"])
+@rule(
+    needs=["total"],
+    gives=["total"],
+    reads=["copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "t"],
+)
 def cap_by_link(
     vehicle: Vehicle,
     state: State,
@@ -307,6 +322,7 @@ def cap_by_link(
     reserve_kbps: Kbps = allocation.ZERO,
     alone_after_s: Fraction | None = None,
     least_trust: Fraction = Fraction(1),
+    start: Fraction = Fraction(1),
 ) -> Step:
     """The total is at most what the uplink carries, as the operator's side measures it; see `runner.core.link_cap`.
 
@@ -315,12 +331,13 @@ def cap_by_link(
     nothing is to be sent, nothing can be measured. A prediction older than its own `valid_s`, otherwise than
     `alone_after_s`, is left aside while the link is measured: the total then follows the measurement alone. Of one
     that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time,
-    and falls again where it had fallen lately; see `runner.core.trust`.
+    and falls again where it had fallen lately; see `runner.core.trust`. From the time an operator connects until the
+    link has been measured, the total is the share `start` of the limit.
 
     Memory: the cap, `LinkCap`.
     """
     assert draft.total is not None
-    if state.link is None and "cap_by_link" not in memory:
+    if state.link is None and "cap_by_link" not in memory and (start == 1 or state.operator_since is None):
         return draft, memory  # never measured
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
@@ -332,6 +349,7 @@ def cap_by_link(
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
             cap = probing(cap, asked, limit)
+        cap = started(cap, link, state.operator_since, limit, start)
         cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
         cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
     memory = {**memory, "cap_by_link": cap}
@@ -339,8 +357,14 @@ def cap_by_link(
     why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
-        why = "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
+        why = _why_capped(cap)
     return _lowered(draft, video_kbps(cameras, carried), why), memory
+
+
+def _why_capped(cap: LinkCap) -> str:
+    if cap.changed == cap.started:
+        return "the link is not measured yet"
+    return "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
 
 
 def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:

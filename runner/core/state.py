@@ -36,6 +36,7 @@ class State:
     link              the newest measurement of the uplink; None: no operator measures it
     position          the newest one
     copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
+    operator_since    t at which the operator's side connected; None: it is not connected
     operator_lost     t at which the operator's side disconnected
     """
 
@@ -48,6 +49,7 @@ class State:
     prediction: ev.BitratePredicted | None = None
     total_set: Kbps | None = None
     collective_total: Kbps | None = None
+    operator_since: float | None = None
     operator_lost: float | None = None
     link: ev.LinkMeasured | None = None
     position: ev.PositionReported | None = None
@@ -115,9 +117,10 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 _known(vehicle, name)
             return {"copies": copies}
         case ev.OperatorConnected():
-            return {"operator_lost": None}
+            return {"operator_since": event.t, "operator_lost": None}
         case ev.OperatorDisconnected():
-            return {} if state.operator_lost is not None else {"operator_lost": event.t, "link": None}
+            gone = {"operator_since": None, "operator_lost": event.t, "link": None}
+            return gone if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
         case ev.ClockAdvanced():
