@@ -128,7 +128,7 @@ def drive(
     position  of the vehicle over time
     queued_s  length of the queue before the cameras begin
     start  share of the limit until the link is measured
-    key_frame  times the size of others, by which each camera begins
+    key_frame  size of each camera's first frame, in multiples of the others
     """
     chance, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)

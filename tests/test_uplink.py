@@ -46,14 +46,14 @@ def test_a_queue_that_was_full_before_the_first_picture_is_seen_by_its_losses(fp
 
 
 @pytest.mark.parametrize("fps", [15, 30])
-def test_a_start_at_a_share_of_a_prediction_that_is_too_high_loses_less(fps: float) -> None:
+def test_a_start_at_half_of_a_prediction_that_is_too_high_loses_less(fps: float) -> None:
     link, limit = Link(steps((0, 4000)), queue_s=0.2), steps((0, HIGH))
-    at_once, gently = (drive(link, limit, 10, fps=fps, start=share, key_frame=6) for share in (Fraction(1), HALF))
-    assert len(gently.lost) < 0.2 * len(at_once.lost)
+    whole, half = (drive(link, limit, 10, fps=fps, start=share, key_frame=6) for share in (Fraction(1), HALF))
+    assert len(half.lost) < 0.2 * len(whole.lost)
 
 
 @pytest.mark.parametrize("fps", [5, 15, 30])
-def test_a_start_at_a_share_of_a_right_prediction_is_over_within_a_second(fps: float) -> None:
+def test_a_start_at_half_of_a_right_prediction_is_over_within_a_second(fps: float) -> None:
     done = drive(Link(steps((0, 4000))), steps((0, RIGHT)), 10, fps=fps, start=HALF, key_frame=6)
     assert done.caps[0][1] == RIGHT / 2
     assert done.lowest(1 + 5 / fps, 10) == RIGHT

@@ -3,7 +3,7 @@
 Overuse cuts it at once below what the link carries, low enough to drain the queue. It recovers in factors up to the
 limit, which is the prediction or the operator's total, and never beyond: the prediction saves the probing. Where the
 link proved narrower than the limit, recovery is fast up to what it carried, in proportion to the limit of that time,
-and careful from there on. A share of the limit is enough until the link has been measured at all.
+and careful from there on. When an operator connects, the cap begins at a share of the limit.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # before, what the link carried is too unc
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
+START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
 UNMEASURED_S = 2.0  # an operator that is present and reports nothing for longer does not measure the link
 FRESH_S = 1.0  # a measurement that is older does not stand in for a prediction
 BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
@@ -50,23 +51,24 @@ SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: 
 class LinkCap:
     """Memory between measurements.
 
-    kbps      cap in force; None: nothing speaks against the limit
-    carried   kbit/s that the link carried when it was last overused, and the limit at that time
-    queue_ms  wait at the last cut
-    steps     careful increases since then
-    before    kbit/s that arrived when the link was last clear
-    stalled   t at which nothing arrived any more; None: something arrives
-    halved    how often the cap was halved since then
-    changed   t of the last change
-    measured  t of the last measurement
-    idle      t at which nothing was to be sent, last
-    alone     whether nothing else limits the total
-    trust     how far the limit is trusted
-    most      kbit/s that arrived at most, lately
-    faded     t at which it faded last
-    started   t at which the operator connected, for whom the cap began at a share of the limit
-    began     t of the first measurement
-    passed    t of a change, and the kbit/s that have arrived at most since it took effect
+    kbps        cap in force; None: nothing speaks against the limit
+    carried     kbit/s that the link carried when it was last overused, and the limit at that time
+    queue_ms    wait at the last cut
+    steps       careful increases since then
+    before      kbit/s that arrived when the link was last clear
+    stalled     t at which nothing arrived any more; None: something arrives
+    halved      how often the cap was halved since then
+    changed     t of the last change
+    measured    t of the last measurement
+    idle        t at which nothing was to be sent, last
+    alone       whether nothing else limits the total
+    trust       how far the limit is trusted
+    most        kbit/s that arrived at most, lately
+    faded       t at which it faded last
+    began       t of the first measurement
+    passed      t of a change, and the kbit/s that have arrived at most since it took effect
+    connected   t of the operator's connection for which the cap last began
+    provisional whether it began at a share of the limit, and no measurement has spoken against the limit since
     """
 
     kbps: Kbps | None = None
@@ -83,9 +85,10 @@ class LinkCap:
     trust: Trust = UNDOUBTED
     most: Kbps = Fraction(0)
     faded: float = -float("inf")
-    started: float = -float("inf")
     began: float = float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
+    connected: float = -float("inf")
+    provisional: bool = False
 
 
 UNCAPPED = LinkCap()
@@ -106,7 +109,7 @@ def advanced(
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
-        return _forgotten(cap, cap.started) if unmeasured > UNMEASURED_S else cap
+        return _reset(cap) if unmeasured > (START_S if cap.provisional else UNMEASURED_S) else cap
     cap, full = replace(cap, trust=regained(cap.trust, t, position)), limit
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
@@ -124,21 +127,22 @@ def advanced(
 
 
 def started(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
-    """The cap after an operator connected at `since`: a share of the limit until the link is measured.
+    """The cap after an operator connected at `since`: a share of the limit, unless the link is known to carry less.
 
-    Every camera then begins with a key frame, and nothing is known of the link: with all of the limit, a link that is
-    narrower loses packets before the first measurement.
+    Every camera then begins with a key frame. At the full limit, a link that is narrower would lose packets before
+    the first measurement.
     """
-    if since is None or since <= cap.started or share == 1:
+    if since is None or since <= cap.connected or share == 1:
         return cap
-    if link is not None:
-        return replace(cap, started=since)
-    return replace(_forgotten(cap, since), kbps=_short(limit * share), changed=since)
+    cap, kbps = replace(cap, connected=since), _short(limit * share)
+    if link is not None or (cap.kbps is not None and cap.kbps <= kbps):
+        return cap
+    return replace(_reset(cap), kbps=kbps, provisional=True, idle=max(cap.idle, since))
 
 
-def _forgotten(cap: LinkCap, started: float) -> LinkCap:
-    """A cap that knows nothing of the link but the places where limits proved too high."""
-    return LinkCap(trust=Trust(places=cap.trust.places), started=started)
+def _reset(cap: LinkCap) -> LinkCap:
+    """A new cap, which keeps only the places where limits proved too high."""
+    return LinkCap(trust=Trust(places=cap.trust.places), connected=cap.connected)
 
 
 def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
@@ -171,7 +175,7 @@ def probing(cap: LinkCap, asked: Kbps, limit: Kbps) -> LinkCap:
     if cap.alone:
         return cap
     kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
-    return replace(cap, alone=True, kbps=kbps, carried=(kbps, limit), steps=0)
+    return replace(cap, alone=True, kbps=kbps, carried=(_short(asked), limit), steps=0, provisional=False)
 
 
 def idle(cap: LinkCap, t: float) -> LinkCap:
@@ -223,6 +227,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
         steps=0,
         changed=t,
         most=most,
+        provisional=False,
     )
 
 
@@ -230,8 +235,10 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is not tested, and so does not grow
-    if cap.before is None and t - cap.began < BEGIN_S:
-        return cap  # nor does one before the first measured rate
+    if cap.provisional and t - cap.began >= BEGIN_S:  # standing pictures may never fill it
+        return replace(cap, kbps=None, provisional=False, changed=t)
+    if cap.provisional and cap.before is None:
+        return cap  # and it does not grow before a rate has been measured
     if link.kbps is not None and cap.kbps > TESTED * link.kbps:
         return cap  # nor does one that standing pictures are far from using
     steps, factor = cap.steps, FAST
@@ -243,7 +250,9 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
     if factor < 1 + CAREFUL:
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = _short(cap.kbps * factor)
-    return replace(cap, kbps=None if kbps >= limit else kbps, steps=steps, changed=t)
+    if kbps >= limit:
+        return replace(cap, kbps=None, provisional=False, steps=steps, changed=t)
+    return replace(cap, kbps=kbps, steps=steps, changed=t)
 
 
 def _stalled(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
@@ -252,14 +261,15 @@ def _stalled(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap
         if t - cap.idle < SILENCE_S + _rtt_s(link):
             return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
-        return replace(cap, kbps=_short(arrived * DEEPEST), stalled=t, halved=0, changed=t)
+        return replace(cap, kbps=_short(arrived * DEEPEST), stalled=t, halved=0, changed=t, provisional=False)
     return _halved(cap, t, limit)
 
 
 def _halved(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     if t - cap.changed < SILENCE_S:
         return cap
-    return replace(cap, kbps=_short(_in_force(cap, limit) / 2), halved=cap.halved + 1, changed=t)
+    kbps = _short(_in_force(cap, limit) / 2)
+    return replace(cap, kbps=kbps, halved=cap.halved + 1, changed=t, provisional=False)
 
 
 def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:

@@ -331,8 +331,8 @@ def cap_by_link(
     nothing is to be sent, nothing can be measured. A prediction older than its own `valid_s`, otherwise than
     `alone_after_s`, is left aside while the link is measured: the total then follows the measurement alone. Of one
     that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time,
-    and falls again where it had fallen lately; see `runner.core.trust`. From the time an operator connects until the
-    link has been measured, the total is the share `start` of the limit.
+    and falls again where it had fallen lately; see `runner.core.trust`. When an operator connects, the total begins
+    at the share `start` of the limit and recovers as soon as the link has been measured.
 
     Memory: the cap, `LinkCap`.
     """
@@ -362,8 +362,8 @@ def cap_by_link(
 
 
 def _why_capped(cap: LinkCap) -> str:
-    if cap.changed == cap.started:
-        return "the link is not measured yet"
+    if cap.measured < cap.connected:
+        return "the link has not been measured yet"
     return "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
 
 

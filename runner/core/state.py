@@ -117,7 +117,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 _known(vehicle, name)
             return {"copies": copies}
         case ev.OperatorConnected():
-            return {"operator_since": event.t, "operator_lost": None}
+            since = event.t if state.operator_since is None else state.operator_since
+            return {"operator_since": since, "operator_lost": None}
         case ev.OperatorDisconnected():
             gone = {"operator_since": None, "operator_lost": event.t, "link": None}
             return gone if state.operator_lost is None else {}

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
+CONTROL_FIRST_S, LOOK_S = 1.0, 0.01  # how long the streams wait for the vehicle, and how often they look for it
 END_S = 1.0  # how long the last sample may take
 
 
@@ -73,12 +74,19 @@ class LiveOperator:
         duration_s  from the moment the vehicle is online, or START_S after this call; None: until stopped
         """
         self.station.connect()
+        self._await_vehicle()
         self._side = self._build(on_unit)
         self._log.begin()
         self._duration_s = inf if duration_s is None else duration_s
         self._latest_start = time.monotonic() + START_S
         self._thread.start()
         self._reporting.start()
+
+    def _await_vehicle(self) -> None:
+        """The vehicle should know of this operator before its cameras begin to fill the link."""
+        end = time.monotonic() + CONTROL_FIRST_S
+        while not self.station.state and time.monotonic() < end and not self._stopped.wait(LOOK_S):
+            pass
 
     def runs(self, wait_s: float = 0.0) -> bool:
         """Whether it still samples after a time; returns at once if it does not.

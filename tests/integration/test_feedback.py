@@ -7,7 +7,7 @@ from statistics import median
 import pytest
 
 from rig import NOISE, SMALL_ROBOT, Operator, free_port, process, run
-from runner.core.events import LinkMeasured
+from runner.core.events import LinkMeasured, OperatorConnected
 from runner.core.uplink import LinkState
 from runner.drive.read import read_drive
 from runner.records import DecisionMade, LinkSample, ReceptionReported
@@ -45,6 +45,19 @@ def test_reports_reach_the_vehicle_and_measure_the_link(drive):
     assert LinkState.FILLING in {link.state for link in measured}
     settled = [float(link.kbps) for link in measured if link.t > SETTLED_S and link.kbps]
     assert 1000 < median(settled) < 2100  # the link carries 2000
+
+
+def test_the_vehicle_knows_its_operator_before_pictures_fill_the_link(drive):
+    """And so begins at half of what is predicted."""
+    sides = read_drive(drive).sides
+    vehicle, link = sides["vehicle"], sides["link"]
+    connected = next(vehicle.of(OperatorConnected)).t
+    ahead_s = link.began.time - vehicle.began.time
+    passed = [line.bytes for line in link.of(LinkSample) if line.t + ahead_s < connected]
+    assert max(passed, default=0) < 20_000
+    first = next(line for line in vehicle.of(DecisionMade) if line.t >= connected)
+    assert first.total_kbps <= 2000
+    assert "the link has not been measured yet" in first.cameras["front"].reason
 
 
 def test_the_total_follows_what_the_link_carries(drive):

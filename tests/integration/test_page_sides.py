@@ -152,7 +152,7 @@ def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
         all_live(page)
         shown = partial(page.locator("[data-camera=front] .form").inner_text)
         age = until(lambda: re.search(r" (\d+) ± (\d+) ms", shown()))
-        assert 0 < int(age[1]) < 500, age  # and not 3700
+        assert 0 <= int(age[1]) < 500, age  # and not 3700
         assert int(age[2]) < 100, age
         time.sleep(2.5)  # by then a clock that was not compared is warned of
         assert page.locator("#warning").is_hidden()
