@@ -14,7 +14,7 @@ from soak import reports
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LEAST, LinkCap, advanced
 from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, regained
-from runner.core.uplink import LinkState
+from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
 pytestmark = pytest.mark.slow  # simulates drives
 
@@ -57,6 +57,23 @@ def test_a_start_at_half_of_a_right_prediction_is_over_within_a_second(fps: floa
     done = drive(Link(steps((0, 4000))), steps((0, RIGHT)), 10, fps=fps, start=HALF, key_frame=6)
     assert done.caps[0][1] == RIGHT / 2
     assert done.lowest(1 + 5 / fps, 10) == RIGHT
+
+
+def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
+    """The first pictures come 220 ms late, of one camera until others show that the path is shorter."""
+    uplink, shown = UplinkMemory(), []
+    for number in range(40):
+        captured = number / 15
+        late = {"front": 0.22 if captured < 0.2 else 0.0, "rear": 0.22 if captured < 1.0 else 0.0}
+        queue = 0.0 if captured < 1.1 else 0.1
+        rear = [("rear", late["rear"])] if captured < 1.0 or captured >= 1.3 else []
+        units = tuple(
+            ReceivedUnit(name, captured, captured + 0.02 + extra + queue, 4000, 4)
+            for name, extra in (("front", late["front"]), *rear)
+        )
+        uplink, estimated = estimate(uplink, LinkReport(captured + 0.25, units, 10, 0))
+        shown.append(estimated.queue_ms if estimated else 0.0)
+    assert min(shown[19:25]) > 90
 
 
 def test_a_link_that_halves_is_answered_at_once() -> None:

@@ -36,7 +36,7 @@ BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted lim
 LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
 # To others that fill the link the cameras yield, down to a share of the most that arrived lately ...
-YIELDED = Fraction(1, 4)
+YIELDED = Fraction(1, 3)
 # ... unless a cap was held for so long, s, and less than a share of it arrives, or never more than TRIED of it: the
 # link itself is narrower.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))

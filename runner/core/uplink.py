@@ -30,7 +30,7 @@ RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, o
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
 EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
 EMPTY_S = 0.010  # a unit that waited less met no queue
-GROWN_S = 0.030  # a queue from here on may be growing
+GROWN_S = 0.020  # a queue from here on may be growing
 GROWTH_S = 0.006  # by how much a queue must grow within COMPARED_S to be growing, or shrink to be draining
 COMPARED_S = 0.08
 LONG_S = 0.060  # a queue from here on is too long unless it drains
@@ -103,7 +103,7 @@ class _Path:
     """Delay of one camera's path: the minimum of the bucket of time before and of the current one, which began then.
 
     own  whether this camera was seen with an empty queue. Until then the path is the shortest of all cameras: one that
-         starts while a queue lasts would take it for its path
+         starts while a queue lasts, or slowly, would take that for its path
     """
 
     before: float
@@ -219,10 +219,11 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
         captured[unit.camera] = unit.captured
         delay = unit.arrived - unit.captured
         known = paths.get(unit.camera) or _new_path(unit, paths.values())
-        paths[unit.camera] = known.after(unit, empty=uplink.onset is None)
+        path = paths[unit.camera] = known.after(unit, empty=uplink.onset is None)
+        shortest = path.delay if path.own else min(other.delay for other in paths.values())
         if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
-        kept.append(_Unit(unit.arrived, max(0.0, delay - paths[unit.camera].delay), unit.bytes, unit.packets))
+        kept.append(_Unit(unit.arrived, max(0.0, delay - shortest), unit.bytes, unit.packets))
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
