@@ -65,6 +65,7 @@ class Draft(NamedTuple):
     scaling  factor by camera that is on
     measured True: the total is what the link is measured to carry, whatever the age of the prediction
     capped   True: the measured link lowers the total
+    sized_for  kbit/s of all cameras for which picture sizes are chosen; None: the total
     sending  False stops all cameras, whatever their bitrate
     notes    reasons that concern all cameras
     reasons  reason by camera
@@ -76,6 +77,7 @@ class Draft(NamedTuple):
     scaling: Mapping[str, Fraction] = NOTHING
     measured: bool = False
     capped: bool = False
+    sized_for: Kbps | None = None
     sending: bool = True
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING

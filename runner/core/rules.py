@@ -219,14 +219,17 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = {}, {}
+    later = draft.sized_for / draft.total if draft.sized_for and draft.total else 1
     for name, camera in vehicle.cameras.items():
         if not state.on[name]:
             continue
         allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
-        kbps, bitrate = _whole(allocated), scaling.as_full_image(allocated, roi, full)
+        kbps, bitrate = _whole(allocated), scaling.as_full_image(allocated * later, roi, full)
         # A camera that cannot be sent shows no picture: however few its pixels, it gets the smallest factor.
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
-        seen = "" if not kbps or roi is full or roi == full else f", as {_whole(bitrate)} for the full image"
+        seen = ""
+        if kbps and (later != 1 or (roi is not full and roi != full)):
+            seen = f", as {_whole(bitrate)} for the full image" + (" after the start" if later != 1 else "")
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
     return draft.replaced(scaling=factors, reasons=reasons), memory
 
@@ -260,7 +263,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
             scaling.select_scaling(camera.rate_quality, scaling.as_full_image(kbps, roi, camera.full_roi))[0]
             for kbps in (draft.bitrate[name], bitrates[name])
         )
-        if fitted < asked:
+        if fitted < asked and draft.sized_for is None:
             factors[name] = min(own, fitted)
         reasons[name] += f", sent with {_whole(bitrates[name])} kbit/s and {plain(factors[name])}"
     return draft.replaced(bitrate=bitrates, scaling=factors, reasons=reasons), memory
@@ -358,7 +361,9 @@ def cap_by_link(
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = _why_capped(cap)
-    return _lowered(draft, video_kbps(cameras, carried), why), memory
+    lowered = _lowered(draft, video_kbps(cameras, carried), why)
+    # A new size restarts the encoder, so those of the start are chosen for the time after it.
+    return lowered.replaced(sized_for=draft.total) if cap.provisional and lowered.capped else lowered, memory
 
 
 def _why_capped(cap: LinkCap) -> str:
