@@ -35,6 +35,7 @@ FIGURES = {
     "lost": "lost",
     "frozen": "frozen %",
     "switches": "sizes/min",
+    "below": "below a floor %",
     "down": "settled down s",
     "up": "up s",
 }
@@ -78,8 +79,22 @@ def figures(drive: Drive) -> Figures:
         "lost": float(whole.lost or 0),
         "frozen": 100 * whole.frozen,
         "switches": switches(over_time),
+        "below": 100 * _below_floor(drive),
         **settling(drive),
     }
+
+
+def _below_floor(drive: Drive) -> float:
+    """Share of the time in which a camera that is on gets less than its `floor_kbps`."""
+    vehicle = drive.sides["vehicle"]
+    cameras = configuration([], base=(dict(vehicle.began.config), "config"), runnable=False).vehicle().cameras
+    decisions = [line for line in vehicle.of(DecisionMade) if line.t > SETTLED_S]
+    below = sum(
+        after.t - line.t
+        for line, after in pairwise(decisions)
+        if any(own.on and own.kbps < int(cameras[name].floor_kbps) for name, own in line.cameras.items())
+    )
+    return below / (decisions[-1].t - decisions[0].t)
 
 
 def settling(drive: Drive) -> Figures:

@@ -4,8 +4,10 @@
   python bench/uplinks.py OUT UPLINK.csv --runs 1 --seconds 30 --only right high_50
 
 Drives `experiment=wrong_prediction` over each uplink, measures each drive, and prints a table: medians over the runs,
-and their range. OUT keeps the drives, OUT/uplinks.json all figures and OUT/uplinks.png a picture of them; what is there
-is not driven again. Run it on an otherwise idle machine.
+and their range. A drive without a limited link shows first how much of their bitrate the cameras use: where that is
+little, or a busy machine drops frames, a row says nothing about the link and is marked void. OUT keeps the drives,
+OUT/uplinks.json all figures and OUT/uplinks.png a picture of them; what is there is not driven again. Run it on an
+otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -53,7 +55,9 @@ FIGURES = {
     "mssim": "MSSIM mean",
     "worst": "MSSIM worst",
     "switches": "sizes/min",
+    "dropped": "frames dropped by the cameras %",
 }
+FILLED, DROPPED = 95, 1  # %, at least and at most, else a row is void
 # Panels of the picture: their scale, and which way is better.
 PANELS = {
     "frozen": ("frozen, % of the time (less is better)", "linear"),
@@ -74,6 +78,7 @@ def main() -> None:
     options.add_argument("--seconds", type=int, default=60)
     options.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
     asked = options.parse_args()
+    print(f"of their bitrate the cameras use {(filled := _filled(asked)):.0f} %", flush=True)
     found: dict[str, dict[str, list[Figures]]] = {}
     for uplink in asked.uplinks:
         conditions = _conditions(uplink)
@@ -87,7 +92,15 @@ def main() -> None:
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
     picture(found).savefig(asked.output / "uplinks.png", dpi=100)
-    print("\n".join(table(found)))
+    print("\n".join(table(found, filled)))
+
+
+def _filled(asked: argparse.Namespace) -> float:
+    """Of the bitrate that is allocated to the cameras, the share in % that they send over a link without limits."""
+    path = asked.output / "unlimited"
+    words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(asked.uplinks[0])]
+    driven(path, [*words, f"fps_max={FPS}", f"duration_s={asked.seconds}"])
+    return 100 * statistics(series(read_drive(path), path.name)).share
 
 
 def _conditions(uplink: Path) -> dict[str, list[str]]:
@@ -152,7 +165,20 @@ def figures(path: Path) -> Figures:
         "worst": min(means),
         **queue_ms(logged, "queue_"),
         "switches": switches(over_time),
+        "dropped": _dropped(over_time),
     }
+
+
+def _dropped(over_time: Series) -> float:
+    """Frames that the cameras should have sent and did not, %: the machine was too busy."""
+    counted = []
+    for camera in over_time.cameras.values():
+        assert camera.sent
+        t, frames = camera.sent.t, camera.sent.frames
+        first = np.searchsorted(t, SETTLED_S)
+        counted.append((frames[-1] - frames[first], FPS * (t[-1] - t[first])))
+    sent, due = np.sum(np.array(counted), axis=0)
+    return float(max(0.0, 100 * (1 - sent / due)))
 
 
 def queue_ms(drive: Drive, name: str = "") -> Figures:
@@ -214,13 +240,21 @@ def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
             began = None
 
 
-def table(found: dict[str, dict[str, list[Figures]]]) -> Iterator[str]:
-    """Markdown: a row for each uplink and condition, median and range over its runs."""
+def table(found: dict[str, dict[str, list[Figures]]], filled: float) -> Iterator[str]:
+    """Markdown: a row for each uplink and condition, median and range over its runs.
+
+    filled  %, see `_filled`
+    """
     yield row("uplink", "prediction", *FIGURES.values())
     yield row(*["---"] * (len(FIGURES) + 2))
     for uplink, conditions in found.items():
         for name, drives in conditions.items():
-            yield row(uplink, name, *(shown(key, [one[key] for one in drives]) for key in FIGURES))
+            void = filled < FILLED or median(drive["dropped"] for drive in drives) > DROPPED
+            yield row(
+                uplink,
+                f"{name} (void)" if void else name,
+                *(shown(key, [one[key] for one in drives]) for key in FIGURES),
+            )
 
 
 def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:

@@ -259,6 +259,16 @@ def test_a_return_does_not_raise_a_smaller_cap() -> None:
     assert drive.total == before
 
 
+def test_a_total_that_the_link_lowers_while_mode_collective_is_entered_returns_with_the_link() -> None:
+    drive = connected()
+    measure(drive, 2, 2.5, 3, 3.5, kbps=600, queue_ms=100, state="filling")
+    before = drive.total
+    drive.accept("mode_selected", t=3.6, mode="collective")
+    assert drive.total == before, "no jump"
+    measure(drive, *(4 + i / 5 for i in range(100)), kbps=3000)
+    assert drive.total == 3000
+
+
 def test_cameras_that_have_not_begun_yet_are_no_stall() -> None:
     drive = connected()
     half = drive.total

@@ -13,7 +13,7 @@ from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LEAST, LinkCap, advanced
-from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, regained
+from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, updated
 from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
 pytestmark = pytest.mark.slow  # simulates drives
@@ -171,41 +171,54 @@ DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),)
 
 
 def test_a_place_is_forgotten_little_by_little() -> None:
-    shares = {t: regained(DOUBTED, t, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
+    shares = {t: updated(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
     assert list(map(float, shares.values())) == [0.5, 0.75, 0.9, 1, 1]
-    assert regained(DOUBTED, 601, replace(laps(0), t=601)) == Trust()
+    assert updated(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
 
 
 def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_stays() -> None:
-    trust = regained(DOUBTED, 10, laps(30))
+    trust = updated(DOUBTED, 10, HALF, laps(30))
     assert (trust.share, trust.places[0].near) == (1, False)
-    trust = regained(trust, 51, laps(51))
+    trust = updated(trust, 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
     for t in range(52, 120):
-        trust = regained(trust, t, replace(laps(50), t=t))
+        trust = updated(trust, t, HALF, replace(laps(50), t=t))
     assert trust.share == 1
-    assert regained(replace(trust, share=Fraction(4, 5)), 120, replace(laps(50), t=120)).share == Fraction(83, 100)
+    assert updated(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(83, 100)
 
 
 def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:
     """After time in which nothing was measured."""
-    trust = regained(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, laps(51))
+    trust = updated(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
 
 
+@pytest.mark.parametrize("late_s", [0.1, 0.3])
+def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_s: float) -> None:
+    """As where a prediction steps with the link, and arrives just after the cut."""
+    falls = [(8 * i + 5.0, 8 * i + 7.0) for i in range(6)]
+    link = Link(lambda t: 400 if any(a <= t < b for a, b in falls) else 4000)
+    done = drive(link, lambda t: 0.9 * link.kbps(t - late_s), 50, fps=15)
+    for _, end in falls:
+        assert done.first(end, lambda cap: cap >= 0.8 * RIGHT) <= 2.5
+
+
 def test_an_old_position_says_nothing() -> None:
-    assert regained(DOUBTED, KNOWN_S + 1, laps(0)).share == 1
+    assert updated(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
     doubts = tuple((float(t), Fraction(1, 2)) for t in (0, 2))
-    trust = doubted(Trust(doubts=doubts), 4.0, Fraction(1, 2), Fraction(1, 2), laps(0))
+    trust = updated(doubted(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
     assert (trust.share, trust.places) == (Fraction(1, 2), ())
 
 
 def test_a_place_that_is_doubted_again_is_kept_longest() -> None:
     near = DoubtedPlace(laps(0), 0.0, Fraction(1, 2))
-    far = tuple(DoubtedPlace(PositionReported(t=0, lat=50 + i, lon=11), 0.0, Fraction(1, 2)) for i in range(3))
+    far = tuple(
+        DoubtedPlace(PositionReported(t=0, lat=50 + i, lon=11), 0.0, Fraction(1, 2), near=False) for i in range(3)
+    )
     doubts = tuple((float(t), Fraction(3, 5)) for t in (96, 98))
-    trust = doubted(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5), Fraction(1, 2), laps(100))
-    assert trust.places == (*far, DoubtedPlace(laps(0), 100.0, Fraction(3, 5)))
+    trust = doubted(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5))
+    trust = updated(trust, 100.5, HALF, laps(100))
+    assert trust.places == (*far, DoubtedPlace(laps(0), 100.5, Fraction(3, 5)))
 
 
 @pytest.mark.parametrize(

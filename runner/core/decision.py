@@ -43,13 +43,15 @@ class Setting:
 class Decision:
     """What is in force: the mode, its total before the cap at demand, and a setting for each camera.
 
-    asked  kbit/s that the prediction or the operator gives, before later rules lowered it; ignored in comparisons
+    asked     kbit/s that the prediction or the operator gives, before later rules lowered it; ignored in comparisons
+    uncapped  kbit/s, the total without the limit of the measured link; ignored in comparisons
     """
 
     mode: Mode
     total: Kbps
     settings: Mapping[str, Setting]
     asked: Kbps = field(default=Fraction(0), compare=False)
+    uncapped: Kbps = field(default=Fraction(0), compare=False)
 
     def equals_with_reasons(self, other: Decision) -> bool:
         """Whether it is equal and for the same reasons."""
@@ -59,16 +61,16 @@ class Decision:
 class Draft(NamedTuple):
     """A decision in progress. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
-    total    kbit/s of all cameras
-    demand   kbit/s by camera, 0 when off
-    bitrate  exact kbit/s by camera
-    scaling  factor by camera that is on
-    measured True: the total is what the link is measured to carry, whatever the age of the prediction
-    capped   True: the measured link lowers the total
+    total      kbit/s of all cameras
+    demand     kbit/s by camera, 0 when off
+    bitrate    exact kbit/s by camera
+    scaling    factor by camera that is on
+    measured   True: the total is what the link is measured to carry, whatever the age of the prediction
+    uncapped   kbit/s, the total before the measured link lowered it; None: it does not
     sized_for  kbit/s of all cameras for which picture sizes are chosen; None: the total
-    sending  False stops all cameras, whatever their bitrate
-    notes    reasons that concern all cameras
-    reasons  reason by camera
+    sending    False stops all cameras, whatever their bitrate
+    notes      reasons that concern all cameras
+    reasons    reason by camera
     """
 
     total: Kbps | None = None
@@ -76,7 +78,7 @@ class Draft(NamedTuple):
     bitrate: Mapping[str, Kbps] = NOTHING
     scaling: Mapping[str, Fraction] = NOTHING
     measured: bool = False
-    capped: bool = False
+    uncapped: Kbps | None = None
     sized_for: Kbps | None = None
     sending: bool = True
     notes: tuple[str, ...] = ()

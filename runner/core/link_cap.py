@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import NamedTuple
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.model import Kbps, exact
-from runner.core.trust import UNDOUBTED, Trust, doubted, regained, thousandths
+from runner.core.trust import LATE_S, UNDOUBTED, Trust, doubted, relieved, thousandths, updated
 from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue is to be drained within about this time ...
@@ -47,12 +48,20 @@ FADED = Fraction(997, 1000)  # is left of that most after each second
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
 
 
+class Overuse(NamedTuple):
+    """When the link was last overused (t), and what it then carried under which limit, kbit/s."""
+
+    t: float
+    carried: Kbps
+    limit: Kbps
+
+
 @dataclass(frozen=True, slots=True)
 class LinkCap:
     """Memory between measurements.
 
     kbps        cap in force; None: nothing speaks against the limit
-    carried     kbit/s that the link carried when it was last overused, and the limit at that time
+    overuse     the last one
     queue_ms    wait at the last cut
     steps       careful increases since then
     before      kbit/s that arrived when the link was last clear
@@ -72,7 +81,7 @@ class LinkCap:
     """
 
     kbps: Kbps | None = None
-    carried: tuple[Kbps, Kbps] | None = None
+    overuse: Overuse | None = None
     queue_ms: float = 0.0
     steps: int = 0
     before: Kbps | None = None
@@ -110,7 +119,8 @@ def advanced(
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         return _reset(cap) if unmeasured > (START_S if cap.provisional else UNMEASURED_S) else cap
-    cap, full = replace(cap, trust=regained(cap.trust, t, position)), limit
+    cap, full = _adapted(cap, t, limit), limit
+    cap = replace(cap, trust=updated(cap.trust, t, least_trust, position))
     limit = believed(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _silent(cap, link, t, limit)
@@ -120,10 +130,20 @@ def advanced(
     lossy = (link.loss or 0) > TOO_LOSSY
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
-        return _doubting(_cut(cap, link, t, limit), link, t, full, least_trust, position)
+        return _doubting(_cut(cap, link, t, limit, full), link, t, full, least_trust)
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
-        return _recovered(_resumed(cap, limit), link, t, limit)
+        return _recovered(_resumed(cap, limit), link, t, limit, full)
     return cap
+
+
+def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+    """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
+    last = cap.overuse
+    if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
+        return cap
+    followed = max(limit, last.carried)
+    trust = relieved(cap.trust, last.t, followed / last.limit)
+    return replace(cap, overuse=last._replace(limit=followed), trust=trust)
 
 
 def started(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
@@ -150,14 +170,12 @@ def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
     return limit if cap.trust.share == 1 or least_trust == 1 or cap.alone else limit * cap.trust.share
 
 
-def _doubting(
-    cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction, position: PositionReported | None
-) -> LinkCap:
+def _doubting(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction) -> LinkCap:
     """After a cut: believe less of a limit that has been too high for some time."""
     if cap.changed != t or link.kbps is None or cap.alone or least == 1:
         return cap
     carried = min(Fraction(1), thousandths(BELIEVED * link.kbps / limit))
-    return replace(cap, trust=doubted(cap.trust, t, carried, least, position))
+    return replace(cap, trust=doubted(cap.trust, t, carried))
 
 
 def raised(cap: LinkCap, least: Kbps) -> LinkCap:
@@ -170,12 +188,12 @@ def is_fresh(link: LinkMeasured | None, t: float) -> bool:
     return link is not None and t - link.t <= FRESH_S
 
 
-def probing(cap: LinkCap, asked: Kbps, limit: Kbps) -> LinkCap:
+def probing(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
     """The cap when nothing but the measurement limits the total any more: it grows from what was asked for last."""
     if cap.alone:
         return cap
     kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
-    return replace(cap, alone=True, kbps=kbps, carried=(_short(asked), limit), steps=0, provisional=False)
+    return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, _short(asked), limit), steps=0, provisional=False)
 
 
 def idle(cap: LinkCap, t: float) -> LinkCap:
@@ -204,16 +222,17 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
-def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
+    """full  the limit, whether it is believed or not"""
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
-    full = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
+    lossy = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
     carried = link.kbps
-    if full and t - cap.changed >= LOSS_S + _rtt_s(link):  # of pictures that miss packets the rate is uncertain
+    if lossy and t - cap.changed >= LOSS_S + _rtt_s(link):  # of pictures that miss packets the rate is uncertain
         carried = min(carried, _in_force(cap, limit) * (1 - exact(link.loss or 0)))
-    target = carried * (DEEPEST if full else max(DEEPEST, min(SHALLOWEST, drain)))
+    target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
     most = min(cap.most, limit)
-    if full or _is_narrow(cap, link, t, limit):
+    if lossy or _is_narrow(cap, link, t, limit):
         most = min(most, PROVEN * carried)
     target = max(target, YIELDED * most)
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
@@ -222,7 +241,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     return replace(
         cap,
         kbps=_short(target),
-        carried=(carried, limit) if t - cap.began >= BEGIN_S else None,
+        overuse=Overuse(t, carried, full),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
@@ -231,7 +250,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     )
 
 
-def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is not tested, and so does not grow
@@ -241,12 +260,11 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkC
         return cap  # and it does not grow before a rate has been measured
     if link.kbps is not None and cap.kbps > TESTED * link.kbps:
         return cap  # nor does one that standing pictures are far from using
-    steps, factor = cap.steps, FAST
-    if cap.carried:
-        carried, limit_then = cap.carried
-        factor = min(FAST, RESERVE * carried * limit / limit_then / cap.kbps)
-    elif link.kbps is not None:
-        factor = min(FAST, BEGIN * link.kbps / cap.kbps)
+    steps, factor, last = cap.steps, FAST, cap.overuse
+    if cap.provisional or (last and last.t - cap.began < BEGIN_S):
+        factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
+    elif last:
+        factor = min(FAST, RESERVE * last.carried * full / last.limit / cap.kbps)
     if factor < 1 + CAREFUL:
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = _short(cap.kbps * factor)

@@ -308,7 +308,7 @@ def fade_when_stale(
     total = max(draft.total / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
-    return draft.noted(note, total=total), memory
+    return draft.noted(note, total=total, uncapped=None if draft.uncapped is None else total), memory
 
 
 @rule(
@@ -351,7 +351,7 @@ def cap_by_link(
         if alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t):
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = probing(cap, asked, limit)
+            cap = probing(cap, state.t, asked, limit)
         cap = started(cap, link, state.operator_since, limit, start)
         cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
         cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
@@ -363,7 +363,7 @@ def cap_by_link(
         why = _why_capped(cap)
     lowered = _lowered(draft, video_kbps(cameras, carried), why)
     # A new size restarts the encoder, so those of the start are chosen for the time after it.
-    return lowered.replaced(sized_for=draft.total) if cap.provisional and lowered.capped else lowered, memory
+    return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
 def _why_capped(cap: LinkCap) -> str:
@@ -378,7 +378,7 @@ def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:
     if total >= draft.total:
         return draft
     total = Fraction(int(10 * total), 10)
-    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, capped=True)
+    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, uncapped=draft.total)
 
 
 def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
@@ -432,7 +432,7 @@ def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memo
     Memory: as there; empty while nothing caps the total.
     """
     past: Mapping[str, _Hold] = memory.get("hold_while_capped", {})
-    if not draft.capped:
+    if draft.uncapped is None:
         return draft, {**memory, "hold_while_capped": {}} if past else memory
     draft, held = _held(state, draft, past, for_s)
     return draft, {**memory, "hold_while_capped": held}
@@ -479,7 +479,9 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
     settings = {name: _setting(state, draft, name) for name in vehicle.cameras}
-    return Decision(state.mode, draft.total, settings, asked), memory
+    # Without a prediction the measurement is all there is: then nothing is known of a total without it.
+    uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
+    return Decision(state.mode, draft.total, settings, asked, uncapped), memory
 
 
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:

@@ -137,14 +137,17 @@ def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
 
 
 def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
-    """Change the mode without a jump: S keeps what is sent, C keeps the total unless the operator has set one."""
+    """Change the mode without a jump: S keeps what is sent, C keeps the total unless the operator has set one.
+
+    What the measured link takes off the total now is not kept: mode C measures it again, and it returns with the link.
+    """
     if mode is state.mode:
         return {}
     match mode:
         case Mode.SINGLE:
             return {"mode": mode, "manual": {**state.manual, **keep(in_force)}}
         case Mode.COLLECTIVE:
-            total = in_force.total if state.total_set is None else state.total_set
+            total = in_force.uncapped if state.total_set is None else state.total_set
             return {"mode": mode, "collective_total": total}
         case Mode.AUTOMATIC:
             return {"mode": mode}

@@ -15,6 +15,7 @@ from runner.core.events import PositionReported
 FALL_S = 1.0  # cuts within this time answer the same fall of the link
 EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many falls within this time ...
 LATE_S = 2.5  # ... and at least this long after the first: a prediction that is only late is right by then
+CONFIRM_S = 0.5  # a limit that follows a fall of the link within this time, as a prediction does, is not doubted
 REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
 NEAR_M = 100.0  # a place reaches this far: about as far as the shadow of a building
 REMEMBERED_S = 600  # a place is forgotten, little by little, in this time: load and coverage of a cell change
@@ -60,8 +61,12 @@ class Trust:
 UNDOUBTED = Trust()
 
 
-def regained(trust: Trust, t: float, position: PositionReported | None) -> Trust:
-    """Trust at time t: it returns while nothing speaks against the limit, and falls at a place where it had fallen."""
+def updated(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
+    """Trust at time t: it falls after doubts and at a place where it had fallen, and returns with time.
+
+    least  share that is believed at least
+    """
+    trust = _confirmed(trust, t, least, position)
     places, share = trust.places, trust.share
     if position is not None and places and t - position.t <= KNOWN_S:
         seen = [(place, is_near(place.at, position)) for place in places if t - place.t <= REMEMBERED_S]
@@ -74,23 +79,38 @@ def regained(trust: Trust, t: float, position: PositionReported | None) -> Trust
     return trust if places is trust.places else replace(trust, places=places)
 
 
-def doubted(trust: Trust, t: float, carried: Fraction, least: Fraction, position: PositionReported | None) -> Trust:
-    """Trust after a cut: less, if the limit has been too high for some time.
+def doubted(trust: Trust, t: float, carried: Fraction) -> Trust:
+    """Trust after a cut.
 
     carried  share of the limit that the link carried
-    least    share that is believed at least
     """
     doubts = tuple(doubt for doubt in trust.doubts if t - doubt[0] <= EPISODE_S)
     if doubts and t - doubts[-1][0] < FALL_S:
         doubts, carried = doubts[:-1], max(carried, doubts[-1][1])
-    doubts, share = (*doubts, (t, carried)), trust.share
-    if len(doubts) >= FEW and t - doubts[0][0] >= LATE_S:
-        # Use the mildest of these falls: a limit that is only late is far off at first, and almost right soon after.
-        share = max(least, min(share, max(part for _, part in doubts)))
+    return replace(trust, changed=t, doubts=(*doubts, (t, carried)))
+
+
+def relieved(trust: Trust, t: float, ratio: Fraction) -> Trust:
+    """Trust after the limit has fallen to a ratio of what it was at the cut at time t."""
+    if not trust.doubts or trust.doubts[-1][0] != t:
+        return trust
+    carried = min(Fraction(1), thousandths(trust.doubts[-1][1] / ratio))
+    return replace(trust, doubts=(*trust.doubts[:-1], (t, carried)))
+
+
+def _confirmed(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
+    """Trust some time after a cut: less, if the limit has been too high for some time, and still is."""
+    doubts = trust.doubts
+    if len(doubts) < FEW or doubts[-1][0] - doubts[0][0] < LATE_S or trust.changed != doubts[-1][0]:
+        return trust
+    # Use the mildest of these falls: a limit that is only late is far off at first, and almost right soon after.
+    share = max(least, *(part for _, part in doubts))
+    if t - doubts[-1][0] < CONFIRM_S or share >= trust.share:
+        return trust
     places = trust.places
-    if position is not None and t - position.t <= KNOWN_S and share < trust.share:
+    if position is not None and t - position.t <= KNOWN_S:
         places = _with(places, DoubtedPlace(position, t, share))
-    return Trust(share, t, doubts, places)
+    return replace(trust, share=share, changed=t, places=places)
 
 
 def _with(places: tuple[DoubtedPlace, ...], new: DoubtedPlace) -> tuple[DoubtedPlace, ...]:
