@@ -31,7 +31,7 @@ from runner.configuration.config import configuration
 from runner.core.model import plain
 from runner.drive.quality_file import DOCUMENT, read_quality
 from runner.drive.read import Drive, read_drive
-from runner.drive.series import Series, series
+from runner.drive.series import Series, sending_spans, series
 from runner.drive.statistics import statistics
 from runner.records import LinkSample
 from runner.system.files import write_whole
@@ -40,7 +40,7 @@ EXPERIMENT = "experiment=wrong_prediction"
 FPS = 15  # eight cameras that two cores encode and decode beside the rest
 SETTLED_S = 3.0  # from then on a drive counts
 USABLE_KBPS = 500  # latency counts while the link carries at least so much
-OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # a link that carries less for longer is out
+OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # a link that carries less for longer is out, until it is usable again
 FIGURES = {
     "frozen": "frozen %",
     "back_s": "back after outage, p95 s",
@@ -78,9 +78,11 @@ def main() -> None:
     options.add_argument("--seconds", type=int, default=60)
     options.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
     asked = options.parse_args()
-    print(f"of their bitrate the cameras use {(filled := _filled(asked)):.0f} %", flush=True)
     found: dict[str, dict[str, list[Figures]]] = {}
+    filled: dict[str, float] = {}
     for uplink in asked.uplinks:
+        filled[uplink.stem] = _filled(asked.output / uplink.stem / "unlimited", uplink, asked.seconds)
+        print(f"{uplink.stem}: the cameras use {filled[uplink.stem]:.0f} % of their bitrate", flush=True)
         conditions = _conditions(uplink)
         drives: dict[str, list[Figures]] = {name: [] for name in asked.only or conditions}
         found[uplink.stem] = drives
@@ -95,11 +97,10 @@ def main() -> None:
     print("\n".join(table(found, filled)))
 
 
-def _filled(asked: argparse.Namespace) -> float:
+def _filled(path: Path, uplink: Path, seconds: int) -> float:
     """Of the bitrate that is allocated to the cameras, the share in % that they send over a link without limits."""
-    path = asked.output / "unlimited"
-    words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(asked.uplinks[0])]
-    driven(path, [*words, f"fps_max={FPS}", f"duration_s={asked.seconds}"])
+    words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(uplink)]
+    driven(path, [*words, f"fps_max={FPS}", f"duration_s={seconds}"])
     return 100 * statistics(series(read_drive(path), path.name)).share
 
 
@@ -175,8 +176,10 @@ def _dropped(over_time: Series) -> float:
     for camera in over_time.cameras.values():
         assert camera.sent
         t, frames = camera.sent.t, camera.sent.frames
-        first = np.searchsorted(t, SETTLED_S)
-        counted.append((frames[-1] - frames[first], FPS * (t[-1] - t[first])))
+        first = int(np.searchsorted(t, SETTLED_S))
+        spans = sending_spans(camera.decided, over_time.end)
+        sending_s = sum(max(0.0, min(end, t[-1]) - max(begin, t[first])) for begin, end in spans)
+        counted.append((frames[-1] - frames[first], FPS * sending_s))
     sent, due = np.sum(np.array(counted), axis=0)
     return float(max(0.0, 100 * (1 - sent / due)))
 
@@ -234,22 +237,22 @@ def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
     for now, rate in zip(t, kbps, strict=True):
         if rate < OUTAGE_KBPS:
             began = now if began is None else began
-        elif began is not None:
+        elif began is not None and rate >= USABLE_KBPS:
             if now - began >= OUTAGE_S and began > SETTLED_S:
                 yield now
             began = None
 
 
-def table(found: dict[str, dict[str, list[Figures]]], filled: float) -> Iterator[str]:
+def table(found: dict[str, dict[str, list[Figures]]], filled: dict[str, float]) -> Iterator[str]:
     """Markdown: a row for each uplink and condition, median and range over its runs.
 
-    filled  %, see `_filled`
+    filled  % by uplink, see `_filled`
     """
     yield row("uplink", "prediction", *FIGURES.values())
     yield row(*["---"] * (len(FIGURES) + 2))
     for uplink, conditions in found.items():
         for name, drives in conditions.items():
-            void = filled < FILLED or median(drive["dropped"] for drive in drives) > DROPPED
+            void = filled[uplink] < FILLED or median(drive["dropped"] for drive in drives) > DROPPED
             yield row(
                 uplink,
                 f"{name} (void)" if void else name,

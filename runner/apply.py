@@ -14,7 +14,7 @@ from runner.core.commands import Command, KnobValue
 from runner.core.model import Media, suggest
 from runner.errors import RunError
 from runner.graph import Plan, launch
-from runner.gst import TYPELIBS, GLib, Gst
+from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
 from runner.gst.outage import Gathered
@@ -106,6 +106,7 @@ class _Glib:
     """GLib's main loop in its own thread, where the RTSP server and the buses run."""
 
     def __init__(self) -> None:
+        load_types()
         self._loop = GLib.MainLoop()
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
         self._thread.start()

@@ -48,6 +48,19 @@ _load()
 
 from gi.repository import GLib, Gst  # noqa: E402
 
-__all__ = ["TYPELIBS", "GLib", "Gst"]
+__all__ = ["TYPELIBS", "GLib", "Gst", "load_types"]
 
 Gst.init(None)
+
+
+def load_types() -> None:
+    """Let PyGObject make the classes of all types, before threads use them.
+
+    It makes a class when it is first used; where two threads are the first, it makes two, and objects of one are
+    refused by the methods of the other.
+    """
+    for name in TYPELIBS:
+        module = import_module(f"gi.repository.{name}")
+        for attribute in dir(module):
+            with suppress(AttributeError):  # some are of newer libraries than the one installed
+                getattr(module, attribute)
