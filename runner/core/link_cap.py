@@ -22,6 +22,7 @@ DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a shar
 LOSSY = 0.03  # share of packets; with a queue that grows, from here on the queue is full
 LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they say nothing about a cut
 TOO_LOSSY = 0.1  # share of packets; random loss on the radio link stays below
+LOSING_S = 0.3  # a share of losses that has only fallen for longer is of packets before: none are lost any more
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
@@ -42,7 +43,7 @@ YIELDED = Fraction(1, 3)
 # link itself is narrower.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
-SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change
+SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change of cap or limit
 PROVEN = 2  # times what it then carries, as the most that arrived
 FADED = Fraction(997, 1000)  # is left of that most after each second
 SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
@@ -78,6 +79,10 @@ class LinkCap:
     passed      t of a change, and the kbit/s that have arrived at most since it took effect
     connected   t of the operator's connection for which the cap last began
     provisional whether it began at a share of the limit, and no measurement has spoken against the limit since
+    loss        share of packets lost, at the last measurement
+    losing      t at which it rose last
+    limit       the last one, believed or not
+    rose        t at which it rose last, and from which limit
     """
 
     kbps: Kbps | None = None
@@ -98,6 +103,10 @@ class LinkCap:
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
     connected: float = -float("inf")
     provisional: bool = False
+    loss: float = 0.0
+    losing: float = -float("inf")
+    limit: Kbps = Fraction(0)
+    rose: tuple[float, Kbps] = (-float("inf"), Fraction(0))
 
 
 UNCAPPED = LinkCap()
@@ -127,7 +136,7 @@ def advanced(
     cap = _noted(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
-    lossy = (link.loss or 0) > TOO_LOSSY
+    lossy = cap.loss > TOO_LOSSY and t - cap.losing <= LOSING_S
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         return _doubting(_cut(cap, link, t, limit, full), link, t, full, least_trust)
@@ -138,7 +147,7 @@ def advanced(
 
 def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
-    last = cap.overuse
+    cap, last = replace(cap, limit=limit, rose=(t, cap.limit) if limit > cap.limit else cap.rose), cap.overuse
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
@@ -202,7 +211,7 @@ def idle(cap: LinkCap, t: float) -> LinkCap:
 
 
 def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The most that arrived lately, and since the last change took effect."""
+    """The most that arrived lately, and since the last change took effect; whether packets are being lost."""
     if t - cap.faded >= 1:
         cap = replace(cap, most=_short(cap.most * FADED), faded=t)
     kbps = link.kbps or Fraction(0)
@@ -210,7 +219,9 @@ def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     passed = passed if since == cap.changed else Fraction(0)
     if t - cap.changed >= SEEN_S + _rtt_s(link):
         passed = max(passed, kbps)
-    return replace(cap, most=max(cap.most, kbps), passed=(cap.changed, passed))
+    loss = link.loss or 0.0
+    losing = t if loss > cap.loss else cap.losing
+    return replace(cap, most=max(cap.most, kbps), passed=(cap.changed, passed), loss=loss, losing=losing)
 
 
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -241,7 +252,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     return replace(
         cap,
         kbps=_short(target),
-        overuse=Overuse(t, carried, full),
+        overuse=Overuse(t, carried, cap.rose[1] if t - cap.rose[0] < SEEN_S + _rtt_s(link) else full),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
