@@ -193,9 +193,9 @@ def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:
     assert trust.share == Fraction(542, 1000)
 
 
-@pytest.mark.parametrize("late_s", [0.1, 0.3])
+@pytest.mark.parametrize("late_s", [0.0, 0.1, 0.3])
 def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_s: float) -> None:
-    """As where a prediction steps with the link, and arrives just after the cut."""
+    """As where a prediction steps with the link, and arrives with the measurement of the step or just after the cut."""
     falls = [(8 * i + 5.0, 8 * i + 7.0) for i in range(6)]
     link = Link(lambda t: 400 if any(a <= t < b for a, b in falls) else 4000)
     done = drive(link, lambda t: 0.9 * link.kbps(t - late_s), 50, fps=15)

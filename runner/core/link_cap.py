@@ -147,7 +147,8 @@ def advanced(
 
 def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
-    cap, last = replace(cap, limit=limit, rose=(t, cap.limit) if limit > cap.limit else cap.rose), cap.overuse
+    rose = (t, cap.limit) if limit > cap.limit > 0 else cap.rose
+    cap, last = replace(cap, limit=limit, rose=rose), cap.overuse
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
