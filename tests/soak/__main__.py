@@ -1,7 +1,7 @@
 """Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
 new sizes, garbage, reports of any kind, clocks that drift apart.
 
-    make soak                           everything, at most 45 minutes on two cores
+    make soak                           everything, about an hour on two cores
     SOAK=0.1 make soak                  a tenth of it
     SOAK_SEED=7 make soak               the same random choices again; the seed is printed
     make soak PARTS="stalls hostile"    some parts only
