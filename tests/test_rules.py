@@ -269,6 +269,15 @@ def test_a_total_that_the_link_lowers_while_mode_collective_is_entered_returns_w
     assert drive.total == 3000
 
 
+def test_the_first_cut_is_not_deep_since_not_all_cameras_may_have_begun() -> None:
+    drive = connected()
+    half = drive.total
+    measure(drive, 1.3, kbps=100, queue_ms=30, state="filling")
+    assert drive.total == pytest.approx(0.6 * half, rel=0.06)
+    measure(drive, 1.5, kbps=200, queue_ms=40, state="filling")
+    assert drive.total < 0.3 * half
+
+
 def test_cameras_that_have_not_begun_yet_are_no_stall() -> None:
     drive = connected()
     half = drive.total

@@ -247,6 +247,8 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     if lossy or _is_narrow(cap, link, t, limit):
         most = min(most, PROVEN * carried)
     target = max(target, YIELDED * most)
+    if cap.provisional:  # not all cameras may have begun: that little arrives says little
+        target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return cap
