@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, driven, queue_ms, row, shown, switches
+from uplinks import SETTLED_S, Figures, cameras, driven, queue_ms, row, shown, switches
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
@@ -86,13 +86,12 @@ def figures(drive: Drive) -> Figures:
 
 def _below_floor(drive: Drive) -> float:
     """Share of the time in which a camera that is on gets less than its `floor_kbps`."""
-    vehicle = drive.sides["vehicle"]
-    cameras = configuration([], base=(dict(vehicle.began.config), "config"), runnable=False).vehicle().cameras
-    decisions = [line for line in vehicle.of(DecisionMade) if line.t > SETTLED_S]
+    floors = {name: int(camera.floor_kbps) for name, camera in cameras(drive).items()}
+    decisions = [line for line in drive.sides["vehicle"].of(DecisionMade) if line.t > SETTLED_S]
     below = sum(
         after.t - line.t
         for line, after in pairwise(decisions)
-        if any(own.on and own.kbps < int(cameras[name].floor_kbps) for name, own in line.cameras.items())
+        if any(own.on and own.kbps < floors[name] for name, own in line.cameras.items())
     )
     return below / (decisions[-1].t - decisions[0].t)
 

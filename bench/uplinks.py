@@ -17,7 +17,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, median
@@ -28,7 +28,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
-from runner.core.model import plain
+from runner.core.model import Camera, plain
 from runner.drive.quality_file import DOCUMENT, read_quality
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import Series, sending_spans, series
@@ -211,10 +211,15 @@ def _at(t: Floats, values: Floats, times: Floats) -> Floats:
     return held
 
 
+def cameras(drive: Drive) -> Mapping[str, Camera]:
+    """The cameras that were driven with."""
+    config = dict(drive.sides["vehicle"].began.config)
+    return configuration([], base=(config, "config"), runnable=False).vehicle().cameras
+
+
 def _used(drive: Drive, over_time: Series) -> float:
     """Bytes that passed over those that could have: no more than the link carried, or the cameras may send."""
-    vehicle = configuration([], base=(dict(drive.sides["vehicle"].began.config), "config"), runnable=False).vehicle()
-    most = float(plain(sum(camera.rate_quality.b_full for camera in vehicle.cameras.values())))
+    most = float(plain(sum(camera.rate_quality.b_full for camera in cameras(drive).values())))
     samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
     could = sum(min(before.kbps, most) * (after.t - before.t) for before, after in pairwise(samples))
     return (samples[-1].bytes - samples[0].bytes) * 8 / 1000 / could

@@ -219,17 +219,20 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = {}, {}
-    later = draft.sized_for / draft.total if draft.sized_for and draft.total else 1
+    later = (
+        draft.sized_for / draft.total if draft.sized_for and draft.total else None
+    )  # by how much more, if at the start
     for name, camera in vehicle.cameras.items():
         if not state.on[name]:
             continue
         allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
-        kbps, bitrate = _whole(allocated), scaling.as_full_image(allocated * later, roi, full)
+        kbps, sized_for = _whole(allocated), allocated if later is None else allocated * later
+        bitrate = scaling.as_full_image(sized_for, roi, full)
         # A camera that cannot be sent shows no picture: however few its pixels, it gets the smallest factor.
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = ""
-        if kbps and (later != 1 or (roi is not full and roi != full)):
-            seen = f", as {_whole(bitrate)} for the full image" + (" after the start" if later != 1 else "")
+        if kbps and (later is not None or (roi is not full and roi != full)):
+            seen = f", as {_whole(bitrate)} for the full image" + ("" if later is None else " after the start")
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
     return draft.replaced(scaling=factors, reasons=reasons), memory
 
