@@ -26,7 +26,7 @@ from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.records import Arrival
+from runner.records import Arrivals
 
 if TYPE_CHECKING:
     from fractions import Fraction
@@ -348,18 +348,17 @@ class OperatorSide:
             receiver.request_tails()
         return True
 
-    def take_arrivals(self) -> dict[str, list[Arrival]]:
-        """By camera, the access units that have arrived since the last call; to be called from one thread."""
-        return {name: receiver.take_arrivals() for name, receiver in self._receivers.items()}
-
-    def damaged(self) -> list[str]:
-        """Cameras whose newest picture shows that packets were lost for good."""
-        return [name for name, receiver in self._receivers.items() if receiver.is_damaged]
-
-    def take_packets(self) -> tuple[int, int]:
-        """RTP packets of all cameras received, and missing at first, since the last call; from one thread."""
-        counted = [receiver.take_packets() for receiver in self._receivers.values()]
-        return (sum(received for received, _ in counted), sum(lost for _, lost in counted))
+    def take_arrivals(self) -> Arrivals:
+        """What has arrived since the last call; to be called from one thread."""
+        receivers = self._receivers
+        counted = [receiver.take_packets() for receiver in receivers.values()]
+        return Arrivals(
+            frames={name: receiver.take_arrivals() for name, receiver in receivers.items()},
+            newest={name: receiver.newest for name, receiver in receivers.items() if receiver.newest},
+            packets=sum(received for received, _ in counted),
+            lost=sum(lost for _, lost in counted),
+            damaged=[name for name, receiver in receivers.items() if receiver.is_damaged],
+        )
 
     def stop(self) -> None:
         def stop() -> None:

@@ -9,7 +9,7 @@ has no such start, from 1970.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
@@ -302,29 +302,49 @@ class Sample:
 
 
 class Arrival(NamedTuple):
-    """An access unit as it arrived.
+    """A frame as it arrived, encoded.
 
-    arrived   s, by this machine's monotonic clock
+    arrived   s, by this machine's monotonic clock: when its last packet came
     captured  s, by the vehicle's clock; since any time, if the transport carries the RTP timestamp only
+    whole     whether no packet of it was missing at first
     """
 
     arrived: float
     captured: float
     bytes: int
+    whole: bool = True
+
+
+class Arrivals(NamedTuple):
+    """What the operator's side has received since it was last asked.
+
+    frames         by camera; packets that are missing are not waited for
+    newest         by camera, the newest access unit that has left the jitter buffer
+    packets, lost  RTP packets of all cameras received, and missing at first
+    damaged        cameras whose newest picture shows that packets were lost for good
+    """
+
+    frames: Mapping[str, Sequence[Arrival]]
+    newest: Mapping[str, Arrival]
+    packets: int = 0
+    lost: int = 0
+    damaged: Sequence[str] = ()
 
 
 class UnitReceived(NamedTuple):
-    """An access unit as the operator's side received it; a list in JSON, since there are hundreds a second.
+    """A frame as the operator's side received it; a list in JSON, since there are hundreds a second.
 
-    ago_s    s from its arrival to the report
-    delay_s  s from its capture, by the vehicle's clock, to its arrival; less a constant, since clocks differ
+    ago_s    s from the arrival of its last packet to the report
+    delay_s  s from its capture, by the vehicle's clock, to that arrival; less a constant, since clocks differ
     bytes    without the headers of packets
+    whole    whether no packet of it was missing at first
     """
 
     camera: str
     ago_s: float
     delay_s: float
     bytes: int
+    whole: bool = True
 
 
 @dataclass(frozen=True, slots=True)

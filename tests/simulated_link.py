@@ -16,6 +16,7 @@ from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMem
 
 Profile = Callable[[float], float]  # value over time, s
 SLOT_S = 0.01  # capacity is constant for this long
+PACKET = 1200  # bytes
 
 
 @dataclass(repr=False)
@@ -144,8 +145,8 @@ def drive(
         heapq.heappush(queue, (t, next(order), kind, what))
 
     last_unit = last_report = 0.0
-    on_the_way: list[ReceivedUnit] = []
-    packets = lost = 0
+    on_the_way: list[tuple[ReceivedUnit, int, int]] = []  # with packets that came, and those that did not until then
+    missing = [0] * cameras
     in_force = limit(0.0) if cap.kbps is None else float(cap.kbps)
     while queue and queue[0][0] < seconds:
         t, _, kind, what = heapq.heappop(queue)
@@ -153,28 +154,28 @@ def drive(
             at(t + 1 / fps, "frame", what)
             varied = chance.uniform(1 - noise, 1 + noise) * (key_frame if t < 1 / fps else 1)
             size = int(in_force * 1000 / 8 / fps / cameras * varied)
-            count = -(-size // 1200)
-            gone = sum(chance.random() < link.loss for _ in range(count)) if link.loss else 0
-            left = None if gone else waiting.put(t, size)
-            if left is None:
+            came, gone = _passed(waiting, t, size, lambda: chance.random() < link.loss)
+            missing[what] += gone
+            if gone:
                 done.lost.append(t)
-                lost, packets = lost + (gone or count), packets + (count - gone if gone else 0)
-                continue
-            last_unit = max(last_unit, left + link.one_way_s + link.delay_s(t))
-            done.passed(t, left - t, last_unit, size)
-            on_the_way.append(ReceivedUnit(f"camera {what}", t, last_unit, size, count))
-            packets += count
+            if came:
+                last_unit = max(last_unit, came[-1] + link.one_way_s + link.delay_s(t))
+                size = min(size, len(came) * PACKET)
+                done.passed(t, came[-1] - t, last_unit, size)
+                unit = ReceivedUnit(f"camera {what}", t, last_unit, size, not gone)
+                on_the_way.append((unit, len(came), missing[what]))
+                missing[what] = 0
         elif kind == "tcp":
             tcp.react(t, what)
             for when, outcome in tcp.send(t, waiting):
                 at(when, "tcp", outcome)
         elif kind == "report":
             at(t + report_s, "report", None)
-            units = tuple(unit for unit in on_the_way if unit.arrived <= t)
-            on_the_way = on_the_way[len(units) :]
+            arrived = [entry for entry in on_the_way if entry[0].arrived <= t]
+            on_the_way = on_the_way[len(arrived) :]
             last_report = max(last_report, t + link.one_way_s + link.delay_s(t))
-            at(last_report, "arrived", LinkReport(t, units, packets, lost))
-            packets = lost = 0
+            units, packets, lost = zip(*arrived, strict=True) if arrived else ((), (), ())
+            at(last_report, "arrived", LinkReport(t, units, sum(packets), sum(lost)))
         else:
             uplink, estimated = estimate(uplink, what)
             if estimated:
@@ -185,6 +186,13 @@ def drive(
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
+
+
+def _passed(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:
+    """When packets of a frame have left that are neither dropped nor lost, and how many are."""
+    left = [queue.put(t, min(PACKET, size - begin)) for begin in range(0, size, PACKET)]
+    came = [at for at in left if at is not None and not is_lost()]
+    return came, len(left) - len(came)
 
 
 def _measured(t: float, estimated: LinkEstimate, rtt_s: float) -> LinkMeasured:

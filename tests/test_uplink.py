@@ -68,7 +68,7 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
         queue = 0.0 if captured < 1.1 else 0.1
         rear = [("rear", late["rear"])] if captured < 1.0 or captured >= 1.3 else []
         units = tuple(
-            ReceivedUnit(name, captured, captured + 0.02 + extra + queue, 4000, 4)
+            ReceivedUnit(name, captured, captured + 0.02 + extra + queue, 4000)
             for name, extra in (("front", late["front"]), *rear)
         )
         uplink, estimated = estimate(uplink, LinkReport(captured + 0.25, units, 10, 0))

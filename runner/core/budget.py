@@ -12,10 +12,9 @@ MTU_BYTES, HEADER_BYTES = 1200, 58  # of a graph that does not state its own
 INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-A), which count as part of the MTU
 
 
-def on_the_wire(graph: Graph, size: int) -> tuple[int, int]:
-    """Bytes on the wire, headers included, and packets of an access unit of `size` bytes."""
-    packets = -(-size // _payload(graph))
-    return size + packets * _header(graph), packets
+def on_the_wire(graph: Graph, size: int) -> int:
+    """Bytes on the wire, headers included, of an access unit of `size` bytes."""
+    return size + -(-size // _payload(graph)) * _header(graph)
 
 
 def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from operator import attrgetter
 from statistics import median
 from types import MappingProxyType
 
@@ -21,10 +22,7 @@ BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time
 NEW_S = 1.0  # how long a new camera has to send before its own path is measured
 KEPT_S = 1.0  # units are kept for this long
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is lost or late makes it look lower
-MOST_INCOMPLETE = 4.0  # times what arrived in whole units
 MOST_UNITS = 5000  # and no more of them
-FEW_UNITS, COUNTED_S = 50, 0.9  # of fewer units, or in less time, packets are not counted
-EXTRA, MOST_EXTRA = 1.25, 5.0  # packets of a unit beyond those that its size takes, until they are counted, and at most
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
@@ -38,6 +36,8 @@ UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, the rate is measured anew
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
 FEW_PACKETS = 100  # of fewer no share of losses is stated
+OVERFLOWING = 0.1  # packets lost for each that arrives; a queue that drops so many lasts because it is full
+STUCK_GROWTH = 1.5  # times its shortest; one that is longer grows
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
 
@@ -56,16 +56,16 @@ class ReceivedUnit:
     """One access unit as the operator's side received it.
 
     captured  s, by the vehicle's clock
-    arrived   s, by the operator's monotonic clock
-    bytes     on the wire, headers included
-    packets   that it came in
+    arrived   s, by the operator's monotonic clock: when its last packet came
+    bytes     that arrived, on the wire, headers included
+    whole     whether no packet was missing at first
     """
 
     camera: str
     captured: float
     arrived: float
     bytes: int
-    packets: int = 1
+    whole: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +132,11 @@ def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """When a unit arrived, how long it waited in the queue, s, its size in bytes and packets."""
+    """When a unit arrived, how long it waited in the queue, s, and its size."""
 
     arrived: float
     queue: float
     bytes: int
-    packets: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,26 +147,24 @@ class UplinkMemory:
     captured   by camera, capture time of its last unit
     intervals  by camera, s between its last two units
     units      of the last second, in order of arrival
-    queues     (time of the report, wait in the queue) of the last STUCK_S
+    queues     (time of the report, wait in the queue, packets received, lost) of the last STUCK_S
     packets    (time of the report, received, lost) of the last second
     resumed    when units arrived again after the last gap
     onset      when the queue was last empty; None: it is empty
     peak       kbit/s, highest rate since the onset
     rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
-    extra      packets of a unit beyond those that its size takes: headers of the stream come in packets of their own
     """
 
     paths: Mapping[str, _Path] = field(default_factory=lambda: MappingProxyType({}))
     captured: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     intervals: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     units: tuple[_Unit, ...] = ()
-    queues: tuple[tuple[float, float], ...] = ()
+    queues: tuple[tuple[float, float, int, int], ...] = ()
     packets: tuple[tuple[float, int, int], ...] = ()
     resumed: float = -float("inf")
     onset: float | None = None
     peak: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
-    extra: float = EXTRA
 
 
 def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
@@ -179,7 +176,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     packets = (*_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
     if uplink.resumed != before.resumed:
         packets = ()  # what was lost in a stall says nothing about the link after it
-    uplink = _calibrated(replace(uplink, packets=packets))
+    uplink = replace(uplink, packets=packets)
     if not uplink.units:
         return uplink, None
     frame, last = _frame_interval(uplink.intervals), uplink.units[-1].arrived
@@ -190,17 +187,16 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
     else:
         onset = uplink.onset
-    queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue))
+    queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
-    kbps = _rate(uplink, last, max(RATE_S, 3 * frame))
-    certain = kbps if kbps is not None and not _counted(packets)[1] else 0.0  # of pictures that miss packets it is not
-    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, certain))
+    kbps, since = _rate(uplink, last, max(RATE_S, 3 * frame), queue)
+    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
     if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
-        rates = (*_since(uplink.rates, report.at - STEADY_S), (report.at, kbps))
+        rates = (*_since(uplink.rates, max(report.at - STEADY_S, since)), (report.at, kbps))
         uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
     elif state is LinkState.CLEAR:
         uplink = replace(uplink, rates=())
@@ -214,16 +210,18 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
     for unit in units:
         if unit.captured < captured.get(unit.camera, unit.captured):
             paths, captured, intervals, kept = {}, {}, {}, []
-        if unit.camera in captured:
+        if unit.captured > captured.get(unit.camera, unit.captured):  # the rest of a unit may follow later
             intervals[unit.camera] = min(LONGEST_INTERVAL_S, unit.captured - captured[unit.camera])
         captured[unit.camera] = unit.captured
         delay = unit.arrived - unit.captured
         known = paths.get(unit.camera) or _new_path(unit, paths.values())
-        path = paths[unit.camera] = known.after(unit, empty=uplink.onset is None)
+        # One that misses its last packets seems to have come sooner.
+        path = paths[unit.camera] = known.after(unit, empty=uplink.onset is None) if unit.whole else known
         shortest = path.delay if path.own else min(other.delay for other in paths.values())
         if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
-        kept.append(_Unit(unit.arrived, max(0.0, delay - shortest), unit.bytes, unit.packets))
+        kept.append(_Unit(unit.arrived, max(0.0, delay - shortest), unit.bytes))
+    kept.sort(key=attrgetter("arrived"))  # one that misses its last packets is reported late
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
@@ -237,48 +235,31 @@ def _longest_gap(frame: float) -> float:
     return max(GAP_S, 2 * frame)
 
 
-def _rate(uplink: UplinkMemory, last: float, window: float) -> float | None:
-    """kbit/s that arrived: since the queue began where it lasts, and never across a gap."""
+def _rate(uplink: UplinkMemory, last: float, window: float, queue: float) -> tuple[float | None, float]:
+    """kbit/s that arrived: since the queue began or doubled where it lasts, and never across a gap. And since when."""
     # From one arrival to another: a window that begins between two would count too much or too little.
     begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-float("inf"))
     begin = max(begin, uplink.units[0].arrived)
-    since = max(begin, uplink.resumed, uplink.resumed if uplink.onset is None else uplink.onset)
-    if last - since < EVIDENCE_S:
-        if uplink.resumed > begin or last - begin < EVIDENCE_S:
-            return None
-        since = begin
-    return (
-        sum(unit.bytes for unit in uplink.units if unit.arrived > since)
-        * 8
-        / 1000
-        / (last - since)
-        * _incomplete(uplink)
-    )
+    began = uplink.resumed if uplink.onset is None else max(uplink.resumed, uplink.onset)
+    doubled = max((unit.arrived for unit in uplink.units if 2 * unit.queue <= queue), default=began)
+    for since in (max(begin, began, doubled), max(begin, began)):
+        if last - since >= EVIDENCE_S:
+            return _kbps(uplink.units, since, last), since
+    if uplink.resumed > begin or last - begin < EVIDENCE_S:
+        return None, last
+    return _kbps(uplink.units, begin, last), begin
 
 
-def _incomplete(uplink: UplinkMemory) -> float:
-    """By how much more has arrived in the last second than whole units: of one that misses a packet all are dropped."""
-    received, lost = _counted(uplink.packets)
-    whole = sum(unit.packets + uplink.extra for unit in uplink.units)
-    return min(MOST_INCOMPLETE, max(1.0, received / whole)) if lost else 1.0
+def _kbps(units: Iterable[_Unit], since: float, until: float) -> float:
+    return sum(unit.bytes for unit in units if unit.arrived > since) * 8 / 1000 / (until - since)
 
 
-def _calibrated(uplink: UplinkMemory) -> UplinkMemory:
-    """Packets of a unit, counted while none is lost."""
-    received, lost = _counted(uplink.packets)
-    counted_s = uplink.packets[-1][0] - uplink.packets[0][0] if uplink.packets else 0.0
-    if len(uplink.units) < FEW_UNITS or lost or counted_s < COUNTED_S:
-        return uplink
-    more = received - sum(unit.packets for unit in uplink.units)
-    return replace(uplink, extra=min(MOST_EXTRA, max(0.0, more / len(uplink.units))))
-
-
-def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float | None) -> LinkState:
+def _state(queues: Sequence[tuple[float, float, int, int]], queue: float, onset: float | None) -> LinkState:
     if onset is None or queue <= GROWN_S:
         return LinkState.CLEAR
     now = queues[-1][0]
-    before = min((was for at, was in queues if now - 0.3 < at < now - COMPARED_S), default=queue)
-    long_ago = min((was for at, was in queues if at < now - UNDRAINED_S), default=None)
+    before = min((was for at, was, _, _ in queues if now - 0.3 < at < now - COMPARED_S), default=queue)
+    long_ago = min((was for at, was, _, _ in queues if at < now - UNDRAINED_S), default=None)
     undrained = long_ago is not None and queue > long_ago - GROWTH_S
     if queue > before + GROWTH_S or (queue > LONG_S and queue > before - GROWTH_S) or undrained:
         return LinkState.FILLING
@@ -287,21 +268,22 @@ def _state(queues: tuple[tuple[float, float], ...], queue: float, onset: float |
 
 def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
     """Whether a queue lasts although less arrives than at its beginning, so that it cannot be one."""
-    lasting = uplink.queues[-1][0] - uplink.queues[0][0] > 0.8 * STUCK_S
-    shortest = min(was for _, was in uplink.queues)
+    queues = [was for _, was, _, _ in uplink.queues]
+    received, lost = sum(some for _, _, some, _ in uplink.queues), sum(some for _, _, _, some in uplink.queues)
     return (
         uplink.onset is not None
         and kbps is not None
-        and lasting
-        and shortest > GROWN_S
-        and uplink.queues[-1][1] > 0.9 * uplink.queues[0][1]
+        and uplink.queues[-1][0] - uplink.queues[0][0] > 0.8 * STUCK_S
+        and min(queues) > GROWN_S
+        and 0.9 * queues[0] < queues[-1] < STUCK_GROWTH * min(queues)
+        and lost <= OVERFLOWING * received
         and kbps < STUCK_SHARE * uplink.peak
     )
 
 
 def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     """The path's delays raised by what was taken for a queue."""
-    longer = min(was for _, was in uplink.queues)
+    longer = min(was for _, was, _, _ in uplink.queues)
     paths = {
         name: _Path(path.delay + longer, path.delay + longer, path.began, path.own)
         for name, path in uplink.paths.items()
@@ -310,13 +292,8 @@ def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
     return replace(uplink, paths=paths, onset=None, queues=(), units=units)
 
 
-def _counted(packets: Sequence[tuple[float, int, int]]) -> tuple[int, int]:
-    """Packets received, and missing."""
-    return sum(received for _, received, _ in packets), sum(lost for _, _, lost in packets)
-
-
 def _loss(packets: Sequence[tuple[float, int, int]]) -> float:
-    received, lost = _counted(packets)
+    received, lost = sum(received for _, received, _ in packets), sum(lost for _, _, lost in packets)
     return lost / (received + lost) if received + lost >= FEW_PACKETS else 0.0
 
 

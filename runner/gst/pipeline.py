@@ -9,6 +9,7 @@ from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
 from runner.graph import Plan
+from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.repeats import RepeatedPicture
 from runner.gst.sender_stages import EncoderWatch, SenderStages
@@ -144,7 +145,7 @@ class CameraPipeline:
         """Let every packet carry the capture time of its frame."""
         if isinstance(payloader, GstRtp.RTPBasePayload):
             extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
-            extension.set_id(1)
+            extension.set_id(CAPTURE_ID)
             payloader.emit("add-extension", extension)
 
 

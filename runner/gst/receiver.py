@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
+from runner.gst.arriving import KEPT, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.pipeline import counted
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
@@ -21,9 +22,6 @@ from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records import Arrival
 from runner.system.recent import RecentValue
 
-NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
-RTP_HZ = 90_000  # of video (RFC 6184)
-KEPT_ARRIVALS = 1024  # not read yet; the oldest are dropped
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
@@ -97,8 +95,9 @@ class Receiver:
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
-        self._unread: deque[Arrival] = deque(maxlen=KEPT_ARRIVALS)
+        self._unread: deque[Arrival] = deque(maxlen=KEPT)  # without RTP: access units, in place of packets
         self._packets = (0, 0)  # received and missing, as last read
+        self._newest: Arrival | None = None
         # Without RTSP no element reads the capture time of a frame.
         self._untimed = "" if plan.serves else next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
         self._media_clock = MediaClock(1 / RTP_HZ)
@@ -158,8 +157,16 @@ class Receiver:
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
 
+    @property
+    def newest(self) -> Arrival | None:
+        """The newest access unit, complete or not, once it has left the jitter buffer."""
+        return self._newest
+
     def take_arrivals(self) -> list[Arrival]:
-        """Access units that have arrived since the last call. From any one thread."""
+        """What has arrived since the last call; packets that are missing are not waited for. From any one thread."""
+        if self._buffers:
+            now = time.monotonic()
+            return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
         return [self._unread.popleft() for _ in range(len(self._unread))]
 
     @property
@@ -169,9 +176,8 @@ class Receiver:
 
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
-        before = self._packets
-        counts = [buffer.packets for buffer in self._buffers]
-        now = self._packets = (sum(passed for passed, _, _ in counts), sum(missing for _, missing, _ in counts))
+        before, frames = self._packets, [buffer.frames for buffer in self._buffers]
+        now = self._packets = (sum(each.received for each in frames), sum(each.missing for each in frames))
         return (max(0, now[0] - before[0]), max(0, now[1] - before[1]))  # a new pipeline counts from 0
 
     def request_tails(self) -> None:
@@ -254,7 +260,7 @@ class Receiver:
             damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
-            lost=before.lost + sum(lost for _, _, lost in (buffer.packets for buffer in self._buffers)),
+            lost=before.lost + sum(buffer.lost for buffer in self._buffers),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
             latency_ms=self._latency.get(),
@@ -276,9 +282,11 @@ class Receiver:
         arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
         captured = capture_time(buffer)
         self._entered = (buffer.pts, monotonic)
-        sampled = self._media_clock.seconds if captured is None else captured
-        if sampled is not None:
-            self._unread.append(Arrival(monotonic, sampled, buffer.get_size()))
+        if captured is not None or self._untimed:
+            sampled = self._media_clock.seconds if captured is None else captured
+            self._newest = Arrival(monotonic, sampled, buffer.get_size())
+            if not self._buffers:
+                self._unread.append(self._newest)
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         # The depayloader marks the very first unit, and each unit with missing packets.
@@ -312,19 +320,6 @@ class Receiver:
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
-
-
-class MediaClock:
-    """Time of a counter of 32 bits that wraps around; None before its first value."""
-
-    def __init__(self, tick_s: float) -> None:
-        self._tick_s, self._last, self._ticks = tick_s, 0, 0
-        self.seconds: float | None = None
-
-    def tick(self, counter: int) -> None:
-        ahead = (counter - self._last) & 0xFFFFFFFF
-        self._ticks += ahead - (ahead >> 31 << 32)  # of two directions the shorter
-        self._last, self.seconds = counter, self._ticks * self._tick_s
 
 
 def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:

@@ -126,11 +126,7 @@ class LiveOperator:
         """In its own thread, since a sample waits for GLib: the vehicle takes a missing report for a bad link."""
         side = self._side
         assert side
-        self._repeat(
-            "reception report",
-            REPORT_S,
-            lambda: self.station.report_reception(side.take_arrivals(), *side.take_packets(), side.damaged()),
-        )
+        self._repeat("reception report", REPORT_S, lambda: self.station.report_reception(side.take_arrivals()))
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
         """Do a piece of work until stopped; an exception in it must not end the operator's view of a moving vehicle.

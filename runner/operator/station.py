@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
 from runner.records import (
     Arrival,
+    Arrivals,
     CameraSample,
     CameraState,
     CameraTelemetry,
@@ -115,7 +116,7 @@ class Station:
         self._clock_due = 0.0  # time.monotonic of the next
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
-        self._newest: dict[str, Arrival] = {}  # by camera
+        self._newest: Mapping[str, Arrival] = {}  # by camera
         self._sampled = 0.0  # time.monotonic of `samples`
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         listen = {
@@ -197,29 +198,22 @@ class Station:
         for listener in self.listeners:
             listener.on_sample(sample)
 
-    def report_reception(
-        self, arrivals: Mapping[str, Iterable[Arrival]], packets: int, lost: int, damaged: Iterable[str] = ()
-    ) -> None:
-        """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread.
-
-        packets, lost  RTP packets of all cameras received, and missing at first
-        damaged        cameras whose newest picture shows that packets were lost for good
-        """
-        now = time.monotonic()
-        units = sorted((unit.arrived, name, unit) for name, arrived in arrivals.items() for unit in arrived)
-        self._newest |= {name: unit for _, name, unit in units}
-        if units and self._delay_s is None:
-            self._delay_s = units[0][2].arrived - units[0][2].captured
+    def report_reception(self, arrivals: Arrivals) -> None:
+        """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread."""
+        now, self._newest = time.monotonic(), arrivals.newest
+        frames = sorted((frame.arrived, name, frame) for name, some in arrivals.frames.items() for frame in some)
+        if frames and self._delay_s is None:
+            self._delay_s = frames[0][2].arrived - frames[0][2].captured
         base = self._delay_s or 0.0
         received = tuple(
-            UnitReceived(name, round(now - at, 4), round(at - unit.captured - base, 4), unit.bytes)
-            for at, name, unit in units
+            UnitReceived(name, round(now - at, 4), round(at - frame.captured - base, 4), frame.bytes, frame.whole)
+            for at, name, frame in frames
         )
         if self.state is None:
             return
-        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, packets, lost)
-        if damaged := tuple(damaged):
-            report = replace(report, damaged=damaged)
+        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, arrivals.packets, arrivals.lost)
+        if arrivals.damaged:
+            report = replace(report, damaged=tuple(arrivals.damaged))
         if (latency_ms := self._worst_latency_ms(now)) is not None:
             report = replace(report, latency_ms=round(latency_ms, 1))
         if now >= self._clock_due:

@@ -55,7 +55,8 @@ def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
             unit.camera,
             report.at - unit.ago_s - unit.delay_s,
             report.at - unit.ago_s,
-            *on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
+            on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
+            unit.whole,
         )
         for unit in report.units
         if unit.camera in vehicle.cameras

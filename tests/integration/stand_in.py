@@ -9,7 +9,7 @@ from typing import Any
 from runner.apply import Reception
 from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
-from runner.records import Arrival
+from runner.records import Arrivals
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
@@ -92,14 +92,8 @@ class RecordingOperator:
             self._received[name] = Reception(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
         return dict(self._received)
 
-    def take_arrivals(self) -> dict[str, list[Arrival]]:
-        return {}
-
-    def take_packets(self) -> tuple[int, int]:
-        return (0, 0)
-
-    def damaged(self) -> list[str]:
-        return []
+    def take_arrivals(self) -> Arrivals:
+        return Arrivals({}, {})
 
     def stop(self) -> None:
         self._received = {}

@@ -96,7 +96,7 @@ def test_lost_packets_are_sent_again(monkeypatch):
 @pytest.mark.parametrize("by_time", [True, pytest.param(False, marks=pytest.mark.soak)])
 def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeypatch, by_time):
     from runner.apply import OperatorSide
-    from runner.gst import Gst, repair
+    from runner.gst import Gst, arriving, repair
 
     dropped = []
 
@@ -109,7 +109,7 @@ def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeyp
         def _lose(self, _pad, info):
             buffer = info.get_buffer()
             kind = buffer.extract_dup(1, 1)[0]
-            if kind != repair.MARKER | 96:  # of the last packets, but not those that are sent again
+            if kind != arriving.MARKER | 96:  # of the last packets, but not those that are sent again
                 return Gst.PadProbeReturn.OK
             dropped.append(kind)
             return Gst.PadProbeReturn.DROP
@@ -160,16 +160,16 @@ def test_a_picture_that_is_damaged_for_good_is_whole_again_after_a_key_frame(gra
         try:
             until(lambda: len(units) > 20)
             left[0] = 3
-            until(operator.damaged)
+            until(lambda: operator.take_arrivals().damaged)
             lost_at = len(units)
             until(lambda: len(units) > lost_at + 20)
-            assert operator.damaged() == ["front_left"]  # nothing else heals it
+            assert operator.take_arrivals().damaged == ["front_left"]  # nothing else heals it
             side.send_key_frames(["front_left", "no_such_camera"])
             asked_at = len(units)
-            until(lambda: not operator.damaged())
+            until(lambda: not operator.take_arrivals().damaged)
             assert len(units) - asked_at < 15
             until(lambda: len(units) > asked_at + 30)
-            assert operator.damaged() == []
+            assert operator.take_arrivals().damaged == []
             received = operator.sample(SENDING)["front_left"]
             assert (received.width, received.height) == knobs["size"]
             assert side.faults() == []

@@ -15,7 +15,7 @@ from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.station import SILENT_S, Station
-from runner.records import Arrival
+from runner.records import Arrival, Arrivals
 
 pytestmark = pytest.mark.gst
 
@@ -167,7 +167,7 @@ def test_a_silent_vehicle_is_offline_until_its_next_message(both):
 
 def report_until(station, done):
     """Report reception repeatedly, as an operator's side does."""
-    until(lambda: [station.report_reception({}, 0, 0), station.take(FRESH), done()][-1], every_s=0.04)
+    until(lambda: [station.report_reception(Arrivals({}, {})), station.take(FRESH), done()][-1], every_s=0.04)
 
 
 def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
@@ -191,12 +191,13 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
 def test_the_slowest_camera_that_should_send_is_reported(both):
     station, vehicle, _ = both
     vehicle.clock_ahead_s = 3.7
+    newest = {}
 
     def reported(silent=(), ms=40):
         """The latency that is reported when all cameras but the silent ones have just sent a picture."""
         now, captured = time.monotonic(), time.time() + 3.7 - ms / 1000
-        came = {name: [Arrival(now, captured, 1000)] for name in STATE["cameras"] if name not in silent}
-        station.report_reception(came, 0, 0)
+        newest.update({name: Arrival(now, captured, 1000) for name in STATE["cameras"] if name not in silent})
+        station.report_reception(Arrivals({name: [arrival] for name, arrival in newest.items()}, newest))
         station.take(FRESH)
         vehicle.publish("telemetry", TELEMETRY)
         return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0

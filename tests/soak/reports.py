@@ -49,7 +49,7 @@ def sequence(seed: int) -> str:
     while t < until and (cap.kbps is not None or cap.trust.share < 1):
         t, at = t + REPORT_S, at + REPORT_S
         size = int(float(min(LIMIT, cap.kbps or LIMIT)) * REPORT_S * 125 / len(CAMERAS))
-        units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size, 3) for name in CAMERAS)
+        units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size) for name in CAMERAS)
         uplink, cap, wrong = _step(uplink, cap, t, LinkReport(at, units, 9, 0), PLACES[0])
         if wrong:
             return wrong
@@ -63,7 +63,10 @@ def _report(chance: random.Random, at: float) -> LinkReport:
     )
     return LinkReport(
         at,
-        tuple(ReceivedUnit(name, came - delay, came, chance.randrange(10**5), 4) for came, name, delay in units),
+        tuple(
+            ReceivedUnit(name, came - delay, came, chance.randrange(10**5), chance.random() < 0.8)
+            for came, name, delay in units
+        ),
         chance.randrange(100),
         chance.choice((0, 0, 1, 100)),
     )

@@ -1,0 +1,155 @@
+"""Packets gathered into frames as they arrive: what came of each, when, and what is missing."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.gst.arriving import NTP_EPOCH_S, ArrivingFrames, MediaClock, Packet, read_packet
+
+pytestmark = pytest.mark.gst
+
+MS = 0.001
+CAPTURED = 1_700_000_000.25
+
+
+def header(*, extension: bytes = b"", sources: int = 0, last: bool = False) -> bytes:
+    first = bytes([0x80 | (0x10 if extension else 0) | sources, 96 | (0x80 if last else 0)])
+    return first + bytes.fromhex("12340000abcd") + bytes(4 + 4 * sources) + extension
+
+
+def extension(number: int = 1) -> bytes:
+    ntp = round((CAPTURED + NTP_EPOCH_S) * 2**32).to_bytes(8, "big")
+    return b"\xbe\xde\x00\x03" + bytes([number << 4 | 7]) + ntp + bytes(3)
+
+
+@pytest.mark.parametrize(
+    ("data", "size", "payload", "captured"),
+    [
+        (header(), 112, 100, None),
+        (header(sources=2), 120, 100, None),
+        (header(extension=extension()), 128, 100, CAPTURED),
+        (header(extension=extension(number=2)), 128, 100, None),
+        (header(extension=b"\x10\x00\x00\x01\x00\x00\x00\x00"), 120, 100, None),  # of two bytes (RFC 8285, section 4.3)
+        (header(), 12, 0, None),
+    ],
+)
+def test_what_a_header_says(data: bytes, size: int, payload: int, captured: float | None) -> None:
+    assert read_packet(data, size) == Packet(0x1234, 0xABCD, last=False, bytes=payload, captured=captured)
+
+
+def test_the_marker_ends_a_frame() -> None:
+    assert read_packet(header(last=True), 12).last
+
+
+class Stream:
+    """Frames of two packets of 1000 bytes, one every 50 ms; the packets of a frame are 2 ms apart."""
+
+    def __init__(self) -> None:
+        self.frames, self._first = ArrivingFrames(), 65_530  # numbers wrap around soon
+
+    def send(self, frame: int, parts: str = "01", *, after_ms: float = 0, again: bool = False) -> bool:
+        newer = False
+        for part in map(int, parts):
+            packet = Packet(
+                (self._first + 2 * frame + part) % 65536, 4500 * frame % 2**32, part == 1, 1000, CAPTURED + frame / 20
+            )
+            newer = self.frames.add(packet, self.at(frame, 2 * part + after_ms), again=again)
+        return newer
+
+    @staticmethod
+    def at(frame: int, ms: float = 0) -> float:
+        return frame / 20 + ms * MS
+
+    def taken(self, frame: int, ms: float = 40) -> list[tuple[float, float, int, bool]]:
+        """Frames taken so long after the begin of one: number, ms from its begin to its arrival, bytes, whole."""
+        found = []
+        for arrived, captured, size, whole in self.frames.take(self.at(frame, ms)):
+            number = round(20 * (captured - CAPTURED))
+            found.append((number, round(1000 * (arrived - number / 20), 3), size, whole))
+        return found
+
+    @property
+    def counted(self) -> tuple[int, int]:
+        return self.frames.received, self.frames.missing
+
+
+def test_whole_frames() -> None:
+    stream = Stream()
+    for frame in range(10):
+        stream.send(frame)
+    assert stream.taken(9) == [(frame, 2, 2000, True) for frame in range(10)]
+    assert stream.taken(9) == []
+    assert stream.counted == (20, 0)
+
+
+def test_a_missing_first_packet() -> None:
+    stream = Stream()
+    stream.send(0)
+    stream.send(1, "1")
+    assert stream.taken(1) == [(0, 2, 2000, True), (1, 2, 1000, False)]
+    assert stream.counted == (3, 1)
+
+
+def test_a_missing_last_packet_is_noticed_by_time_and_by_the_next_frame() -> None:
+    stream = Stream()
+    stream.send(0)
+    stream.send(1, "0")
+    assert not stream.frames.is_late(stream.at(1, 9))
+    assert stream.taken(1, 9) == [(0, 2, 2000, True)]
+    assert stream.frames.is_late(stream.at(1, 11))
+    assert stream.taken(1, 11) == [(1, 0, 1000, False)]
+    assert stream.frames.is_late(stream.at(1, 11)), "its last packet may still be requested"
+    assert stream.frames.next_number() == 65_533
+    stream.send(2)
+    stream.send(3, "0")
+    stream.send(4)
+    assert stream.taken(4) == [(2, 2, 2000, False), (3, 0, 1000, False), (4, 2, 2000, False)]
+    assert stream.counted == (8, 2)
+
+
+def test_a_packet_that_was_overtaken_is_not_missing() -> None:
+    stream = Stream()
+    stream.send(0)
+    assert not stream.send(1, "10")
+    stream.send(2)
+    assert [size for _, _, size, _ in stream.taken(2)] == [2000, 1000, 3000]
+    assert stream.counted == (6, 0)
+
+
+def test_a_packet_that_is_sent_again_was_missing_at_first() -> None:
+    stream = Stream()
+    stream.send(0)
+    stream.send(1, "1")
+    assert not stream.send(1, "0", after_ms=20, again=True)
+    stream.send(2, "0")
+    assert stream.send(2, "1", after_ms=30, again=True), "the last one of a frame, which was requested by time"
+    assert [(number, size, whole) for number, _, size, whole in stream.taken(2)] == [
+        (0, 2000, True),
+        (1, 1000, False),
+        (2, 3000, False),
+    ]
+    assert stream.counted == (4, 2)
+    stream.send(3, "0")
+    assert stream.frames.is_late(stream.at(3, 11)), "what it took to send one again says nothing about gaps"
+
+
+@pytest.mark.parametrize("first", [30_000, 65_000])
+def test_a_stream_that_begins_anew_loses_nothing(first: int) -> None:
+    stream = Stream()
+    stream.send(0)
+    stream._first = first
+    for frame in range(1, 5):
+        stream.send(frame)
+    assert stream.taken(4) == [(frame, 2, 2000, True) for frame in range(5)]
+    assert stream.counted == (10, 0)
+
+
+def test_a_media_clock_wraps_around() -> None:
+    clock = MediaClock(1 / 90_000)
+    clock.tick(2**32 - 90_000)
+    before = clock.seconds
+    clock.tick(0)
+    clock.tick(90_000)
+    assert clock.seconds - before == pytest.approx(2)
+    clock.tick(0)  # backwards
+    assert clock.seconds - before == pytest.approx(1)
