@@ -31,13 +31,13 @@ from runner.configuration.config import configuration
 from runner.core.model import Camera, plain
 from runner.drive.quality_file import DOCUMENT, read_quality
 from runner.drive.read import Drive, read_drive
-from runner.drive.series import Series, sending_spans, series
+from runner.drive.series import Series, series
 from runner.drive.statistics import statistics
 from runner.records import LinkSample
 from runner.system.files import write_whole
 
 EXPERIMENT = "experiment=wrong_prediction"
-FPS = 15  # eight cameras that two cores encode and decode beside the rest
+FPS = 15  # of eight cameras that two cores encode and decode beside the rest; for a wide uplink or a slow machine less
 SETTLED_S = 3.0  # from then on a drive counts
 USABLE_KBPS = 500  # latency counts while the link carries at least so much
 OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # a link that carries less for longer is out, until it is usable again
@@ -76,12 +76,13 @@ def main() -> None:
     options.add_argument("uplinks", type=Path, nargs="+")
     options.add_argument("--runs", type=int, default=5)
     options.add_argument("--seconds", type=int, default=60)
+    options.add_argument("--fps", type=int, default=FPS, help="frames a second of each camera, at most")
     options.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
     asked = options.parse_args()
     found: dict[str, dict[str, list[Figures]]] = {}
     filled: dict[str, float] = {}
     for uplink in asked.uplinks:
-        filled[uplink.stem] = _filled(asked.output / uplink.stem / "unlimited", uplink, asked.seconds)
+        filled[uplink.stem] = _filled(asked.output / uplink.stem / "unlimited", uplink, asked.seconds, asked.fps)
         print(f"{uplink.stem}: the cameras use {filled[uplink.stem]:.0f} % of their bitrate", flush=True)
         conditions = _conditions(uplink)
         drives: dict[str, list[Figures]] = {name: [] for name in asked.only or conditions}
@@ -89,7 +90,8 @@ def main() -> None:
         for number in range(asked.runs):  # paired: what the machine does meanwhile meets all conditions
             for name, done in drives.items():
                 path = asked.output / uplink.stem / f"{name}.{number}"
-                drive(path, [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)], asked.seconds)
+                words = [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)]
+                drive(path, words, asked.seconds, asked.fps)
                 done.append(figures(path))
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
@@ -97,10 +99,10 @@ def main() -> None:
     print("\n".join(table(found, filled)))
 
 
-def _filled(path: Path, uplink: Path, seconds: int) -> float:
+def _filled(path: Path, uplink: Path, seconds: int, fps: int) -> float:
     """Of the bitrate that is allocated to the cameras, the share in % that they send over a link without limits."""
     words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(uplink)]
-    driven(path, [*words, f"fps_max={FPS}", f"duration_s={seconds}"])
+    driven(path, [*words, f"fps_max={fps}", f"duration_s={seconds}"])
     return 100 * statistics(series(read_drive(path), path.name)).share
 
 
@@ -114,9 +116,9 @@ def _trace(uplink: Path) -> str:
     return f"pqos.file={uplink.resolve()}"
 
 
-def drive(path: Path, words: Sequence[str], seconds: int) -> None:
+def drive(path: Path, words: Sequence[str], seconds: int, fps: int = FPS) -> None:
     """Drive and measure the pictures, unless that was done."""
-    driven(path, [*words, f"fps_max={FPS}", "log.video=true", f"duration_s={seconds}"])
+    driven(path, [*words, f"fps_max={fps}", "log.video=true", f"duration_s={seconds}"])
     if not (path / DOCUMENT).exists():
         run = [sys.executable, "-m", "runner", "quality", str(path)]
         subprocess.run(run, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -166,22 +168,23 @@ def figures(path: Path) -> Figures:
         "worst": min(means),
         **queue_ms(logged, "queue_"),
         "switches": switches(over_time),
-        "dropped": _dropped(over_time),
+        "dropped": _dropped(over_time, {name: float(camera.fps) for name, camera in cameras(logged).items()}),
     }
 
 
-def _dropped(over_time: Series) -> float:
-    """Frames that the cameras should have sent and did not, %: the machine was too busy."""
-    counted = []
-    for camera in over_time.cameras.values():
+def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
+    """Frames that the cameras should have sent and did not, %: the machine was too busy.
+
+    Counted where they send: between two samples in which nothing was sent, nobody watched, or sending was off.
+    """
+    sent = due = 0.0
+    for name, camera in over_time.cameras.items():
         assert camera.sent
-        t, frames = camera.sent.t, camera.sent.frames
-        first = int(np.searchsorted(t, SETTLED_S))
-        spans = sending_spans(camera.decided, over_time.end)
-        sending_s = sum(max(0.0, min(end, t[-1]) - max(begin, t[first])) for begin, end in spans)
-        counted.append((frames[-1] - frames[first], FPS * sending_s))
-    sent, due = np.sum(np.array(counted), axis=0)
-    return float(max(0.0, 100 * (1 - sent / due)))
+        frames, seconds = np.diff(camera.sent.frames), np.diff(camera.sent.t)
+        sends = np.convolve(frames == 0, np.ones(3), "same") == 0  # nor where it stops or begins between two samples
+        sends &= camera.sent.t[:-1] >= SETTLED_S
+        sent, due = sent + float(frames[sends].sum()), due + fps[name] * float(seconds[sends].sum())
+    return max(0.0, 100 * (1 - sent / due))
 
 
 def queue_ms(drive: Drive, name: str = "") -> Figures:
