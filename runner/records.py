@@ -414,6 +414,21 @@ class VideoBegan:
 
 
 @dataclass(frozen=True, slots=True)
+class VideoShifted:
+    """From a frame on, times in a video file are off by another amount: a pause, or a receiver that smooths them.
+
+    after_s   s from the file's first frame to this one, by the file
+    captured  capture time of this one, s since 1970
+    """
+
+    t: float
+    camera: str
+    file: str
+    after_s: float
+    captured: float
+
+
+@dataclass(frozen=True, slots=True)
 class LinkSample:
     """A limited link: its rate, the queueing delay of a packet, and what it has forwarded, dropped and lost so far.
 
@@ -455,6 +470,7 @@ Record = (
     | ReceptionReported
     | Note
     | VideoBegan
+    | VideoShifted
     | LinkSample
     | LinesDropped
     | Ended
@@ -469,6 +485,7 @@ KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     ReceptionReported: "reception",
     Note: "note",
     VideoBegan: "video",
+    VideoShifted: "video_shift",
     LinkSample: "link",
     LinesDropped: "dropped",
     Ended: "ended",

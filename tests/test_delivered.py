@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, UnitTimes, matched
+from runner.drive.captures import SAME_NS, FilmedFile, UnitTimes, arrivals, matched
 from runner.drive.delivered import _nearest, _thumbnail, due
 from runner.h264.access_unit import coded_picture
 
@@ -51,11 +51,36 @@ def test_what_stands_was_captured_by_then_and_had_arrived(times: list[tuple[int,
 
 
 def test_a_picture_was_captured_when_one_alike_was_sent() -> None:
-    """Whatever the log says: its clock is off by more than a frame at first, and one picture was damaged."""
+    """Whatever the file says; one picture was damaged."""
     sent = {b"a": [0], b"b": [66 * MS, 6600 * MS], b"c": [133 * MS], b"e": [266 * MS]}
-    logged = [ns * MS + 85 * MS for ns in (0, 66, 133, 200)] + [266 * MS + 10 * MS]
-    assert list(matched(sent, [b"a", b"b", b"c", b"?", b"e"], logged)) == [ns * MS for ns in (0, 66, 133, 200, 266)]
+    filed = [ns * MS + 85 * MS for ns in (0, 66, 133, 200)] + [266 * MS + 10 * MS]
+    assert list(matched(sent, [b"a", b"b", b"c", b"?", b"e"], filed)) == [ns * MS for ns in (0, 66, 133, 200, 266)]
     assert list(matched({}, [b"a"], [5 * MS])) == [5 * MS]
+
+
+def test_arrivals_are_found_though_the_clocks_seem_to_differ() -> None:
+    """By 85 ms at first and less and less; the log lacks two pictures, one of them the first."""
+    captured = [100 * n * MS for n in range(30)]
+    ahead = [max(0, 85 - 5 * n) * MS for n in range(30)]
+    log = [UnitTimes(captured[n] + ahead[n], captured[n] + 200 * MS) for n in range(30) if n not in (0, 12)]
+    assert arrivals(captured, log) == [
+        UnitTimes(ns, ns + 200 * MS) for n, ns in enumerate(captured) if n not in (0, 12)
+    ]
+    assert arrivals(captured, []) == []
+
+
+def test_times_of_a_file_are_those_of_its_last_shift() -> None:
+    """In ms: the clock ran on through a pause of 5 s after the frame at 200, then a receiver was 30 behind."""
+    file = FilmedFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
+    assert [file.captured(after * MS) // MS for after in (0, 200, 300, 400, 500, 900)] == [
+        1000,
+        1200,
+        6300,
+        6400,
+        6530,
+        6930,
+    ]
+    assert file.captured(300 * MS - 5000) == 6300 * MS - 5000, "the file counts in 1/90000 s"
 
 
 def test_parameter_sets_and_start_codes_do_not_tell_pictures_apart() -> None:

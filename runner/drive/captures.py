@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from runner.drive.read import Side
-from runner.records import Sample, VideoBegan
+from runner.records import Sample, VideoBegan, VideoShifted
 
 if TYPE_CHECKING:
     from runner.apply import Unit
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 SECOND_NS = 1_000_000_000
 # A frame of the file and one of the log further apart than this differ; less than most cameras' frame interval.
 SAME_NS = 20_000_000
+ROUNDING_NS = 1_000_000  # of times in the file, which count in 1/90000 s
+UNCERTAIN_NS = 150_000_000  # by how much the clocks may seem to differ at first
 
 ReadVideo = Callable[[Path], Iterator["Unit"]]
 
@@ -27,17 +31,41 @@ class UnitTimes(NamedTuple):
     arrived: int
 
 
-def files(side: Side) -> dict[str, list[VideoBegan]]:
+@dataclass(frozen=True, slots=True)
+class FilmedFile:
+    """A video file of a drive.
+
+    name   relative to the directory of the drive
+    times  (since the first frame by the file, capture time), ns: from each of these frames on both run alike
+    """
+
+    camera: str
+    name: str
+    times: tuple[tuple[int, int], ...]
+
+    def captured(self, after_ns: int) -> int:
+        """Capture time of a frame, ns since 1970."""
+        at = bisect_right(self.times, after_ns + ROUNDING_NS, key=itemgetter(0)) - 1
+        after, captured = self.times[max(0, at)]
+        return captured + after_ns - after
+
+    @property
+    def lies_outside(self) -> bool:
+        """Whether it is not in the directory of its drive, which may come from anywhere."""
+        return Path(self.name).is_absolute() or ".." in Path(self.name).parts
+
+
+def files(side: Side) -> dict[str, list[FilmedFile]]:
     """By camera, its video files, in the order of their first frames."""
-    found: dict[str, list[VideoBegan]] = {}
+    shifts: dict[str, list[tuple[int, int]]] = {}
+    for shift in side.of(VideoShifted):
+        shifted = (round(shift.after_s * SECOND_NS), round(shift.captured * SECOND_NS))
+        shifts.setdefault(shift.file, []).append(shifted)
+    found: dict[str, list[FilmedFile]] = {}
     for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
-        found.setdefault(line.camera, []).append(line)
+        times = ((0, round(line.captured * SECOND_NS)), *sorted(shifts.get(line.file, [])))
+        found.setdefault(line.camera, []).append(FilmedFile(line.camera, line.file, times))
     return found
-
-
-def lies_outside(line: VideoBegan) -> bool:
-    """Whether a file is not in the directory of its drive, which may come from anywhere."""
-    return Path(line.file).is_absolute() or ".." in Path(line.file).parts
 
 
 def received(side: Side, camera: str) -> list[UnitTimes]:
@@ -57,49 +85,37 @@ def _ahead_s(sample: Sample) -> float:
     return 0.0 if sample.clock_bound_ms is None else (sample.clock_ahead_ms or 0.0) / 1000
 
 
-def captured(known: Sequence[int], first: int, after: Iterable[int]) -> Iterator[int]:
-    """Capture times of the frames of a file, ns since 1970, increasing.
-
-    known  capture times from the log, increasing; empty for the vehicle's own file, whose times are exact
-    first  that of the file's first frame, as its receiver stated it
-    after  times since the first frame, by the file
-    """
-    offset, last = 0, -1
-    for ns in after:
-        offset = follow(known, first + ns, offset)
-        last = max(first + ns + offset, last + 1)
-        yield last
-
-
-def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], logged: Sequence[int]) -> Iterator[int]:
+def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], filed: Sequence[int]) -> Iterator[int]:
     """Capture times of received pictures, by those that were sent alike, ns since 1970.
 
-    The log's own times are as uncertain as the difference of the clocks, which may be more than a frame interval in
-    the first seconds. A picture that was damaged, so that none was sent alike, is as far off as the one before it.
+    A receiver's own times are off by what its jitter buffer adds and removes, up to a second after an outage. A picture
+    that was damaged, so that none was sent alike, is as far off as the one before it.
 
     sent      by coded picture, when such pictures were captured, increasing
     pictures  coded pictures as received
-    logged    their capture times by the log
+    filed     their capture times by the receiver's file
     """
     off = 0
-    for picture, ns in zip(pictures, logged, strict=True):
+    for picture, ns in zip(pictures, filed, strict=True):
         alike = sent.get(picture)
         if alike:
             off = min(alike, key=lambda capture: abs(capture - ns - off)) - ns
         yield ns + off
 
 
-def follow(known: Sequence[int], ns: int, offset: int) -> int:
-    """The offset to add to a frame's time in a file, ns, to get its capture time.
+def arrivals(captured: Sequence[int], log: Sequence[UnitTimes]) -> list[UnitTimes]:
+    """When pictures arrived, by the log; those that it lacks are left out.
 
-    known   capture times from the log, increasing, ns
-    ns      the frame's time by the file alone
-    offset  that of the previous frame
+    The log's capture times are as uncertain as the difference of the clocks, which may be more than a frame interval in
+    the first seconds; later it changes slowly, so that each picture is searched for near the match of the previous one.
 
-    A receiver smooths times, and slowly removes the delay of the first frame: 0.1 s and more. Frames missing in file or
-    log do not lead to a wrong match, as each frame is searched for near the match of the previous one.
+    captured  when they were captured, ns since 1970, increasing
     """
-    wanted = ns + offset
-    at = bisect_left(known, wanted)
-    nearest = min(known[max(0, at - 1) : at + 1], key=lambda capture: abs(capture - wanted), default=None)
-    return offset if nearest is None or abs(nearest - wanted) > SAME_NS else nearest - ns
+    known, off, found = [unit.captured for unit in log], 0, []
+    for ns in captured:
+        at = bisect_left(known, ns + off)
+        nearest = min(log[max(0, at - 1) : at + 1], key=lambda unit: abs(unit.captured - ns - off), default=None)
+        if nearest is not None and abs(nearest.captured - ns - off) <= (UNCERTAIN_NS if off == 0 else SAME_NS):
+            off = nearest.captured - ns
+            found.append(UnitTimes(ns, nearest.arrived))
+    return found

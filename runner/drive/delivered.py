@@ -27,11 +27,11 @@ from runner.core.model import Camera
 from runner.drive.captures import (
     SAME_NS,
     SECOND_NS,
+    FilmedFile,
     ReadVideo,
     UnitTimes,
-    captured,
+    arrivals,
     files,
-    lies_outside,
     matched,
     received,
 )
@@ -41,7 +41,7 @@ from runner.errors import RunError
 from runner.h264.access_unit import coded_picture
 from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
-from runner.records import DecisionMade, Sample, VideoBegan
+from runner.records import DecisionMade, Sample
 
 if TYPE_CHECKING:
     from runner.apply import Unit
@@ -52,7 +52,9 @@ TELL_S = 0.25  # between two reports of progress
 BLOCKS = 32  # along the shorter side of a picture
 
 DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
-FileTimes = tuple[VideoBegan, Mapping[int, int]]  # a file; by time since its first unit, when each was captured, ns
+FileTimes = tuple[
+    FilmedFile, Mapping[int, int]
+]  # a file; by time as `decode_video` gives it, when each was captured, ns
 
 
 def measure(
@@ -109,7 +111,7 @@ def due(moments: Sequence[int], units: Sequence[UnitTimes], deadline_ns: int) ->
 
 
 class _FileUnit(NamedTuple):
-    """An access unit: time since the first one of its file, when it was captured, ns; digest of its coded picture."""
+    """An access unit: its time as `decode_video` gives it, when it was captured, ns; digest of its coded picture."""
 
     after: int
     captured: int
@@ -128,46 +130,38 @@ class _Videos:
     read: ReadVideo
     decode: DecodeVideo
 
-    def units(self, line: VideoBegan, known: Sequence[int]) -> list[_FileUnit]:
-        """The access units of a file.
-
-        known  as in `captured`
-        """
-        if lies_outside(line):
-            return []
-        found = [(unit.after_ns, _digest(unit)) for unit in self.read(self.directory / line.file)]
-        times = captured(known, round(line.captured * SECOND_NS), [after for after, _ in found])
-        return [_FileUnit(after, ns, coded) for (after, coded), ns in zip(found, times, strict=True)]
+    def units(self, file: FilmedFile) -> list[_FileUnit]:
+        """The access units of a file."""
+        found = () if file.lies_outside else self.read(self.directory / file.name)
+        return [_FileUnit(unit.demuxed_ns, file.captured(unit.after_ns), _digest(unit)) for unit in found]
 
     def pictures(self, timed: Sequence[FileTimes], size: tuple[int, int]) -> Iterator[tuple[int, Luma]]:
         """The decoded pictures of some files, with their capture times."""
-        for line, times in timed:
-            for after, picture in self.decode(self.directory / line.file, *size) if times else ():
+        for file, times in timed:
+            for after, picture in self.decode(self.directory / file.name, *size) if times else ():
                 if after in times:
                     yield times[after], picture
 
 
 def _matched(
-    videos: _Videos, sent: Sequence[VideoBegan], came: Sequence[VideoBegan], log: Sequence[UnitTimes]
+    videos: _Videos, sent: Sequence[FilmedFile], came: Sequence[FilmedFile], log: Sequence[UnitTimes]
 ) -> tuple[list[FileTimes], list[FileTimes], list[UnitTimes]]:
     """Files as sent and as received, with the vehicle's own times of capture, and when each received unit arrived."""
     exact: list[FileTimes] = []
     alike: dict[bytes, list[int]] = {}
-    for line in sent:
-        found = videos.units(line, ())
-        exact.append((line, {unit.after: unit.captured for unit in found}))
+    for file in sent:
+        found = videos.units(file)
+        exact.append((file, {unit.after: unit.captured for unit in found}))
         for unit in found:
             alike.setdefault(unit.coded, []).append(unit.captured)
     shown: list[FileTimes] = []
-    units: list[UnitTimes] = []
-    known, arrived = [unit.captured for unit in log], dict(log)
-    for line in came:
-        found = videos.units(line, known)
-        own = list(matched(alike, [unit.coded for unit in found], [unit.captured for unit in found]))
-        shown.append((line, {unit.after: ns for unit, ns in zip(found, own, strict=True)}))
-        pairs = zip(own, found, strict=True)
-        units += [UnitTimes(ns, arrived[unit.captured]) for ns, unit in pairs if unit.captured in arrived]
-    return exact, shown, sorted(units)
+    own: list[int] = []
+    for file in came:
+        found = videos.units(file)
+        times = list(matched(alike, [unit.coded for unit in found], [unit.captured for unit in found]))
+        shown.append((file, {unit.after: ns for unit, ns in zip(found, times, strict=True)}))
+        own += times
+    return exact, shown, arrivals(sorted(own), log)
 
 
 def _camera(
@@ -175,8 +169,8 @@ def _camera(
     videos: _Videos,
     vehicle: Side,
     operator: Side,
-    sent: Sequence[VideoBegan],
-    came: Sequence[VideoBegan],
+    sent: Sequence[FilmedFile],
+    came: Sequence[FilmedFile],
     clip: Path | None,
 ) -> DeliveredQuality:
     exact, shown, units = _matched(videos, sent, came, received(operator, camera.name))

@@ -29,6 +29,7 @@ from runner.records import (
     Record,
     Telemetry,
     VideoBegan,
+    VideoShifted,
     line_to_json,
 )
 from runner.redact import redacted
@@ -123,6 +124,10 @@ class Log:
     def video(self, camera: str, file: str, captured: float) -> None:
         """A video file has started; `captured`: capture time of its first frame, s since 1970."""
         self.record(VideoBegan(self.now(), camera, file, captured))
+
+    def video_shift(self, camera: str, file: str, after_s: float, captured: float) -> None:
+        """From a frame on, times in a video file are off by another amount; see `VideoShifted`."""
+        self.record(VideoShifted(self.now(), camera, file, round(after_s, 6), captured))
 
     def close(self) -> None:
         """Close the log cleanly; a drive that never began leaves no file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -13,10 +13,10 @@ from msgspec import UNSET
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, ReadVideo, files, follow, lies_outside, received
+from runner.drive.captures import SECOND_NS, FilmedFile, ReadVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
-from runner.records import KINDS, Json, Note, Position, Record, Sample, VideoBegan, line_to_json
+from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
 from runner.schema import referred
 
 if TYPE_CHECKING:
@@ -197,9 +197,8 @@ def _streams(
     for name, side in drive.sides.items():
         # If the vehicle did not log, the operator's log has its positions.
         yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
-        for camera, lines in files(side).items():
-            known = [unit.captured for unit in received(side, camera)]
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, lines, known, channels, read_video, on_warning)
+        for camera, filmed in files(side).items():
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, filmed, channels, read_video, on_warning)
 
 
 def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
@@ -233,32 +232,26 @@ def _pictures(
     directory: Path,
     topic: str,
     camera: str,
-    lines: list[VideoBegan],
-    known: Sequence[int],
+    filmed: list[FilmedFile],
     channels: _Channels,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
 ) -> Iterator[McapMessage]:
-    """The frames of one camera on one side, at their capture times.
-
-    known  capture times from the log, ns since 1970, increasing
-    """
+    """The frames of one camera on one side, at their capture times."""
     topic = topic.format(camera=camera)
     last = -1
-    for line in lines:
-        first = round(line.captured * SECOND_NS)
-        if lies_outside(line):
-            on_warning(f"{line.file}: lies outside the drive and was left out")
+    for file in filmed:
+        if file.lies_outside:
+            on_warning(f"{file.name}: lies outside the drive and was left out")
             continue
         try:
-            offset = 0
-            for unit in read_video(directory / line.file):
-                offset = follow(known, first + unit.after_ns, offset)
+            for unit in read_video(directory / file.name):
                 # A rebuilt pipeline begins after the previous one has ended, but clocks may be set.
-                last = max(first + unit.after_ns + offset, last + 1)
+                last = max(file.captured(unit.after_ns), last + 1)
                 yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:
-            on_warning(f"{error}; the export continues without {'the rest of it' if last >= first else 'it'}")
+            more = "the rest of it" if last >= file.captured(0) else "it"
+            on_warning(f"{error}; the export continues without {more}")
 
 
 def _cameras(drive: Drive) -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from gi.repository import Gst
 
 DIRECTORY = "video"  # below the drive's directory
+SHIFT_S = 0.0005  # by which times of the file may be off
 _MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
 Captured = Callable[[Gst.Pad, Gst.Buffer], float]  # when a frame was captured, s since 1970
@@ -24,17 +25,20 @@ class VideoFiles:
     directory  the drive's; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counts the pipelines with a frame
     on_video   called when a file has its first frame, from another thread: camera, name of the file relative to the
                directory, capture time of that frame in s since 1970
+    on_shift   called when capture times are ahead of the file's by another amount from a frame on: camera, name of the
+               file, its time since the first frame by the file, s, and its capture time, s since 1970
     """
 
     directory: Path
     on_video: Callable[[str, str, float], None]
+    on_shift: Callable[[str, str, float, float], None]
 
 
 class VideoFile:
     """The file of one pipeline. It begins with the first frame: a pipeline without frames leaves none.
 
-    Any failure here ends the file, is reported once, and does not affect the stream. After the first frame no Python
-    runs. Elements are looked up when needed: an object that a probe keeps alive must not keep the pipeline alive.
+    Any failure here ends the file, is reported once, and does not affect the stream. Elements are looked up when
+    needed: an object that a probe keeps alive must not keep the pipeline alive.
 
     side       vehicle or operator
     captured   returns a frame's capture time; called between queue and parser
@@ -46,7 +50,9 @@ class VideoFile:
     ) -> None:
         self._files, self._camera, self._side = files, camera, side
         self._captured, self._on_report = captured, on_report
-        self._came: dict[int, float] = {}  # by stream time, ns: the capture time
+        self._came: dict[int, float] = {}  # until the file begins, by stream time, ns: the capture time
+        self._file, self._first = "", 0  # its name, and the stream time of its first frame
+        self._ahead = 0.0  # s since 1970, of capture times over times in the file
         self._begun = self._failed = self._late = False
 
     def follow(self, pipeline: Gst.Bin) -> None:
@@ -61,17 +67,23 @@ class VideoFile:
         _outermost(pipeline).get_bus().set_sync_handler(self._on_message)
 
     def _on_unit(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """From the queue's thread, until the file has begun: the parser outputs nothing before parameter sets."""
-        if self._begun:
-            return Gst.PadProbeReturn.REMOVE
+        """From the queue's thread. The parser outputs nothing before parameter sets."""
         buffer = info.get_buffer()
-        self._came[buffer.pts] = self._captured(pad, buffer)
+        captured = self._captured(pad, buffer)
+        if not self._begun:
+            self._came[buffer.pts] = captured
+        elif self._file and not self._failed:
+            after_s = (buffer.pts - self._first) / Gst.SECOND
+            if abs(captured - after_s - self._ahead) > SHIFT_S:
+                self._ahead = captured - after_s
+                self._files.on_shift(self._camera, self._file, after_s, captured)
         return Gst.PadProbeReturn.OK
 
     def _on_first_parsed(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         """From the queue's thread: open the file, just before its first frame."""
         self._begun = True
-        captured = self._came.get(info.get_buffer().pts) or max(self._came.values(), default=time.time())
+        first = info.get_buffer().pts
+        captured = self._came.get(first) or max(self._came.values(), default=time.time())
         self._came.clear()
         parts = pad.get_parent_element().get_parent()
         try:
@@ -83,7 +95,9 @@ class VideoFile:
         sink.set_property("location", str(path))
         sink.set_locked_state(False)
         if sink.sync_state_with_parent():  # otherwise an error was posted
-            self._files.on_video(self._camera, str(path.relative_to(self._files.directory)), captured)
+            self._file, self._first = str(path.relative_to(self._files.directory)), first
+            self._ahead = captured
+            self._files.on_video(self._camera, self._file, captured)
         return Gst.PadProbeReturn.REMOVE
 
     def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:

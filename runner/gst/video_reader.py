@@ -9,6 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.errors import RunError
+from runner.gst.stream_times import RestoredTimes, stream_times
 from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
@@ -22,14 +23,16 @@ _PARSED = {  # by codec, the parser: whole pictures as Annex B, parameter sets w
 class Unit(NamedTuple):
     """One access unit.
 
-    after_ns  time since the first unit of the file, ns
-    codec     h264 or h265
-    data      Annex B
+    after_ns    time since the first unit of the file, ns
+    codec       h264 or h265
+    data        Annex B
+    demuxed_ns  likewise, by GStreamer's demuxer, which shortens gaps: the times of `runner.gst.pictures.decode_video`
     """
 
     after_ns: int
     codec: str
     data: bytes
+    demuxed_ns: int
 
 
 def read_video(path: Path) -> Iterator[Unit]:
@@ -44,7 +47,7 @@ def read_video(path: Path) -> Iterator[Unit]:
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
     try:
         pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
-        yield from _pulled(pipeline, path)
+        yield from _pulled(pipeline, path, RestoredTimes(stream_times(path)))
     finally:
         pipeline.set_state(Gst.State.NULL)
 
@@ -61,7 +64,7 @@ def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     parse.sync_state_with_parent()
 
 
-def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
+def _pulled(pipeline: Gst.Pipeline, path: Path, times: RestoredTimes) -> Iterator[Unit]:
     out, bus = pipeline.get_by_name("out"), pipeline.get_bus()
     first, silent = 0, 0
     codec = ""
@@ -80,5 +83,6 @@ def _pulled(pipeline: Gst.Pipeline, path: Path) -> Iterator[Unit]:
             codec, first = sample.get_caps().get_structure(0).get_name().removeprefix("video/x-"), buffer.pts
         if buffer.pts == Gst.CLOCK_TIME_NONE:
             continue  # a unit whose beginning is damaged
-        yield Unit(buffer.pts - first, codec, buffer.extract_dup(0, buffer.get_size()))
+        demuxed_ns = buffer.pts - first
+        yield Unit(times.next(demuxed_ns), codec, buffer.extract_dup(0, buffer.get_size()), demuxed_ns)
     raise RunError(f"{path}: is damaged" if codec else f"{path}: contains no readable video")

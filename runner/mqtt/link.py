@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import socket
 import sys
 import threading
@@ -26,7 +27,8 @@ LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
 FAULTS = 100  # distinct message faults that are reported; further ones are only counted
 LONGEST_FAULT = 1000  # characters of why
-REPEATED = {"telemetry", "reception", "clock", "advice"}  # the next message comes soon: without acknowledgement
+REPEATED = {"telemetry", "reception", "clock", "advice"}  # the next message comes soon: without acknowledgement ...
+UNSENT_BYTES = 4096  # ... and not while this much waits: after an outage of the link it would delay what is current
 RETAINED = ("state", "telemetry", "configuration")
 
 
@@ -89,9 +91,10 @@ class ControlLink:
     def publish(self, topic: str, message: JsonObject) -> None:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
-        Without a connection nothing is sent or queued: after a reconnection only current values count.
+        Without a connection nothing is sent or queued: after a reconnection only current values count. Nor are repeated
+        messages while earlier ones wait for the link.
         """
-        if self._listening.is_set():
+        if self._listening.is_set() and not (_is_repeated(topic) and self.is_behind()):
             self._send(topic, message)
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
@@ -104,6 +107,15 @@ class ControlLink:
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)  # waits without a timeout
         ending.start()
         ending.join(CLOSE_S)
+
+    def is_behind(self) -> bool:
+        """Whether the kernel holds UNSENT_BYTES or more that it could not send yet."""
+        poll, sock = select.poll(), self._client.socket()
+        try:
+            poll.register(sock, select.POLLOUT)  # type: ignore[arg-type]  # None is a TypeError
+            return not poll.poll(0)
+        except (OSError, TypeError, ValueError):  # the connection has just been lost
+            return False
 
     def _new_client(self) -> _Client:
         client = _Client(CallbackAPIVersion.VERSION2)
@@ -140,7 +152,7 @@ class ControlLink:
             self._on_report(fault)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
-        qos = 0 if set(topic.split("/")[2:]) & REPEATED else 1
+        qos = 0 if _is_repeated(topic) else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
 
     def _connected(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
@@ -175,6 +187,10 @@ class ControlLink:
             self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
 
 
+def _is_repeated(topic: str) -> bool:
+    return bool(set(topic.split("/")[2:]) & REPEATED)
+
+
 def _kept(topic: str) -> bool:
     return topic.split("/")[2:] in [[name] for name in RETAINED]
 
@@ -184,3 +200,4 @@ def _settle(_client: object, _data: object, sock: Any) -> None:
         # Without this, small messages are held back for 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)

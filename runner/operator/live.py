@@ -126,7 +126,11 @@ class LiveOperator:
         """In its own thread, since a sample waits for GLib: the vehicle takes a missing report for a bad link."""
         side = self._side
         assert side
-        self._repeat("reception report", REPORT_S, lambda: self.station.report_reception(side.take_arrivals()))
+        self._repeat("reception report", REPORT_S, lambda: self._report_reception(side))
+
+    def _report_reception(self, side: OperatorSide) -> None:
+        if self.station.may_report():
+            self.station.report_reception(side.take_arrivals())
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
         """Do a piece of work until stopped; an exception in it must not end the operator's view of a moving vehicle.
@@ -183,7 +187,7 @@ def live_operator(
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
         station.listeners.append(DriveLog(station, drive))
-    video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
 
     def build(on_unit: OnUnit | None) -> OperatorSide:
         logged = log is not None

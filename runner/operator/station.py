@@ -198,6 +198,10 @@ class Station:
         for listener in self.listeners:
             listener.on_sample(sample)
 
+    def may_report(self) -> bool:
+        """Whether a report would be sent at once. While earlier ones wait, what arrives is kept for the next."""
+        return not self._link.is_behind()
+
     def report_reception(self, arrivals: Arrivals) -> None:
         """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread."""
         now, self._newest = time.monotonic(), arrivals.newest

@@ -284,7 +284,7 @@ def live_vehicle(
         console.say(what)
         drive.note(what)
 
-    video = apply.VideoFiles(log, drive.video) if log and vehicle.log_video else None
+    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
     control = _VehicleControl(vehicle, document, report)
     loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report)

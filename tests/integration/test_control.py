@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import pytest
 
@@ -422,3 +423,57 @@ def test_no_message_is_queued_for_a_broker_that_is_away():
         link.close()
         watcher.close()
     assert seen[0] == {"online": "present"}
+
+
+class Stalling:
+    """Passes one connection on to a broker, with little room to hold what it has not passed on."""
+
+    def __init__(self, broker, stack):
+        self.endpoint, self.carries = Endpoint("127.0.0.1", free_port()), threading.Event()
+        self.carries.set()
+        self._broker = (broker.host, broker.port)
+        self._listening = socket.socket()
+        self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self._listening.bind((self.endpoint.host, self.endpoint.port))
+        self._listening.listen()
+        thread = threading.Thread(target=self._serve, daemon=True)
+        thread.start()
+        stack.callback(self._listening.close)
+
+    def _serve(self):
+        near, _ = self._listening.accept()
+        far = socket.create_connection(self._broker)
+        threading.Thread(target=self._pass, args=(far, near), daemon=True).start()
+        self._pass(near, far)
+
+    def _pass(self, one, other):
+        with suppress(OSError):
+            while data := one.recv(1024):
+                self.carries.wait()
+                other.sendall(data)
+
+
+def test_what_is_repeated_does_not_wait_for_a_link_that_carries_nothing(broker, stack):
+    """Else it would take the first part of a second after an outage, when pictures should return."""
+    seen = []
+    link_there = Stalling(broker, stack)
+    own = {topic("x", "request", "+"): lambda message: None}
+    link = ControlLink(link_there.endpoint, (topic("x", "state"), OFFLINE), own, lambda here: None, print)
+    listen = {topic("x", "telemetry"): lambda message: seen.append(json.loads(message.payload)["number"])}
+    watcher = ControlLink(broker, (topic("y", "state"), OFFLINE), listen, lambda here: None, print)
+    for side in (watcher, link):
+        side.connect()
+        stack.callback(side.close)
+        until(lambda side=side: side.wait_connected(0.1))
+
+    def publish(number):
+        link.publish(topic("x", "telemetry"), {"number": number, "rest": 4000 * "."})
+
+    until(lambda: publish(0) or seen)
+    link_there.carries.clear()
+    for number in range(1, 200):  # for 1 s: a longer stall would end the connection
+        publish(number)
+        time.sleep(0.005)
+    link_there.carries.set()
+    until(lambda: publish(1000) or 1000 in seen)
+    assert len([number for number in seen if 0 < number < 1000]) < 20

@@ -9,12 +9,13 @@ import subprocess
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
 from rig import CHECKOUT, free_port, until, watching
 from runner import graph
-from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan
+from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan, read_video
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import ConfigError
@@ -29,12 +30,14 @@ class Sides:
     """Two cameras on the vehicle and at the operator, each with a file, and their reported first frames."""
 
     def __init__(self, directory, *words, cameras=CAMERAS, conf=None):
-        self.first_frames, self.reported = [], []
+        self.first_frames, self.shifts, self.reported = [], [], []
         overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", f"media.port={free_port()}", *words]
         vehicle = configuration(overrides, conf, check=check_plan).vehicle()
         self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
         self.plans = compile_plans(self.vehicle)
-        self.files = VideoFiles(directory, lambda *first: self.first_frames.append(first))
+        self.files = VideoFiles(
+            directory, lambda *first: self.first_frames.append(first), lambda *shift: self.shifts.append(shift)
+        )
         self.sending = VehicleSide(self.plans, self.vehicle.media, self.report, self.files)
         self.resize(320, 180)
 
@@ -118,6 +121,21 @@ def test_the_first_frame_of_a_file_is_reported_with_its_capture_time(sides):
         received = first[name, f"video/{name}.operator.0.ts"]
         assert start < sent < end
         assert abs(received - sent) < 0.001  # the same frame, and the packets carry its capture time
+
+
+def test_a_pause_lasts_as_long_in_the_files_as_it_did(sides, tmp_path):
+    """GStreamer's demuxer would leave half a second of it."""
+    with sides.receiving() as operator:
+        until(lambda: operator.sample({})["front"].frames > 20)
+        sides.sending.turn([Command("front", "sending", False)])
+        time.sleep(1.5)
+        sides.sending.turn([Command("front", "sending", True)])
+        until(lambda: operator.sample({})["front"].frames > 40)
+    sides.stop()
+    for file in (f"video/front.{side}.0.ts" for side in ("vehicle", "operator")):
+        units = list(read_video(tmp_path / file))
+        assert max(b.after_ns - a.after_ns for a, b in pairwise(units)) > 1.4 * Gst.SECOND
+        assert max(b.demuxed_ns - a.demuxed_ns for a, b in pairwise(units)) < 1.4 * Gst.SECOND
 
 
 def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path):
