@@ -181,10 +181,12 @@ def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
     for name, camera in over_time.cameras.items():
         assert camera.sent
         frames, seconds = np.diff(camera.sent.frames), np.diff(camera.sent.t)
+        if len(frames) < 3:
+            continue
         sends = np.convolve(frames == 0, np.ones(3), "same") == 0  # nor where it stops or begins between two samples
         sends &= camera.sent.t[:-1] >= SETTLED_S
         sent, due = sent + float(frames[sends].sum()), due + fps[name] * float(seconds[sends].sum())
-    return max(0.0, 100 * (1 - sent / due))
+    return max(0.0, 100 * (1 - sent / due)) if due else float("nan")
 
 
 def queue_ms(drive: Drive, name: str = "") -> Figures:

@@ -134,14 +134,36 @@ def test_a_packet_that_is_sent_again_was_missing_at_first() -> None:
 
 
 @pytest.mark.parametrize("first", [30_000, 65_000])
-def test_a_stream_that_begins_anew_loses_nothing(first: int) -> None:
+def test_a_stream_that_begins_anew_is_known_by_its_second_packet(first: int) -> None:
     stream = Stream()
     stream.send(0)
     stream._first = first
     for frame in range(1, 5):
         stream.send(frame)
-    assert stream.taken(4) == [(frame, 2, 2000, True) for frame in range(5)]
-    assert stream.counted == (10, 0)
+    whole = [(frame, 2, 2000, True) for frame in range(5)]
+    assert stream.taken(4) == [whole[0], (1, 2, 1000, False), *whole[2:]]
+    assert stream.counted == (9, 0)
+
+
+def test_one_stray_packet_begins_nothing() -> None:
+    stream = Stream()
+    stream.send(0)
+    stream.frames.add(Packet(30_000, 0, last=False, bytes=1000, captured=0.0), 0.01)
+    stream.send(1)
+    assert stream.taken(1) == [(0, 2, 2000, True), (1, 2, 2000, True)]
+    assert stream.counted == (4, 0)
+
+
+def test_a_packet_that_comes_twice_hides_no_loss() -> None:
+    stream = Stream()
+    stream.send(0)
+    stream.send(1, "1")
+    stream.send(1, "1", after_ms=1)
+    stream.send(1, "1", after_ms=1)
+    assert stream.counted == (3, 1)
+    stream.send(1, "0", after_ms=2)
+    stream.send(1, "0", after_ms=2)
+    assert stream.counted == (4, 0)
 
 
 def test_a_media_clock_wraps_around() -> None:

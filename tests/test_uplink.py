@@ -76,6 +76,20 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
     assert min(shown[19:25]) > 90
 
 
+def test_the_rest_of_a_frame_in_a_later_report_shows_no_clock_that_was_set() -> None:
+    """Rounded times make it seem older than its first part."""
+    uplink = UplinkMemory()
+    for number in range(30):
+        captured, queue = number / 15, 0.0 if number < 20 else 0.1
+        part = ReceivedUnit("front", captured, captured + 0.02 + queue, 4000, whole=False)
+        rest = replace(part, captured=captured - 0.0001, arrived=part.arrived + 0.012, whole=True)
+        for at, unit in ((0.01, part), (0.02, rest)):
+            uplink, estimated = estimate(uplink, LinkReport(unit.arrived + at, (unit,), 4, 0))
+    assert estimated
+    assert estimated.queue_ms > 80
+    assert uplink.intervals == {"front": pytest.approx(1 / 15, abs=0.001)}
+
+
 def test_a_link_that_halves_is_answered_at_once() -> None:
     done = drive(Link(steps((0, 4000), (5, 2000))), steps((0, RIGHT)), 10)
     assert done.first(5, lambda cap: cap <= 2000) <= 0.03 + 0.25

@@ -57,6 +57,39 @@ class Overuse(NamedTuple):
     limit: Kbps
 
 
+class Stall(NamedTuple):
+    """Time in which nothing arrives: since when (t), and how often the cap was halved in it."""
+
+    t: float
+    halved: int
+
+
+class Losses(NamedTuple):
+    """Share of packets lost at the last measurement, and when it rose last (t)."""
+
+    share: float
+    t: float
+
+
+class Most(NamedTuple):
+    """kbit/s that arrived at most, lately, and when that faded last (t)."""
+
+    kbps: Kbps
+    t: float
+
+
+class Limit(NamedTuple):
+    """The last limit, believed or not, kbit/s; when it rose last (t), and from which one."""
+
+    kbps: Kbps
+    t: float
+    before: Kbps
+
+
+NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
+NO_LIMIT = Limit(Fraction(0), -float("inf"), Fraction(0))
+
+
 @dataclass(frozen=True, slots=True)
 class LinkCap:
     """Memory between measurements.
@@ -66,23 +99,19 @@ class LinkCap:
     queue_ms    wait at the last cut
     steps       careful increases since then
     before      kbit/s that arrived when the link was last clear
-    stalled     t at which nothing arrived any more; None: something arrives
-    halved      how often the cap was halved since then
+    stall       None: something arrives
     changed     t of the last change
     measured    t of the last measurement
     idle        t at which nothing was to be sent, last
     alone       whether nothing else limits the total
     trust       how far the limit is trusted
-    most        kbit/s that arrived at most, lately
-    faded       t at which it faded last
+    most        what arrived at most
     began       t of the first measurement
     passed      t of a change, and the kbit/s that have arrived at most since it took effect
     connected   t of the operator's connection for which the cap last began
     provisional whether it began at a share of the limit, and no measurement has spoken against the limit since
-    loss        share of packets lost, at the last measurement
-    losing      t at which it rose last
-    limit       the last one, believed or not
-    rose        t at which it rose last, and from which limit
+    losses      of packets
+    limit       the last one
     """
 
     kbps: Kbps | None = None
@@ -90,23 +119,19 @@ class LinkCap:
     queue_ms: float = 0.0
     steps: int = 0
     before: Kbps | None = None
-    stalled: float | None = None
-    halved: int = 0
+    stall: Stall | None = None
     changed: float = -float("inf")
     measured: float = -float("inf")
     idle: float = -float("inf")
     alone: bool = False
     trust: Trust = UNDOUBTED
-    most: Kbps = Fraction(0)
-    faded: float = -float("inf")
+    most: Most = NOTHING
     began: float = float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
     connected: float = -float("inf")
     provisional: bool = False
-    loss: float = 0.0
-    losing: float = -float("inf")
-    limit: Kbps = Fraction(0)
-    rose: tuple[float, Kbps] = (-float("inf"), Fraction(0))
+    losses: Losses = NONE_LOST
+    limit: Limit = NO_LIMIT
 
 
 UNCAPPED = LinkCap()
@@ -136,7 +161,7 @@ def advanced(
     cap = _noted(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
         return _stalled(cap, link, t, limit)
-    lossy = cap.loss > TOO_LOSSY and t - cap.losing <= LOSING_S
+    lossy = cap.losses.share > TOO_LOSSY and t - cap.losses.t <= LOSING_S
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         return _doubting(_cut(cap, link, t, limit, full), link, t, full, least_trust)
@@ -147,8 +172,10 @@ def advanced(
 
 def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
-    rose = (t, cap.limit) if limit > cap.limit > 0 else cap.rose
-    cap, last = replace(cap, limit=limit, rose=rose), cap.overuse
+    known = cap.limit
+    rose = limit > known.kbps > 0
+    cap = replace(cap, limit=Limit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
+    last = cap.overuse
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
@@ -213,16 +240,16 @@ def idle(cap: LinkCap, t: float) -> LinkCap:
 
 def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     """The most that arrived lately, and since the last change took effect; whether packets are being lost."""
-    if t - cap.faded >= 1:
-        cap = replace(cap, most=_short(cap.most * FADED), faded=t)
+    most = cap.most if t - cap.most.t < 1 else Most(_short(cap.most.kbps * FADED), t)
     kbps = link.kbps or Fraction(0)
     since, passed = cap.passed
     passed = passed if since == cap.changed else Fraction(0)
     if t - cap.changed >= SEEN_S + _rtt_s(link):
         passed = max(passed, kbps)
     loss = link.loss or 0.0
-    losing = t if loss > cap.loss else cap.losing
-    return replace(cap, most=max(cap.most, kbps), passed=(cap.changed, passed), loss=loss, losing=losing)
+    losses = Losses(loss, t if loss > cap.losses.share else cap.losses.t)
+    most = most._replace(kbps=max(most.kbps, kbps))
+    return replace(cap, most=most, passed=(cap.changed, passed), losses=losses)
 
 
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -243,7 +270,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     if lossy and t - cap.changed >= LOSS_S + _rtt_s(link):  # of pictures that miss packets the rate is uncertain
         carried = min(carried, _in_force(cap, limit) * (1 - exact(link.loss or 0)))
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
-    most = min(cap.most, limit)
+    most = min(cap.most.kbps, limit)
     if lossy or _is_narrow(cap, link, t, limit):
         most = min(most, PROVEN * carried)
     target = max(target, YIELDED * most)
@@ -255,11 +282,11 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     return replace(
         cap,
         kbps=_short(target),
-        overuse=Overuse(t, carried, cap.rose[1] if t - cap.rose[0] < SEEN_S + _rtt_s(link) else full),
+        overuse=Overuse(t, carried, cap.limit.before if t - cap.limit.t < SEEN_S + _rtt_s(link) else full),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
-        most=most,
+        most=cap.most._replace(kbps=most),
         provisional=False,
     )
 
@@ -289,19 +316,19 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kb
 
 def _stalled(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """One cut at first, since most stalls are short; then half again and again."""
-    if cap.stalled is None:
+    if cap.stall is None:
         if t - cap.idle < SILENCE_S + _rtt_s(link):
             return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
-        return replace(cap, kbps=_short(arrived * DEEPEST), stalled=t, halved=0, changed=t, provisional=False)
-    return _halved(cap, t, limit)
+        return replace(cap, kbps=_short(arrived * DEEPEST), stall=Stall(t, 0), changed=t, provisional=False)
+    return _halved(cap, cap.stall, t, limit)
 
 
-def _halved(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+def _halved(cap: LinkCap, stall: Stall, t: float, limit: Kbps) -> LinkCap:
     if t - cap.changed < SILENCE_S:
-        return cap
+        return replace(cap, stall=stall)
     kbps = _short(_in_force(cap, limit) / 2)
-    return replace(cap, kbps=kbps, halved=cap.halved + 1, changed=t, provisional=False)
+    return replace(cap, kbps=kbps, stall=stall._replace(halved=stall.halved + 1), changed=t, provisional=False)
 
 
 def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
@@ -309,17 +336,17 @@ def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     longest = max(SILENCE_S, 2 * _rtt_s(link) + 3 * REPORT_S)
     if t - max(link.t, cap.changed, cap.idle) < longest:
         return cap
-    return _halved(replace(cap, stalled=link.t if cap.stalled is None else cap.stalled), t, limit)
+    return _halved(cap, cap.stall or Stall(link.t, 0), t, limit)
 
 
 def _resumed(cap: LinkCap, limit: Kbps) -> LinkCap:
     """The first report after a stall that shows an empty queue restores half of what arrived before."""
-    if cap.stalled is None:
+    if cap.stall is None:
         return cap
     kbps = cap.kbps
-    if kbps is not None and cap.halved and cap.before:
+    if kbps is not None and cap.stall.halved and cap.before:
         kbps = max(kbps, min(cap.before, limit) / 2)
-    return replace(cap, kbps=kbps, stalled=None, halved=0)
+    return replace(cap, kbps=kbps, stall=None)
 
 
 def _rtt_s(link: LinkMeasured) -> float:

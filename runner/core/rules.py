@@ -372,7 +372,7 @@ def cap_by_link(
 def _why_capped(cap: LinkCap) -> str:
     if cap.measured < cap.connected:
         return "the link has not been measured yet"
-    return "nothing arrives" if cap.stalled is not None else "measured capacity of the link"
+    return "nothing arrives" if cap.stall else "measured capacity of the link"
 
 
 def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:

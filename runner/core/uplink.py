@@ -14,15 +14,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import inf
 from operator import attrgetter
 from statistics import median
 from types import MappingProxyType
 
 BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time and the one before
 NEW_S = 1.0  # how long a new camera has to send before its own path is measured
-KEPT_S = 1.0  # units are kept for this long
+KEPT_S, MOST_UNITS = 1.0, 5000  # units are kept for this long, and no more of them
+SAME_S = 0.001  # capture times that are closer, after rounding, are those of the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is lost or late makes it look lower
-MOST_UNITS = 5000  # and no more of them
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
@@ -36,7 +37,7 @@ UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, the rate is measured anew
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
 FEW_PACKETS = 100  # of fewer no share of losses is stated
-OVERFLOWING = 0.1  # packets lost for each that arrives; a queue that drops so many lasts because it is full
+OVERFLOWING = 0.1  # packets lost for each that arrives, more than on the radio link; a queue that drops so many is full
 STUCK_GROWTH = 1.5  # times its shortest; one that is longer grows
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
@@ -53,7 +54,7 @@ class LinkState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ReceivedUnit:
-    """One access unit as the operator's side received it.
+    """A frame as the operator's side received it, or a part of one: its rest may follow in a later report.
 
     captured  s, by the vehicle's clock
     arrived   s, by the operator's monotonic clock: when its last packet came
@@ -161,7 +162,7 @@ class UplinkMemory:
     units: tuple[_Unit, ...] = ()
     queues: tuple[tuple[float, float, int, int], ...] = ()
     packets: tuple[tuple[float, int, int], ...] = ()
-    resumed: float = -float("inf")
+    resumed: float = -inf
     onset: float | None = None
     peak: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
@@ -207,20 +208,23 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
     """Add units; a capture time that goes back shows a clock that was set, after which all delays are unknown."""
     paths, captured, intervals = dict(uplink.paths), dict(uplink.captured), dict(uplink.intervals)
     kept, resumed = list(uplink.units), uplink.resumed
+    newest = kept[-1].arrived if kept else None
     for unit in units:
-        if unit.captured < captured.get(unit.camera, unit.captured):
+        after = unit.captured - captured.get(unit.camera, unit.captured)
+        if after < -SAME_S:
             paths, captured, intervals, kept = {}, {}, {}, []
-        if unit.captured > captured.get(unit.camera, unit.captured):  # the rest of a unit may follow later
-            intervals[unit.camera] = min(LONGEST_INTERVAL_S, unit.captured - captured[unit.camera])
+        elif after > SAME_S:  # otherwise the rest of the same frame
+            intervals[unit.camera] = min(LONGEST_INTERVAL_S, after)
         captured[unit.camera] = unit.captured
-        delay = unit.arrived - unit.captured
-        known = paths.get(unit.camera) or _new_path(unit, paths.values())
-        # One that misses its last packets seems to have come sooner.
-        path = paths[unit.camera] = known.after(unit, empty=uplink.onset is None) if unit.whole else known
-        shortest = path.delay if path.own else min(other.delay for other in paths.values())
-        if kept and unit.arrived - kept[-1].arrived > PAUSE_S + 1.5 * _frame_interval(intervals):
+        path = paths.get(unit.camera)
+        if unit.whole:  # one that misses its last packets seems to have come sooner
+            path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
+            paths[unit.camera] = path
+        shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
+        if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
-        kept.append(_Unit(unit.arrived, max(0.0, delay - shortest), unit.bytes))
+        newest = max(newest, unit.arrived) if newest else unit.arrived
+        kept.append(_Unit(unit.arrived, max(0.0, unit.arrived - unit.captured - shortest), unit.bytes))
     kept.sort(key=attrgetter("arrived"))  # one that misses its last packets is reported late
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
@@ -238,11 +242,11 @@ def _longest_gap(frame: float) -> float:
 def _rate(uplink: UplinkMemory, last: float, window: float, queue: float) -> tuple[float | None, float]:
     """kbit/s that arrived: since the queue began or doubled where it lasts, and never across a gap. And since when."""
     # From one arrival to another: a window that begins between two would count too much or too little.
-    begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-float("inf"))
+    begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-inf)
     begin = max(begin, uplink.units[0].arrived)
     began = uplink.resumed if uplink.onset is None else max(uplink.resumed, uplink.onset)
-    doubled = max((unit.arrived for unit in uplink.units if 2 * unit.queue <= queue), default=began)
-    for since in (max(begin, began, doubled), max(begin, began)):
+    small = (unit.arrived for unit in uplink.units if 2 * unit.queue <= queue and uplink.onset is not None)
+    for since in (max(begin, began, max(small, default=began)), max(begin, began)):
         if last - since >= EVIDENCE_S:
             return _kbps(uplink.units, since, last), since
     if uplink.resumed > begin or last - begin < EVIDENCE_S:

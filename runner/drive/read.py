@@ -31,7 +31,7 @@ from runner.system.clocks import KEPT_S
 T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
 # Of a vehicle's log, the lines that are neither an event nor a reception report, nor the first.
-OTHER_KINDS = ("decision", "telemetry", "note", "video", "dropped", "ended")
+OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "dropped", "ended")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ RTP_HZ = 90_000  # of video (RFC 6184)
 HEADER_BYTES = 32  # of a packet, in which a header without contributing sources and the capture time end
 CAPTURE_ID = 1  # of the header extension with the capture time
 EXTENDED, SOURCES, MARKER, HALF = 0x10, 0x0F, 0x80, 0x8000  # RFC 3550, section 5.1; half of all sequence numbers
-DROPOUT, MISORDER = 3000, 100  # packets by which a stream jumps that begins anew, ahead or back (RFC 3550, A.1)
+# Packets by which a stream jumps that begins anew, ahead or back, if the next one follows (RFC 3550, A.1).
+DROPOUT, MISORDER = 3000, 100
 ONE_BYTE, FIXED_BYTES, WORD_BYTES, NTP_BYTES = b"\xbe\xde", 12, 4, 8  # RFC 8285, section 4.2; RFC 6051
 
 
@@ -79,6 +80,8 @@ class ArrivingFrames:
         self._whole = False  # no packet of the frame is missing so far
         self._open = self._given = False  # the frame has not ended; what came of it is among the frames
         self._gap = 0.0
+        self._gone: deque[int] = deque(maxlen=MISORDER)  # numbers that are missing
+        self._restarted: int | None = None  # the number after one that jumped
         self.received = self.missing = 0  # packets that came, and that did not before a later one came
 
     def add(self, packet: Packet, now: float, *, again: bool = False) -> bool:
@@ -89,21 +92,17 @@ class ArrivingFrames:
         """
         with self._lock:
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % (2 * HALF)
-            if ahead >= (HALF if again else 2 * HALF - MISORDER):  # sent again, or overtaken
-                self._bytes += packet.bytes
-                self.received, self.missing = self.received + (not again), self.missing - (not again)
+            if ahead >= (HALF if again else 2 * HALF - MISORDER):
+                self._add_older(packet, again)
                 return False
-            ahead = ahead if ahead < DROPOUT else 0
-            self.received, self.missing = self.received + (not again), self.missing + ahead + again
-            if self._newest is None or packet.stamp != self._newest.stamp:
-                self._begin(packet)
-            elif not again:
-                self._gap = max(now - self._at, FORGET * self._gap)
-            self._whole &= not ahead and not again
-            self._newest, self._at, self._bytes = packet, now, self._bytes + packet.bytes
-            self._open, self._given = not packet.last, False
-            if packet.last:
-                self._give()
+            if ahead < DROPOUT:
+                self._add_newer(packet, now, again, whole=not ahead)
+                self._miss(packet.number, ahead)
+                return True
+            expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
+            if packet.number != expected:
+                return False
+            self._add_newer(packet, now, again, whole=False)
             return True
 
     def is_late(self, now: float) -> bool:
@@ -124,6 +123,33 @@ class ArrivingFrames:
             taken = list(self._frames)
             self._frames.clear()
             return taken
+
+    def _add_older(self, packet: Packet, again: bool) -> None:
+        """Take a packet that was overtaken, is sent again, or comes twice."""
+        if again:
+            self._bytes += packet.bytes
+        elif packet.number in self._gone:
+            self._gone.remove(packet.number)
+            self._bytes += packet.bytes
+            self.received, self.missing = self.received + 1, self.missing - 1
+
+    def _add_newer(self, packet: Packet, now: float, again: bool, *, whole: bool) -> None:
+        """Take a packet that is newer than all before. whole: it follows the one before."""
+        self.received, self.missing = self.received + (not again), self.missing + again
+        if self._newest is None or packet.stamp != self._newest.stamp:
+            self._begin(packet)
+        elif not again:
+            self._gap = max(now - self._at, FORGET * self._gap)
+        self._whole &= whole and not again
+        self._newest, self._at, self._bytes = packet, now, self._bytes + packet.bytes
+        self._open, self._given = not packet.last, False
+        if packet.last:
+            self._give()
+
+    def _miss(self, number: int, count: int) -> None:
+        """So many packets before one are missing."""
+        self.missing += count
+        self._gone.extend(gone % (2 * HALF) for gone in range(number - min(count, MISORDER), number))
 
     def _begin(self, packet: Packet) -> None:
         if self._open and not self._given:

@@ -95,7 +95,7 @@ class Receiver:
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
-        self._unread: deque[Arrival] = deque(maxlen=KEPT)  # without RTP: access units, in place of packets
+        self._unread: deque[Arrival] = deque(maxlen=KEPT)  # access units, where no jitter buffer sees packets
         self._packets = (0, 0)  # received and missing, as last read
         self._newest: Arrival | None = None
         # Without RTSP no element reads the capture time of a frame.
@@ -176,9 +176,11 @@ class Receiver:
 
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
-        before, frames = self._packets, [buffer.frames for buffer in self._buffers]
-        now = self._packets = (sum(each.received for each in frames), sum(each.missing for each in frames))
-        return (max(0, now[0] - before[0]), max(0, now[1] - before[1]))  # a new pipeline counts from 0
+        frames = [buffer.frames for buffer in self._buffers]
+        received, missing = sum(each.received for each in frames), sum(each.missing for each in frames)
+        before = self._packets if received >= self._packets[0] else (0, 0)  # a new pipeline counts from 0
+        self._packets = received, max(missing, before[1])  # fewer than before: some were only overtaken
+        return received - before[0], self._packets[1] - before[1]
 
     def request_tails(self) -> None:
         """Request packets whose loss no later packet shows; to be called a hundred times a second."""
@@ -322,10 +324,8 @@ class Receiver:
         return Gst.FlowReturn.OK
 
 
-def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float:
-    """Capture time of a frame, s since 1970; its arrival time if the transport does not carry it."""
-    captured = capture_time(buffer)
-    return time.time() if captured is None else captured
+def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float | None:
+    return capture_time(buffer)
 
 
 def take_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:

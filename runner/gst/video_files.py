@@ -13,9 +13,10 @@ from gi.repository import Gst
 
 DIRECTORY = "video"  # below the drive's directory
 SHIFT_S = 0.0005  # by which times of the file may be off
+NO_TIME: int = Gst.CLOCK_TIME_NONE  # the largest number
 _MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
-Captured = Callable[[Gst.Pad, Gst.Buffer], float]  # when a frame was captured, s since 1970
+Captured = Callable[[Gst.Pad, Gst.Buffer], float | None]  # when a frame was captured, s since 1970; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +26,8 @@ class VideoFiles:
     directory  the drive's; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counts the pipelines with a frame
     on_video   called when a file has its first frame, from another thread: camera, name of the file relative to the
                directory, capture time of that frame in s since 1970
-    on_shift   called when capture times are ahead of the file's by another amount from a frame on: camera, name of the
-               file, its time since the first frame by the file, s, and its capture time, s since 1970
+    on_shift   called when the offset between capture times and times in the file changes at a frame: camera, name of
+               the file, the frame's time since the first one by the file, s, and its capture time, s since 1970
     """
 
     directory: Path
@@ -71,8 +72,8 @@ class VideoFile:
         buffer = info.get_buffer()
         captured = self._captured(pad, buffer)
         if not self._begun:
-            self._came[buffer.pts] = captured
-        elif self._file and not self._failed:
+            self._came[buffer.pts] = time.time() if captured is None else captured
+        elif captured is not None and self._file and not self._failed and self._first <= buffer.pts < NO_TIME:
             after_s = (buffer.pts - self._first) / Gst.SECOND
             if abs(captured - after_s - self._ahead) > SHIFT_S:
                 self._ahead = captured - after_s

@@ -42,12 +42,16 @@ def read_video(path: Path) -> Iterator[Unit]:
     """
     if not path.is_file():
         raise RunError(f"{path}: {file_problem(path)}")
+    try:
+        times = RestoredTimes(stream_times(path))
+    except OSError as error:
+        raise RunError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")
     pipeline.get_by_name("file").set_property("location", str(path))
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
     try:
         pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
-        yield from _pulled(pipeline, path, RestoredTimes(stream_times(path)))
+        yield from _pulled(pipeline, path, times)
     finally:
         pipeline.set_state(Gst.State.NULL)
 

@@ -88,13 +88,15 @@ class ControlLink:
         """Wait until messages for this side will reach it; returns whether they do."""
         return self._listening.wait(seconds)
 
-    def publish(self, topic: str, message: JsonObject) -> None:
+    def publish(self, topic: str, message: JsonObject, *, behind: bool = False) -> None:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
         Without a connection nothing is sent or queued: after a reconnection only current values count. Nor are repeated
         messages while earlier ones wait for the link.
+
+        behind  send it though earlier ones wait
         """
-        if self._listening.is_set() and not (_is_repeated(topic) and self.is_behind()):
+        if self._listening.is_set() and (behind or not _is_repeated(topic) or not self.is_behind()):
             self._send(topic, message)
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
@@ -200,4 +202,5 @@ def _settle(_client: object, _data: object, sock: Any) -> None:
         # Without this, small messages are held back for 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
+        # A socket that is behind is writable again when half of this is left.
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * UNSENT_BYTES)

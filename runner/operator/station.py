@@ -226,7 +226,7 @@ class Station:
             with self._lock:
                 self._clock_asked.append(sent)
             report = replace(report, sent=sent)
-        self._link.publish(self._receptions, to_json(report))
+        self._link.publish(self._receptions, to_json(report), behind=True)  # what it holds has been taken
 
     def _worst_latency_ms(self, now: float) -> float | None:
         """Latency of the slowest picture on show, at most, ms; None: unknown, or nothing is to be shown.
