@@ -267,8 +267,6 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     lossy = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
     carried = link.kbps
-    if lossy and t - cap.changed >= LOSS_S + _rtt_s(link):  # of pictures that miss packets the rate is uncertain
-        carried = min(carried, _in_force(cap, limit) * (1 - exact(link.loss or 0)))
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
     most = min(cap.most.kbps, limit)
     if lossy or _is_narrow(cap, link, t, limit):
