@@ -23,11 +23,13 @@ BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time
 NEW_S = 1.0  # how long a new camera has to send before its own path is measured
 KEPT_S, MOST_UNITS = 1.0, 5000  # units are kept for this long, and no more of them
 SAME_S = 0.001  # capture times that are closer, after rounding, are those of the same frame
-STEADY_S = 0.1  # the link's rate is the highest measured in this time: what is late makes it look lower
+STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is late makes it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
-BUSY_S = 0.1  # likewise, while there is a queue
+# A link whose queue is longer than the first of these has probably fallen: its rate before counts no more. It is busy,
+# so that a short time shows the new one.
+FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
 EMPTY_S = 0.010  # a unit that waited less met no queue
 GROWN_S = 0.020  # a queue from here on may be growing
@@ -191,15 +193,16 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = uplink.onset
     queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
-    # A link with a queue is busy, so that a short time shows its rate.
-    kbps, since = _rate(uplink, last, max(RATE_S, 3 * frame) if onset is None else BUSY_S, queue)
+    fallen = onset is not None and queue > FALLEN_S
+    kbps, since = _rate(uplink, last, FALLEN_RATE_S if fallen else max(RATE_S, 3 * frame), queue)
     uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
     if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
-        rates = (*_since(uplink.rates, max(report.at - STEADY_S, since)), (report.at, kbps))
+        steady = FALLEN_RATE_S if fallen else STEADY_S
+        rates = (*_since(uplink.rates, max(report.at - steady, since)), (report.at, kbps))
         uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
     elif state is LinkState.CLEAR:
         uplink = replace(uplink, rates=())
