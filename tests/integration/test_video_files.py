@@ -30,14 +30,12 @@ class Sides:
     """Two cameras on the vehicle and at the operator, each with a file, and their reported first frames."""
 
     def __init__(self, directory, *words, cameras=CAMERAS, conf=None):
-        self.first_frames, self.shifts, self.reported = [], [], []
+        self.first_frames, self.reported = [], []
         overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", f"media.port={free_port()}", *words]
         vehicle = configuration(overrides, conf, check=check_plan).vehicle()
         self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
         self.plans = compile_plans(self.vehicle)
-        self.files = VideoFiles(
-            directory, lambda *first: self.first_frames.append(first), lambda *shift: self.shifts.append(shift)
-        )
+        self.files = VideoFiles(directory, lambda *first: self.first_frames.append(first), lambda *shift: None)
         self.sending = VehicleSide(self.plans, self.vehicle.media, self.report, self.files)
         self.resize(320, 180)
 
