@@ -12,6 +12,13 @@ settings.register_profile("any machine", deadline=None)  # a busy one may take l
 settings.load_profile("any machine")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
+        if marks & {"timed", "alone"} and "integration" not in item.path.parts:
+            raise pytest.UsageError(f"{item.nodeid}: `make test` runs timed tests of tests/integration only")
+
+
 @pytest.fixture(autouse=True)
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)

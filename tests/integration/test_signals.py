@@ -14,7 +14,7 @@ import pytest
 
 from runner.system.signals import END_S, LIFELINE
 
-pytestmark = [pytest.mark.slow, pytest.mark.timed]  # starts and ends processes, within a limit
+pytestmark = pytest.mark.slow  # starts and ends processes
 # 128 and the signal's number; or the signal itself, if it arrives after the interpreter has put back its handlers
 BY_SIGNALS = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
