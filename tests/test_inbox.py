@@ -30,6 +30,15 @@ def test_one_request_of_each_sender_in_turn() -> None:
     assert [(r.sender, r.document["kbps"]) for r in all_of(inbox)] == [("a", 0), ("b", 9), ("a", 1), ("a", 2)]
 
 
+def test_the_senders_of_what_waits() -> None:
+    inbox = Inbox()
+    assert inbox.senders() == frozenset()
+    for sender in ("a", "b", "a"):
+        inbox.put(make_request(sender, "total_set", kbps=1))
+    inbox.get(time.monotonic())
+    assert inbox.senders() == {"a", "b"}
+
+
 def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_of_the_mode() -> None:
     inbox = Inbox()
     first = make_request("a", "bitrate_predicted", kbps=1)

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
@@ -27,8 +28,9 @@ LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
 FAULTS = 100  # distinct message faults that are reported; further ones are only counted
 LONGEST_FAULT = 1000  # characters of why
-REPEATED = {"telemetry", "reception", "clock", "advice"}  # the next message comes soon: without acknowledgement ...
-UNSENT_BYTES = 4096  # ... and not while this much waits: after an outage of the link it would delay what is current
+REPEATED = {"telemetry", "reception", "clock", "advice"}  # the next message comes soon: without acknowledgement
+SUPERSEDED = REPEATED | {"state"}  # by a later message, and so not sent ...
+UNSENT_BYTES = 4096  # ... while this much waits: after an outage of the link it would delay what is current
 RETAINED = ("state", "telemetry", "configuration")
 
 
@@ -88,16 +90,22 @@ class ControlLink:
         """Wait until messages for this side will reach it; returns whether they do."""
         return self._listening.wait(seconds)
 
-    def publish(self, topic: str, message: JsonObject, *, behind: bool = False) -> None:
+    def publish(self, topic: str, message: JsonObject, *, behind: bool = False) -> bool:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
-        Without a connection nothing is sent or queued: after a reconnection only current values count. Nor are repeated
-        messages while earlier ones wait for the link.
+        Without a connection nothing is sent or queued: after a reconnection only current values count. Messages with
+        acknowledgement that were on their way when the connection was lost are sent again. What a later message
+        supersedes is not sent while earlier ones wait for the link.
 
-        behind  send it though earlier ones wait
+        behind   send it though earlier ones wait
+        returns  False if it was not sent because others wait
         """
-        if self._listening.is_set() and (behind or not _is_repeated(topic) or not self.is_behind()):
-            self._send(topic, message)
+        if not self._listening.is_set():
+            return True
+        if not behind and _is_one_of(SUPERSEDED, topic) and self.is_behind():
+            return False
+        self._send(topic, message)
+        return True
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
         """Disconnect, after sending final messages such as the last will would contain."""
@@ -120,7 +128,8 @@ class ControlLink:
             return False
 
     def _new_client(self) -> _Client:
-        client = _Client(CallbackAPIVersion.VERSION2)
+        # With an id of its own, a new connection ends the old one, whose will the broker would publish later otherwise.
+        client = _Client(CallbackAPIVersion.VERSION2, client_id=f"tod{uuid.uuid4().hex[:20]}")
         client.on_broken = self._on_broken
         client.connect_timeout = CONNECT_S
         client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
@@ -154,18 +163,24 @@ class ControlLink:
             self._on_report(fault)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
-        qos = 0 if _is_repeated(topic) else 1
+        qos = 0 if _is_one_of(REPEATED, topic) else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
 
-    def _connected(self, client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+    def _connected(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
             self._failed_to_connect(RunError(f"refused: {code}".lower()))
         else:
-            client.subscribe([(wanted, 1) for wanted in self._listen])
+            self._subscribe()
+
+    def _subscribe(self) -> None:
+        self._client.subscribe([(wanted, 1) for wanted in self._listen])
 
     def _subscribed(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
         if refused := [wanted for wanted, code in zip(self._listen, codes, strict=False) if code.is_failure]:
-            self._failed_to_connect(RunError(f"refuses to send {', '.join(refused)}"))
+            self._failed_to_connect(RunError(f"refused to subscribe to {', '.join(refused)}"))
+            again = threading.Timer(RETRY_S[-1], self._subscribe)
+            again.daemon = True
+            again.start()
             return
         if self._connection_fault:
             self._connection_fault = None
@@ -189,8 +204,8 @@ class ControlLink:
             self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
 
 
-def _is_repeated(topic: str) -> bool:
-    return bool(set(topic.split("/")[2:]) & REPEATED)
+def _is_one_of(kinds: set[str], topic: str) -> bool:
+    return bool(kinds.intersection(topic.split("/")[2:3]))
 
 
 def _kept(topic: str) -> bool:

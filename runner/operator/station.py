@@ -52,6 +52,7 @@ SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
 CLOCK_S = 0.2  # between two comparisons of the clocks
 MOST_VEHICLES = 100  # whose names are remembered
+UNHEARD_S = 10.0  # for so long it may still hear this side: an outage of one direction must not end its streams
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
 
 OnReply = Callable[[Outcome], None]
@@ -102,6 +103,7 @@ class Station:
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self._telemetry: Telemetry | None = None
+        self._signed_off = False  # by itself, or by its last will
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it arrived
         self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name, for those known to the broker: whether online
@@ -154,6 +156,18 @@ class Station:
             self._pending[identity] = _PendingRequest(on_reply, event["event"], now + self.answer_s)
         self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
 
+    def _announce(self, now: float) -> None:
+        """State that this operator is present, also to a vehicle that is not heard for a moment."""
+        if self.state is not None:
+            self.ask({"event": "operator_connected"})
+        elif self._may_be_heard(now):
+            event = {"event": "operator_connected", "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
+            self._link.publish(self._requests, event)
+
+    def _may_be_heard(self, now: float) -> bool:
+        """Whether the vehicle may hear this side: it was heard lately and did not sign off."""
+        return not self._signed_off and 0 < now - self._vehicle_time[1] <= UNHEARD_S and self._vehicle_time[0] > 0
+
     def _vehicle_now(self, now: float) -> float:
         """The vehicle's time in the newest telemetry, plus the time since."""
         t, came = self._vehicle_time
@@ -188,7 +202,7 @@ class Station:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
         self._look_for_vehicle(now)
-        self.ask({"event": "operator_connected"})  # the heartbeat
+        self._announce(now)  # the heartbeat
         self._compare_clocks(now)
         samples = {name: self._with_latency(received) for name, received in samples.items()}
         for name, received in samples.items():
@@ -213,7 +227,7 @@ class Station:
             UnitReceived(name, round(now - at, 4), round(at - frame.captured - base, 4), frame.bytes, frame.whole)
             for at, name, frame in frames
         )
-        if self.state is None:
+        if not self._may_be_heard(now):
             return
         report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, arrivals.packets, arrivals.lost)
         if arrivals.damaged:
@@ -305,6 +319,7 @@ class Station:
         if state and (missing := self._vehicle.cameras.keys() - state.cameras.keys()):
             raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")
         self._published = state
+        self._signed_off = state is None
         if state:
             self._vehicle_online()
         else:

@@ -112,6 +112,11 @@ class Inbox:
             self._woken = True
             self._filled.notify()
 
+    def senders(self) -> frozenset[str]:
+        """Those whose requests or reports are waiting."""
+        with self._filled:
+            return frozenset(waiting[0].sender for waiting in self._waiting.values())
+
     def full(self, sender: str) -> bool:
         """Whether a further request of a sender would probably be refused."""
         return len(self._waiting.get(sender, ())) >= WAITING

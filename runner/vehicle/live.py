@@ -173,9 +173,9 @@ class _VehicleControl:
         self._live = live
         self._link.connect()
 
-    def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice) -> None:
-        if self._alone.is_set():
-            self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
+    def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice) -> bool:
+        """Returns False if it has to wait, since the link is behind."""
+        return not self._alone.is_set() or self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
     def close(self) -> None:
         if self._announce_timer:

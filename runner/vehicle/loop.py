@@ -48,9 +48,11 @@ from runner.vehicle.uplink import MeasuredUplink
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
+REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; while no operator is present
 CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
 KEY_FRAME_S = 1.0  # between two key frames that repair pictures of a camera: each takes bits from the next ones
 ADVICE_S = 0.2  # how long a reported latency, and what is advised because of it, counts
+POSITION_S = 5.0  # a position that is older is not where the vehicle is
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
 
@@ -81,7 +83,8 @@ class _PendingReply(NamedTuple):
 class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` their events.
 
-    publish    called with the state (decided and applied) whenever it changed, and telemetry a few times a second
+    publish    called with the state (decided and applied) whenever it changed, and telemetry a few times a second;
+               returns False for one that has to wait, since the control link is behind
     on_report  called with one line on what happened and its result
 
     An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
@@ -93,7 +96,7 @@ class ControlLoop:
     pqos: Pqos
     track: Track | None
     log: Log
-    publish: Callable[[VehicleState | Telemetry | SpeedAdvice], None]
+    publish: Callable[[VehicleState | Telemetry | SpeedAdvice], bool]
     on_report: Callable[[str], None]
     refused: int = 0
     errors: int = 0
@@ -117,6 +120,7 @@ class ControlLoop:
         self._operators = Operators(self.vehicle.expires_s)
         self._uplink = MeasuredUplink(self.vehicle)
         self._in_control = ""
+        self._watched = 0.0  # when operators were last watched
         self._began = time.monotonic()
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
@@ -186,7 +190,7 @@ class ControlLoop:
         next_tick = TICK_S
         while not self._stopped and (duration_s is None or self._now() < duration_s):
             if self._now() >= next_tick:
-                self._guarded("clock_advanced", self._tick)
+                self._tick()
                 next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
             item = self._inbox.get(self._began + next_tick)
             if isinstance(item, Reported):
@@ -216,23 +220,29 @@ class ControlLoop:
         return round(time.monotonic() - self._began, 6)
 
     def _tick(self) -> None:
-        """Advance the time and, if the drive comes from a track, the position."""
+        """What is due ten times a second. A step that fails does not stop the others."""
         t = self._now()
         self._refusals = {}
+        self._ticks += 1
         if self.track is not None:
-            self._take(replace(self.track.at(t), t=t))
-        self._take(ClockAdvanced(t=t))
+            at = self.track.at
+            self._guarded("position_reported", lambda: self._take(replace(at(t), t=t)))
+        self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
+        self._guarded("copies_counted", lambda: self._count_copies(t))
+        self._guarded("faults", self._report_faults)
+        if self._ticks % TELEMETRY_TICKS == 0:
+            self._guarded("telemetry", lambda: self._publish_measured(t))
+        self._guarded("operators", lambda: self._watch_operators(t))
+        self._guarded("advice", lambda: self._advise(t))
+
+    def _count_copies(self, t: float) -> None:
         copies = {name: count for name, count in self.applier.copies().items() if count > 1}
         if copies != self._run.state.copies:
             self._take(CopiesCounted(t=t, copies=copies))
+
+    def _report_faults(self) -> None:
         for fault in self.applier.faults():
             self.on_report(fault)
-        self._ticks += 1
-        if self._ticks % TELEMETRY_TICKS == 0:
-            self._publish_measured(t)
-        self._watch_operators(t)
-        self._advise(t)
-        self._publish_state()
 
     def _take_request(self, request: Request) -> None:
         try:
@@ -314,30 +324,34 @@ class ControlLoop:
         if isinstance(event, OperatorConnected):
             self._operators.connected(sender, t)
         elif isinstance(event, OperatorDisconnected):
-            self._operators.disconnected(sender)
+            self._operators.disconnected(sender, t)
         else:
             self._operators.message_received(sender, t)
         self._presence_changed(before, t, "disconnected")
 
     def _watch_operators(self, t: float) -> None:
+        """Notice operators that have fallen silent, unless it is this loop that has stood still."""
+        stalled, self._watched = t - self._watched > SILENT_S / 2, t
         before = self._operators.present
-        self._operators.silent(t)
+        if not stalled:
+            self._operators.silent(t, self._inbox.senders())
         self._presence_changed(before, t, f"has been silent for {SILENT_S:g} s")
 
     def _presence_changed(self, before: frozenset[str], t: float, why: str) -> None:
         now, in_control = self._operators.present, self._operators.in_control
-        if in_control != self._in_control:
-            self._in_control = in_control
-            self.applier.give_control(in_control)
-            self._take(ControlPassed(t=t, operator=in_control))
         for name in sorted(now - before):
             self.on_report(f"operator {name} is present")
         for name in sorted(before - now):
             self.on_report(f"operator {name} {why}")
-        if now and not before:
-            self._take(OperatorConnected(t=t))
-        elif before and not now:
-            self._take(OperatorDisconnected(t=t))
+        if in_control != self._in_control:
+            self._in_control = in_control
+            self._guarded("control", lambda: self._pass_control(in_control, t))
+        if bool(now) != (self._run.state.operator_since is not None):  # as the core knows it: an event may have failed
+            self._take(OperatorConnected(t=t) if now else OperatorDisconnected(t=t))
+
+    def _pass_control(self, operator: str, t: float) -> None:
+        self.applier.give_control(operator)
+        self._take(ControlPassed(t=t, operator=operator))
 
     def _refuse(self, problem: str, t: float, answer: Answer | None) -> None:
         self.refused += 1
@@ -391,12 +405,20 @@ class ControlLoop:
         """Publish the decided and the applied values if either changed; answer requests that are applied now."""
         applied = self.applier.applied()
         due = self._published is None or self._now() - self._published.t >= STATE_S or bool(self._pending)
-        state = self._state(applied) if due or self._publish_again else self._published
-        if state is not None and (state != self._published or self._publish_again):
-            self._publish_again = False
-            self._published = state
-            self.publish(state)
+        state = self._state(applied) if due or self._publish_again else None
+        if state and self._is_news(state) and self.publish(state):
+            self._publish_again, self._published = False, state
         self._pending = [asked for asked in self._pending if not self._answered(asked, applied)]
+
+    def _is_news(self, state: VehicleState) -> bool:
+        """Whether to publish a state. Reasons alone, such as one with a time that counts up, are not urgent."""
+        last = self._published
+        if last is None or self._publish_again:
+            return True
+        if state == last:
+            return False
+        rest_s = REASONS_S if self._operators.present else UNSEEN_REASONS_S
+        return state.t - last.t >= rest_s or _without_reasons(state) != _without_reasons(last)
 
     def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights, faults = self._run.decision, self._run.state.weights, self.applier.sources()
@@ -434,8 +456,13 @@ class ControlLoop:
         }
         prediction = self._run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
-        position = Position.of(self._position) if self._position else None
+        is_known = self._position is not None and t - self._position.t <= POSITION_S
+        position = Position.of(self._position) if self._position and is_known else None
         factor = self._speed_factor(t)
         telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors, factor)
         self.log.record(telemetry)
         self.publish(telemetry)
+
+
+def _without_reasons(state: VehicleState) -> VehicleState:
+    return replace(state, cameras={name: replace(camera, reason="") for name, camera in state.cameras.items()})

@@ -2,12 +2,13 @@
 
 An operator is a client that sends requests under its own id, which is part of the topic. It is present from its
 `operator_connected` on. It leaves by its silence or its `operator_disconnected`; any later message from it brings it
-back.
+back. One of those present is in control.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
@@ -24,6 +25,7 @@ class _Operator:
     since: float = 0.0
     present: bool = False
     announced: bool = False
+    signed_off: bool = False
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
 
 
@@ -36,6 +38,7 @@ class Operators:
     def __init__(self, expires_s: float) -> None:
         self._expires_s = expires_s
         self._known: dict[str, _Operator] = {}
+        self._control = ""  # the operator that was last in control
 
     @property
     def present(self) -> frozenset[str]:
@@ -43,9 +46,22 @@ class Operators:
 
     @property
     def in_control(self) -> str:
-        """The operator that has been present longest without interruption, "" for none."""
+        """The operator in control, "" for none."""
+        return self._control if self._control in self.present else ""
+
+    def _pass_control(self, t: float) -> None:
+        """Control stays with an operator that is present; then it passes to the one that has been present longest.
+
+        One that fell silent keeps it until another has been heard for SILENT_S since: where nobody was heard meanwhile,
+        the link was down, and whoever is heard first after it must not take the pictures from the one that drives.
+        """
         present = {name: operator.since for name, operator in self._known.items() if operator.present}
-        return min(present, key=lambda name: present[name], default="")
+        if not present or self._control in present:
+            return
+        longest = min(present, key=lambda name: present[name])
+        last = self._known.get(self._control)
+        if last is None or last.signed_off or t - max(last.last_message, present[longest]) >= SILENT_S:
+            self._control = longest
 
     def connected(self, name: str, t: float) -> bool:
         """An operator announces itself, or does so again as its heartbeat; returns whether it was absent."""
@@ -59,22 +75,29 @@ class Operators:
         operator.last_message = t
         returns = operator.announced and not operator.present
         if returns:
-            operator.present, operator.since = True, t
+            operator.present, operator.since, operator.signed_off = True, t, False
+        self._pass_control(t)
         return returns
 
-    def disconnected(self, name: str) -> bool:
+    def disconnected(self, name: str, t: float) -> bool:
         """An operator disconnects, by itself or through its last will; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
-            operator.present = False
+            operator.present, operator.signed_off = False, True
+        self._pass_control(t)
         return was_present
 
-    def silent(self, t: float) -> list[str]:
-        """Operators that have been silent for too long since the last call; they count as offline now."""
-        gone = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
+    def silent(self, t: float, heard: Collection[str] = ()) -> list[str]:
+        """Operators that have been silent for too long since the last call; they count as offline now.
+
+        heard  whose messages wait to be processed
+        """
+        late = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
+        gone = [name for name in late if name not in heard]
         for name in gone:
             self._known[name].present = False
+        self._pass_control(t)
         return gone
 
     def expired(self, name: str, t: float, as_of: float) -> str | None:

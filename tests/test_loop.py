@@ -1,0 +1,145 @@
+"""The vehicle's loop with a recording stand-in for the streams, in real time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from runner.configuration.config import configuration
+from runner.drive.log import Log
+from runner.plans import compile_plans
+from runner.records import Telemetry, VehicleState
+from runner.vehicle.inbox import Request
+from runner.vehicle.loop import ControlLoop
+from runner.vehicle.operators import SILENT_S
+from stand_in import RecordingVehicle
+
+pytestmark = pytest.mark.slow  # seconds of real time
+
+
+class Watched:
+    """A loop, and what it published and reported. `publishes` is its answer."""
+
+    def __init__(self, *words: str) -> None:
+        config = configuration(["vehicle=delivery_robot", "pqos=constant", *words], runnable=False)
+        vehicle, (pqos, track) = config.vehicle(), config.pqos()
+        self.side = RecordingVehicle(compile_plans(vehicle))
+        self.published: list[Any] = []
+        self.reports: list[str] = []
+        self.publishes: Callable[[Any], bool] = lambda record: True
+        log = Log(None, "vehicle", {}, {}, self.reports.append)
+        self.loop = ControlLoop(vehicle, self.side, pqos, track, log, self._publish, self.reports.append)
+
+    def _publish(self, record: Any) -> bool:
+        accepted = self.publishes(record)
+        if accepted:
+            self.published.append(record)
+        return accepted
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [record for record in self.published if isinstance(record, kind)]
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        thread = threading.Thread(target=self.loop.run)
+        thread.start()
+        try:
+            yield
+        finally:
+            self.loop.stop()
+            thread.join(10)
+
+    def breathe(self, seconds: float, name: str = "driver") -> None:
+        """Signs of life of an operator."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.loop.take(Request(name, {"event": "operator_connected"}))
+            time.sleep(SILENT_S / 5)
+
+
+def until(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_step_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched()
+
+    def fail() -> None:
+        raise OSError("no such device")
+
+    monkeypatch.setattr(watched.side, "copies", fail)
+    with watched.running():
+        until(lambda: len(watched.of(Telemetry)) > 2)
+        watched.breathe(0.3)
+        until(lambda: "operator driver has been silent for 1 s" in watched.reports)
+    assert "copies_counted: OSError: no such device" in watched.reports
+    assert watched.loop.errors > 2
+
+
+def test_an_operator_returns_though_control_cannot_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched("modes=safe")
+
+    def fail(operator: str) -> None:
+        raise OSError("broken pipe")
+
+    monkeypatch.setattr(watched.side, "give_control", fail)
+    with watched.running():
+        watched.breathe(0.2)
+        until(lambda: not any(camera.sending for camera in watched.of(VehicleState)[-1].cameras.values()))
+        watched.breathe(0.4)
+        assert all(camera.sending for camera in watched.of(VehicleState)[-1].cameras.values())
+    assert "control: OSError: broken pipe" in watched.reports
+
+
+def test_a_reason_that_counts_up_is_published_seldom_while_nobody_is_there() -> None:
+    """`operator gone for 2.3 s` of eight cameras is some kB, five times a second over the link."""
+    watched = Watched("modes=safe")
+    with watched.running():
+        watched.breathe(0.2)
+        until(lambda: not any(camera.sending for camera in watched.of(VehicleState)[-1].cameras.values()))
+        count = len(watched.of(VehicleState))
+        time.sleep(2)
+        assert "operator gone for" in watched.of(VehicleState)[-1].cameras["front"].reason
+        assert len(watched.of(VehicleState)) == count
+
+
+def test_a_state_that_has_to_wait_is_published_later() -> None:
+    watched = Watched("modes=open_loop", "mode=collective")
+    with watched.running():
+        until(lambda: watched.of(VehicleState))
+        watched.publishes = lambda record: not isinstance(record, VehicleState)
+        for kbps in (700, 800):
+            watched.loop.post({"event": "total_set", "kbps": kbps})
+            time.sleep(0.3)
+        count = len(watched.of(VehicleState))
+        watched.publishes = lambda record: True
+        until(lambda: len(watched.of(VehicleState)) > count)
+        assert watched.of(VehicleState)[-1].asked_kbps == 800
+
+
+def test_operators_are_present_after_the_loop_itself_stood_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their messages of that time were waiting."""
+    watched = Watched()
+    turn, stood = watched.side.turn, threading.Event()
+
+    def stand_still(commands: Any) -> None:
+        if not stood.is_set() and watched.published:
+            stood.set()
+            time.sleep(3 * SILENT_S)
+        turn(commands)
+
+    with watched.running():
+        watched.breathe(0.3)
+        monkeypatch.setattr(watched.side, "turn", stand_still)
+        watched.breathe(4 * SILENT_S)
+    assert stood.is_set()
+    assert watched.reports.count("operator driver is present") == 1
+    assert not [line for line in watched.reports if "silent" in line]
