@@ -65,3 +65,13 @@ def test_the_beginning_of_a_unit_is_enough() -> None:
     damage = Damage("h264")
     assert damage.add(True, lambda: b"")
     assert not damage.add(False, lambda: (KEY + noise)[:HEAD_BYTES])
+
+
+def test_what_was_missed_before_the_first_unit_shows_likewise() -> None:
+    damage = Damage("h264", lasts=True)
+    assert [damage.add(False, lambda: DELTA), damage.add(False, lambda: KEY), damage.add(False, lambda: DELTA)] == [
+        True,
+        False,
+        False,
+    ]
+    assert not Damage("vp8", lasts=True).lasts

@@ -117,7 +117,7 @@ class Receiver:
         self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
-        self._built = False
+        self._built = self._inspects = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
         self._silent = time.monotonic()  # when the camera was last not expected to send
         self.should_send: bool | None = None  # None: unknown while the vehicle is offline
@@ -153,8 +153,9 @@ class Receiver:
             self._supervised.restart(f"no frame for {STALL_S:g} s")
         else:
             return received
-        # Only one frame in many is inspected: no Python runs for the others.
-        self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
+        if not self._inspects:  # only one frame in many: no Python runs for the others
+            self._inspects = True
+            self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
 
     @property
@@ -172,7 +173,7 @@ class Receiver:
     @property
     def is_damaged(self) -> bool:
         """Whether the newest picture shows that packets were lost for good."""
-        return self._damage.lasts
+        return self._begun and self._damage.lasts
 
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and missing at first, since the last call. From any one thread."""
@@ -197,14 +198,15 @@ class Receiver:
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
+        # A stream that others watch goes on: what was missed meanwhile shows until a picture is healed.
+        self._damage = Damage(self._codec, lasts=self._built)
         self._built = True
         self._close_filter()
         self._moved = (self._before.frames, time.monotonic())
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
         self._received = pipeline.get_by_name("received")
-        self._begun = False
-        self._damage = Damage(self._codec)
+        self._begun = self._inspects = False
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
@@ -272,6 +274,7 @@ class Receiver:
 
     def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         buffer, now = info.get_buffer(), time.monotonic()
+        self._inspects = False
         captured, (pts, arrived) = capture_time(buffer), self._entered
         if captured is not None:
             self._latency.set(1000 * (time.time() - captured))

@@ -15,11 +15,13 @@ class Damage:
     A picture is healed by an IDR picture (of H.265: IRAP), or after a whole refresh wave: `recovery_frame_cnt` frames
     after a recovery point (ITU-T H.264, D.2.8). A loss within the wave damages what the wave has already painted.
     Of other codecs it is unknown what heals; only incomplete units count as damaged.
+
+    lasts  whether units before the first were missed
     """
 
-    def __init__(self, codec: str) -> None:
+    def __init__(self, codec: str, *, lasts: bool = False) -> None:
         self._codec = codec
-        self.lasts = False  # until the picture is healed
+        self.lasts = lasts and codec in CODECS  # until the picture is healed
         self._left: int | None = None  # frames of the wave that heals; None: none has begun since the loss
 
     def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:

@@ -130,6 +130,22 @@ def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
     assert connected[-1] - connected[0] < 3 * 2.0
 
 
+def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
+    """Another viewer keeps the stream running, so that it does not begin with an IDR picture."""
+    vehicle, plans = compiled("media.max_viewers=2")
+    with sending(vehicle, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
+        watched()
+        more()
+        assert side.sample(SENDING)["front"].damaged == 0
+        receiver = side._receivers["front"]
+        side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+        more()
+        until(lambda: side.sample(SENDING)["front"].damaged > 0 or not receiver.is_damaged, every_s=0.1)
+        seen = side.sample(SENDING)["front"]
+        assert seen.damaged > 0, messages
+        until(lambda: side.sample(SENDING) and not receiver.is_damaged, every_s=0.1)
+
+
 @pytest.mark.alone
 def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     """As rtspsrc can on network faults, on its way to NULL."""
