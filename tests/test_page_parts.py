@@ -187,6 +187,13 @@ def test_history_keeps_a_point_a_second_for_minutes():
     assert columns["cameras"]["front"]["kbps"] == columns["time"]
 
 
+def test_history_begins_anew_when_the_clock_is_set_back():
+    history = History()
+    for t in (100, 101, 50, 51):
+        history.add(sample(t))
+    assert history.columns()["time"] == [50, 51]
+
+
 def test_history_keeps_none_for_unknown_values():
     history = History()
     history.add(sample(0))

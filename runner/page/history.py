@@ -20,6 +20,8 @@ class History:
         self._samples: deque[Sample] = deque(maxlen=KEPT)
 
     def add(self, sample: Sample) -> None:
+        if self._samples and sample.t <= self._samples[-1].t - EVERY_S:
+            self._samples.clear()  # the clock was set
         if not self._samples or sample.t - self._samples[-1].t >= EVERY_S:
             self._samples.append(sample)
 

@@ -208,7 +208,7 @@ class PageServer(Listener):
                 self._on_message(viewer, message.data)
 
     def _greet(self, viewer: PageViewer) -> None:
-        viewer.tell("hello", _introduction(self._vehicle))
+        viewer.tell("hello", {**_introduction(self._vehicle), "answer_s": self._station.answer_s})
         viewer.tell("state", state_to_json(self._station.state))
         viewer.tell("history", self._history.columns())
         for note in self._notes:

@@ -139,6 +139,23 @@ def test_single_a_dragged_region_changes_what_is_received(page):
     until(lambda: luma(page, "front_center")[0].shape == full.shape)
 
 
+def test_a_button_released_outside_the_picture_leaves_no_drag_behind(page):
+    """The next click must not send a region of the smallest size."""
+    choose(page, "single")
+    tile = page.locator("[data-camera=front_center] canvas").bounding_box()
+    x, y = tile["x"] + tile["width"] / 2, tile["y"] + 2
+    before = page.evaluate("tod.state.cameras.front_center.roi")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x, tile["y"] - 100)
+    page.mouse.up()
+    page.mouse.move(x, y + 40, steps=4)
+    page.mouse.move(x, y + 80, steps=4)
+    page.mouse.click(x, y + 80)
+    assert send(page, event="weights_set", weights={"front_center": 1})["result"] == "applied"  # after any region
+    assert state(page)["cameras"]["front_center"]["roi"] == before
+
+
 def test_single_numbers_and_sliders_set_one_camera(page):
     choose(page, "single")
     page.locator("[data-camera=top_left] .head b").click()
@@ -389,6 +406,14 @@ def test_another_page_watches_and_may_take_control(chromium, demo, page):
         until(lambda: page.evaluate("tod.control === 'another'"))
     until(lambda: page.evaluate("tod.control === 'nobody'"))
     take_control(page)
+
+
+def test_without_its_worker_a_page_shows_no_camera_as_live(chromium, demo):
+    with opened(chromium, demo) as page:
+        all_live(page)
+        page.evaluate("boot.worker.terminate()")
+        page.wait_for_selector("#banner:not([hidden])")
+        assert {text.split()[1] for text in page.locator("[data-camera] .status").all_inner_texts()} == {"LOST"}
 
 
 def test_a_copy_of_a_page_only_watches(page):

@@ -222,7 +222,7 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
             all_live(page)
             return
         tile = page.locator("[data-camera=rear]")
-        expected = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Choose a graph of H\.264, or .*"
+        expected = r"This browser has no decoder for H\.265 \(hev1\.1\.6\.L\d+\.90\)\. Use an H\.264 graph or .*"
         until(lambda: re.fullmatch(expected, tile.locator(".refused").inner_text()))
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         assert not tile.locator(".rates").inner_text().startswith("–")  # it shows the rates of the received stream

@@ -74,6 +74,11 @@ test("notes are newest first and bounded", () => {
   assert.deepEqual(heard.at(-1), { time: 100.5, text: "late", level: "note" });
 });
 
+test("a station's clock that is set back begins the series anew", () => {
+  for (const time of [100, 101, 50, 51]) take(sample(time));
+  assert.deepEqual(store.series.time, [50, 51]);
+});
+
 test("samples become a point a second, and what is not known is null", () => {
   for (const time of [0, 0.25, 0.5, 0.75, 1, 1.25, 2]) take(sample(time));
   assert.deepEqual(store.series.time, [0, 1, 2]);

@@ -6,8 +6,9 @@ import { send } from "./link.js";
 import { by, mark, whole, write } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
+const MOVING = ["live", "damaged", "late"];
 const COMPARE_MS = 2000;
-const UNKNOWN = "▲ The vehicle does not state its clock: the age of its pictures is unknown; LATE is not shown";
+const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer from the vehicle's clock; LATE is not shown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 
 let compared = performance.now(); // when the clocks were last known to be compared, or could not be
@@ -73,7 +74,9 @@ function refreshBanner() {
 /** Warn once the difference of the clocks has been unknown for a while: it takes a moment to measure. */
 function refreshWarning() {
   const online = store.connected && store.state?.online && store.sample;
-  if (!online || Number.isFinite(store.sample?.clock_bound_ms)) compared = performance.now();
+  const moving = Object.entries(store.ages).filter(([name]) => MOVING.includes(store.status[name]));
+  const known = moving.every(([, { age_ms, bound_ms }]) => Number.isFinite(age_ms) && Number.isFinite(bound_ms));
+  if (!online || (known && Number.isFinite(store.sample?.clock_bound_ms))) compared = performance.now();
   by("warning").hidden = performance.now() - compared < COMPARE_MS;
   write(by("warning"), by("warning").hidden ? "" : UNKNOWN);
 }

@@ -3,12 +3,19 @@
 import { publish, store, take } from "./store.js";
 
 const { canShowVideo, early, worker } = globalThis.boot;
+const HUNG_MS = 1500; // the worker reports four times a second
+const CHECK_MS = 250;
 const questions = new Map();
 let asked = 0;
+let told = performance.now(); // when the worker last reported
+let checked = told;
+/** @type {{connected: boolean}|null} */
+let hung = null; // while it does not: what it last stated
 
 const heard = {
   server: ({ message }) => take(message),
   socket({ open }) {
+    if (hung) return void (hung.connected = open);
     store.connected = open;
     if (!open) store.holder = "nobody";
     publish("socket", open);
@@ -19,6 +26,8 @@ const heard = {
     publish("status", { camera, status });
   },
   ages({ ages, skew_ms }) {
+    told = performance.now();
+    if (hung) revive(ages);
     store.ages = ages;
     store.skew_ms = skew_ms;
     publish("ages", ages);
@@ -34,6 +43,26 @@ const heard = {
 export function start() {
   for (const data of early) heard[data.kind](data);
   worker.onmessage = ({ data }) => heard[data.kind](data);
+  setInterval(supervise, CHECK_MS);
+}
+
+/** A worker that hangs or has died shows standing pictures as live: its page must not. */
+function supervise() {
+  const time = performance.now();
+  const late = time - checked > 2 * CHECK_MS; // this page has stood still itself: the worker's messages are about to come
+  checked = time;
+  if (hung || late || time - told < HUNG_MS || !Object.keys(store.status).length) return;
+  hung = { connected: store.connected };
+  store.connected = false;
+  publish("socket", false);
+  for (const camera of Object.keys(store.status)) heard.status({ camera, status: "lost", why: store.refused[camera] });
+}
+
+function revive(ages) {
+  store.connected = hung?.connected ?? false;
+  hung = null;
+  publish("socket", store.connected);
+  for (const [camera, { status }] of Object.entries(ages)) heard.status({ camera, status, why: store.refused[camera] });
 }
 
 export const send = (message) => worker.postMessage({ order: "send", message });

@@ -4,7 +4,7 @@ import { camera, decided, inControl, listen, mode, store } from "./store.js";
 import { pending, request, whyNoControl, complain } from "./requests.js";
 import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js";
 import { makeSlider } from "./slider.js";
-import { SHAPES, switchCamera, unapplied } from "./tiles.js";
+import { SHAPES, STILL, switchCamera, unapplied } from "./tiles.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, region, size, tenth, whole, write } from "./format.js";
 
@@ -32,7 +32,8 @@ const bitrate = makeSlider({
   label: "bitrate",
   data: "kbps",
   control: () => `kbps:${name()}`,
-  send: (kbps) => configure("kbps", kbps, `${kbps} kbit/s`),
+  about: name,
+  send: (kbps, about) => configure("kbps", kbps, `${kbps} kbit/s`, about),
 });
 const choices = make("span", { class: "choices", role: "group", "aria-label": "factors of this camera" });
 const free = number("scaling", "factor", { min: 0.01, max: 1, step: "any" });
@@ -47,8 +48,8 @@ const rows = new Map();
 const STAGES = {
   capture: ["Capture", "on the vehicle, to the encoder: conversion, region and scaling"],
   encode: ["Encode", "through the encoder"],
-  link: ["Link", "from the encoder to the station; right to within the bound of the clocks"],
-  buffer: ["Jitter buffer", "wait for packets that are late, overtaken or sent again"],
+  link: ["Link", "from the encoder to the station; accurate to within the error bound of the clocks"],
+  buffer: ["Jitter buffer", "wait for late, reordered or retransmitted packets"],
   page: ["To this page", "from the station to this page"],
   decode: ["Decode", "in this browser; in a page without video, at the station"],
   draw: ["Draw", "until the picture was drawn; the screen adds its own delay"],
@@ -90,20 +91,20 @@ function stageTable() {
 
 // --- requests ---------------------------------------------------------------------------------------------------------
 
-function configure(key, value, words) {
-  request(`${key}:${name()}`, { event: "camera_configured", camera: name(), [key]: value }, `${name()} ${words}`);
+function configure(key, value, words, about = name()) {
+  request(`${key}:${about}`, { event: "camera_configured", camera: about, [key]: value }, `${about} ${words}`);
 }
 
 function setFactor(value) {
   edited.delete(free);
-  if (!(value > 0 && value <= 1)) return complain("a factor is above 0 and at most 1");
+  if (!(value > 0 && value <= 1)) return complain("the factor must be above 0 and at most 1");
   configure("scaling", value, `factor ${factor(value)}`);
 }
 
 function setWeight() {
   edited.delete(weight);
   const value = +weight.value;
-  if (weight.value === "" || !(value >= 0)) return complain("a weight is a number from 0");
+  if (weight.value === "" || !(value >= 0)) return complain("the weight must be a number from 0");
   request(`weight:${name()}`, { event: "weights_set", weights: { [name()]: value } }, `${name()} weight ${value}`);
 }
 
@@ -215,7 +216,7 @@ function refreshComparison(now) {
 
 /** Where the time goes between capture and drawing. Stages are sampled one by one: their sum is about the latency. */
 function refreshStages() {
-  const silent = !store.connected || !decided(name())?.sending;
+  const silent = !store.connected || !decided(name())?.sending || STILL.includes(store.status[name()]);
   const drawn = silent ? undefined : store.ages[name()];
   const stages = silent ? undefined : store.sample?.cameras[name()]?.stages_ms;
   const parts = { ...stages, ...(Number.isFinite(drawn?.age_ms) ? drawn?.parts_ms : {}) };

@@ -6,7 +6,7 @@
 import { inControl, listen, note, publish, store } from "./store.js";
 import { send } from "./link.js";
 
-const GIVE_UP_MS = 6000; // the station itself answers "timed out" long before
+const GIVE_UP_MS = 2000; // after the station itself would have answered "timed out"
 const PREFIX = Math.random().toString(36).slice(2, 8);
 
 /**
@@ -26,7 +26,7 @@ let count = 0;
 export function request(control, event, words) {
   if (!inControl()) return complain(whyNoControl());
   const id = `${PREFIX}-${++count}`;
-  const timer = setTimeout(() => answer({ id, result: "timed out", reason: "no answer from the station" }), GIVE_UP_MS);
+  const timer = setTimeout(() => answer({ id, result: "timed out", reason: "no answer from the station" }), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
   requests.pending.set(id, { id, control, event, words, timer, sent: Date.now() });
   send({ id, ...event });
   publish("requests");

@@ -95,10 +95,12 @@ export function dragRegion(name, box) {
   };
 
   box.addEventListener("pointerdown", (event) => {
-    if (event.button === 0 && seenRegion(name)) from = point(event);
+    dragging = false;
+    from = event.button === 0 && seenRegion(name) ? point(event) : null;
   });
   box.addEventListener("pointermove", (event) => {
     if (!from) return;
+    if (!(event.buttons & 1) || !seenRegion(name)) return end(); // released elsewhere, or the vehicle is offline
     const here = point(event);
     if (!dragging && Math.hypot(here.x - from.x, here.y - from.y) < START_PX) return;
     if (!dragging && whyNoRegion()) {
@@ -110,7 +112,7 @@ export function dragRegion(name, box) {
     place(region(event));
   });
   box.addEventListener("pointerup", (event) => {
-    const wish = dragging ? region(event) : null;
+    const wish = dragging && seenRegion(name) ? region(event) : null;
     end();
     if (wish) sendRegion(name, wish);
   });

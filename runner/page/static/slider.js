@@ -11,10 +11,11 @@ const SEND_EVERY_MS = 200;
 const HAND_MS = 400;
 
 /**
- * @param {object} what label, data (value of data-control), id of the number, send(kbps), control() name of the request
+ * @param {object} what label, data (value of data-control), id of the number, about() what the value is of, send(kbps, about),
+ *   control() name of the request
  * @returns {{element, update({value, max, why}), reset()}}
  */
-export function makeSlider({ label, data, id, send, control }) {
+export function makeSlider({ label, data, id, about, send, control }) {
   const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": `${label}, slider`, "data-control": `${data}-slider` });
   const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, "aria-label": `${label}, kbit/s`, "data-control": data });
   const tick = make("i", { class: "tick", "aria-hidden": "true" });
@@ -26,14 +27,14 @@ export function makeSlider({ label, data, id, send, control }) {
   let held = false;
 
   const chosen = () => toKbps(+range.value, max);
-  const wish = throttle(send, SEND_EVERY_MS);
+  const wish = throttle((value) => send(value.kbps, value.about), SEND_EVERY_MS);
   range.addEventListener("pointerdown", () => (held = true));
   range.addEventListener("pointerup", () => (held = false));
   range.addEventListener("pointercancel", () => (held = false));
   range.addEventListener("input", () => {
     touched = performance.now();
     number.value = String(chosen());
-    wish(chosen());
+    wish({ kbps: chosen(), about: about?.() }); // sent a moment later, when another camera may be selected
   });
   number.addEventListener("input", () => (edited = true));
   number.addEventListener("blur", () => (edited = false));
@@ -42,7 +43,7 @@ export function makeSlider({ label, data, id, send, control }) {
     if (number.value === "") return;
     const kbps = Math.max(1, Math.min(max, Math.round(+number.value)));
     range.value = String(toStep(kbps, max));
-    send(kbps);
+    send(kbps, about?.());
   });
 
   return {

@@ -16,7 +16,7 @@ const listeners = new Map();
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[]}} Hello
+ * @typedef {{vehicle: string, cameras: Camera[], answer_s: number}} Hello answer_s: by then the station has answered a request
  * @typedef {object} Applied what was read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
@@ -169,9 +169,10 @@ function history(message) {
 }
 
 function extend(sample) {
+  const last = store.series.time.at(-1);
+  if (last !== undefined && sample.time < last - 0.99) store.series = emptySeries(Object.keys(store.series.cameras)); // the clock was set
+  else if (last !== undefined && sample.time < last + 0.99) return;
   const { series } = store;
-  const last = series.time.at(-1);
-  if (last !== undefined && sample.time < last + 0.99) return;
   push(series, "time", sample.time);
   for (const key of ["predicted_kbps", "allocated_kbps", "actual_kbps"]) push(series, key, sample[key]);
   for (const key of ["lat", "lon"]) push(series, key, sample.position?.[key]);

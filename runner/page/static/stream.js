@@ -17,6 +17,7 @@ const LAG_MS = 2000; // delay beyond the usual one: as long as the burst that wo
 const RESYNC_EVERY_MS = 2000; // doubled each time it did not help: a burst costs more than the fault it repairs
 const RESYNC_SELDOM_MS = 16000;
 const SETTLE_MS = 2000; // after a restart the decoder may take this long for the burst
+const REFUSED_MS = 5000; // between two questions whether the browser decodes a stream now
 const LATE_HOLD_MS = 500; // how long one late picture is indicated
 const STAGES = 1200;
 
@@ -24,7 +25,7 @@ const STAGES = 1200;
 /** @typedef {{picture: Picture, meta: any}} Shown */
 
 export class Stream {
-  arrived = now(); // page times of the newest unit and of the newest picture, or of the start of the stream
+  arrived = now(); // page times of the newest unit and of the newest picture to draw, or of the start of the stream
   decoded = this.arrived;
   drawn = false;
   damaged = false; // the picture drawn shows that packets were lost
@@ -55,6 +56,7 @@ export class Stream {
     this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // of the decoder, the last one
     this.refused = isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there is no picture
+    this.asked = now(); // when the browser last stated that it has no decoder
     this.stages = [];
     this.first_drawn = null;
     this.first = null; // for tests, the first picture drawn
@@ -99,7 +101,9 @@ export class Stream {
   receive(unit) {
     const received = now();
     this.counts.received++;
-    this.arrived = received;
+    // The first units may have reached the station long ago: those of a camera that sends no longer.
+    const came = unit.arrived - this.station.clock.offset + this.station.clock.bound;
+    this.arrived = this.drawn || !Number.isFinite(came) ? received : Math.min(received, came);
     if (this.refused && unit.flags & KEY && isKnown(this.camera.codec)) this.reconsider(unit.data);
     if (!this.station.video || this.refused) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
     if (unit.flags & RESTART) this.restart();
@@ -136,13 +140,17 @@ export class Stream {
   async refusal(codec) {
     const { supported } = await VideoDecoder.isConfigSupported({ codec }).catch(() => ({ supported: false }));
     const name = nameOf(this.camera.codec);
-    return supported ? "" : `This browser has no decoder for ${name} (${codec}). Choose a graph of H.264, or a browser that has one.`;
+    return supported ? "" : `This browser has no decoder for ${name} (${codec}). Use an H.264 graph or another browser.`;
   }
 
-  /** A different stream may have a profile that the browser decodes. */
-  reconsider(data) {
+  /** A different stream may have a profile that the browser decodes, and a decoder may be missing for a moment only. */
+  async reconsider(data) {
     const sps = spsOf(data, this.camera.codec);
-    if (sps && String(sps) !== this.sps) this.refused = "";
+    if (!sps) return;
+    if (String(sps) !== this.sps) return void (this.refused = "");
+    if (now() - this.asked < REFUSED_MS) return;
+    this.asked = now();
+    if (!(await this.refusal(this.codec))) this.refused = "";
   }
 
   decode(unit, received) {
@@ -179,7 +187,7 @@ export class Stream {
     this.close();
     const { codec } = this;
     const why = await this.refusal(codec);
-    if (why && codec === this.codec) return void (this.refused = why); // another burst would not help
+    if (why && codec === this.codec) return void Object.assign(this, { refused: why, asked: now() }); // another burst would not help
     this.counts.errors++;
     this.error = String(error);
     this.resync();
@@ -208,10 +216,9 @@ export class Stream {
     const meta = this.meta.get(frame.timestamp);
     for (const key of this.meta.keys()) if (key <= frame.timestamp) this.meta.delete(key);
     this.counts.decoded++;
-    this.decoded = now();
     const behind = this.settling() && this.queued() > 1; // there is already a newer one
     if (!meta || meta.flags & CATCH_UP || behind) return frame.close();
-    this.wait(frame, { ...meta, decoded: this.decoded }, this.decoder);
+    this.wait(frame, { ...meta, decoded: now() }, this.decoder);
   }
 
   async wait(frame, meta, decoder) {
@@ -220,6 +227,7 @@ export class Stream {
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
     this.waiting = { picture, meta };
+    this.decoded = now(); // what is decoded and never drawn leaves the picture standing still
     this.station.wake();
   }
 

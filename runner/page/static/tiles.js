@@ -12,6 +12,7 @@ export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■",
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
 const ALARMS = ["late", "damaged", "frozen", "lost", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
+export const STILL = [...SILENT, "frozen"]; // what is on show has another age than when it was drawn
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency that may be wrong by more is marked
@@ -152,17 +153,18 @@ function refreshCaption(name, { rates, form, reason }) {
   const now = decided(name);
   const silent = !store.connected || SILENT.includes(store.status[name]);
   const sample = silent ? undefined : store.sample?.cameras[name];
-  const { age_ms, bound_ms } = silent ? NO_AGE : ageOf(name, sample);
+  const still = silent || STILL.includes(store.status[name]);
+  const { age_ms, bound_ms } = still ? NO_AGE : ageOf(name, sample);
   const differs = now ? unapplied(now) : [];
   const bitrate = differs.includes("bitrate") || differs.includes("sending");
   const region = differs.includes("size") || differs.includes("ROI");
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
-  const repair = sample?.buffer_ms ? `; a picture waits up to ${sample.buffer_ms} ms for packets that are sent again` : "";
+  const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
   caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
-  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · capture to drawing, and by how much that may be wrong; ${wire}${repair}`);
+  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`);
   mark(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
   write(reason, now?.reason ?? "");
 }

@@ -41,6 +41,7 @@ let streams = []; // in the order of hello, by which the binary messages are ind
 let described = "";
 let asleep = true;
 let watched = now();
+let stalled = false; // at the last tick
 const log = [];
 
 const tell = (message) => postMessage(message);
@@ -153,7 +154,8 @@ function watch() {
   const late = now() - watched > 3 * WATCH_MS;
   watched = now();
   // After a stall the units that arrived meanwhile are still queued: take them in first, and judge at the next tick.
-  if (late) return;
+  stalled = late && !stalled; // and no longer than that: a worker that is always late must judge, too
+  if (stalled) return;
   supervise();
   judgeAll();
 }
