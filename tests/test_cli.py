@@ -47,6 +47,9 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
         (["print", "--total", "3"], "command line: --total: flags are not supported; write NAME=VALUE, or --help"),
         (["print", "total_kbps"], "command line: total_kbps: must be NAME=VALUE"),
         (["replay", "conf=/nowhere"], "command line: conf: /nowhere: no such directory"),
+        (["replay", "input="], "command line: input: '': must not be empty"),  # from an unset variable of the shell
+        (["vehicle", "log="], "command line: log: '': must not be empty"),
+        (["report", "drive", "output="], "command line: output: '': must not be empty"),
     ],
 )
 def test_words_that_are_no_command(tod: Command, words: list[str], expected: str) -> None:

@@ -164,6 +164,8 @@ def advanced(
     lossy = cap.losses.share > TOO_LOSSY and t - cap.losses.t <= LOSING_S
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
+        if cap.stall and cap.before:  # after the stall the link carries less than before
+            cap = replace(cap, before=min(cap.before, link.kbps))
         return _doubting(_cut(cap, link, t, limit, full), link, t, full, least_trust)
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
         return _recovered(_resumed(cap, limit), link, t, limit, full)

@@ -105,7 +105,7 @@ def _confirmed(trust: Trust, t: float, least: Fraction, position: PositionReport
         return trust
     # Use the mildest of these falls: a limit that is only late is far off at first, and almost right soon after.
     share = max(least, *(part for _, part in doubts))
-    if t - doubts[-1][0] < CONFIRM_S or share >= trust.share:
+    if not CONFIRM_S <= t - doubts[-1][0] <= EPISODE_S or share >= trust.share:
         return trust
     places = trust.places
     if position is not None and t - position.t <= KNOWN_S:

@@ -14,7 +14,7 @@ import os
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -85,7 +85,7 @@ def measure(
         work = {name: pool.submit(one, name) for name in names}
         while not all(each.done() for each in work.values()):
             progress(sum(each.done() for each in work.values()) / len(work))
-            wait(work.values(), TELL_S, FIRST_EXCEPTION)
+            wait(work.values(), TELL_S)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
     for name, each in work.items():

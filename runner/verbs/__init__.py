@@ -127,6 +127,9 @@ class Arguments:
         return number
 
     def path(self, key: str) -> Path | None:
+        """A file or directory; None if not given."""
+        if self.values.get(key) == "":  # an unset variable of the shell, which would mean the current directory
+            raise UserError("command line", key, "''", "must not be empty")
         return Path(self.values[key]) if key in self.values else None
 
 
