@@ -149,6 +149,14 @@ def test_a_link_that_falls_far_is_not_taken_for_one_that_others_fill(kbps: float
     assert done.kbps(25, 60) >= 0.9 * kbps
 
 
+def test_after_a_stall_no_more_is_restored_than_the_link_carries_since() -> None:
+    """As in another cell: half of what arrived before would fill the queue again."""
+    link = Link(steps((0, 8000), (20, 800)), delay_s=stalls((20, 22.4)), one_way_s=0.02, queue_s=0.5)
+    done = drive(link, steps((0, 8000)), 34, fps=15)
+    assert max(cap for t, cap, _ in done.caps if t > 23) <= 1200
+    assert done.kbps(24, 34) >= 0.9 * 800
+
+
 def test_a_prediction_that_falls_and_is_still_too_high_fills_no_queue() -> None:
     link = Link(steps((0, 6000), (20, 1190)), one_way_s=0.05)
     done = drive(link, steps((0, 6000), (20, 1400)), 60, fps=15)
