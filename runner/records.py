@@ -170,7 +170,7 @@ class SpeedAdvice:
 
     The driving function must assume 0 as soon as `expires_s` have passed without a newer one.
 
-    latency_ms  from light to light, at most; None: unknown
+    latency_ms  glass to glass, at most; None: unknown
     """
 
     t: float

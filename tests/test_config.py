@@ -44,6 +44,8 @@ TABLE_1 = {  # S, size in px, Hz, b_min,r and b_full in kbit/s
     "top_rear": (*TOP, "0 200 400", 3000),
 }
 
+RISING = "must start at 0 and be strictly increasing"
+
 
 def test_the_papers_vehicle_is_table_1_digit_by_digit() -> None:
     def numbers(values: tuple[object, ...]) -> str:
@@ -191,7 +193,7 @@ def test_the_three_messages_of_the_style_guide(
     *messages, summary = found.err.splitlines()
     assert sorted(messages) == [
         "conf/cameras/rear_center.yaml: heigth_px: unknown key, did you mean height_px?",
-        "conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: must rise from 0",
+        f"conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: {RISING}",
         "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
     ]
     assert summary == "3 problems, nothing was started"
@@ -223,12 +225,24 @@ REAR, GRAPH, PAPER, ROBOT = (
             {"[0, 400, 1800]": "[0, 400]"},
             "rate_quality.b_min_kbps: [0, 400]: must have 3 entries, one per scaling factor",
         ),
-        (REAR, {"[0, 400, 1800]": "[0, 400, 400]"}, "rate_quality.b_min_kbps: [0, 400, 400]: must rise from 0"),
-        (REAR, {"[0, 400, 1800]": "[5, 400, 1800]"}, "rate_quality.b_min_kbps: [5, 400, 1800]: must rise from 0"),
+        (
+            REAR,
+            {"[0, 400, 1800]": "[0, 400, 400]"},
+            "rate_quality.b_min_kbps: [0, 400, 400]: must start at 0 and be strictly increasing",
+        ),
+        (
+            REAR,
+            {"[0, 400, 1800]": "[5, 400, 1800]"},
+            "rate_quality.b_min_kbps: [5, 400, 1800]: must start at 0 and be strictly increasing",
+        ),
         (REAR, {"[0, 400, 1800]": "[0, a, 1800]"}, "rate_quality.b_min_kbps[1]: 'a': must be a number"),
         (REAR, {"[0.125, 0.25, 0.5]": "[0, 0.25, 0.5]"}, "rate_quality.scaling[0]: 0: must be above 0"),
         (REAR, {"[0.125, 0.25, 0.5]": "[0.125, 0.25, 1.5]"}, "rate_quality.scaling[2]: 1.5: must be at most 1"),
-        (REAR, {"[0.125, 0.25, 0.5]": "[0.25, 0.125, 0.5]"}, "rate_quality.scaling: [0.25, 0.125, 0.5]: must rise"),
+        (
+            REAR,
+            {"[0.125, 0.25, 0.5]": "[0.25, 0.125, 0.5]"},
+            "rate_quality.scaling: [0.25, 0.125, 0.5]: must be strictly increasing",
+        ),
         (REAR, {"[0.125, 0.25, 0.5]": "0.5"}, "rate_quality.scaling: 0.5: must be a list"),
         (REAR, {"4000": "1800"}, "rate_quality.b_full_kbps: 1800: must be above the last b_min, 1800"),
         (REAR, {"rate_quality:": "rate_qualty:"}, "rate_qualty: unknown key, did you mean rate_quality?"),
@@ -371,8 +385,8 @@ def test_a_rule_list_in_the_wrong_order(conf: UserConf, tod: Command) -> None:
         "defaults: [paper, _self_]\ncollective: [share_by_demand: {}, total_from_operator: {start_kbps: 1}]\n",
     )
     assert problems(tod, conf, "modes=mine") == [
-        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs demand, no rule before gives it",
-        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs total, no rule before gives it",
+        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs demand, which no earlier rule gives",
+        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs total, which no earlier rule gives",
         '~/modes/mine.yaml: collective: ["share_by_demand", "total_from_operator"]: no rule gives demand, scaling',
     ]
 
@@ -414,7 +428,7 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         (["fps_max=on"], "fps_max: 'on': must be a number or null"),
         (["media.port=0"], "media.port: 0: must be at least 1"),
         (["media.port=on"], "media.port: 'on': must be a whole number"),
-        (["media.rtp_ports=[21000,20000]"], "media.rtp_ports: [21000, 20000]: must rise: the first and the last port"),
+        (["media.rtp_ports=[21000,20000]"], "media.rtp_ports: [21000, 20000]: must be [first, last], first below last"),
         (["media.max_viewers=0"], "media.max_viewers: 0: must be at least 1"),
         (["media.session_timeout_s=1.5"], "media.session_timeout_s: 1.5: must be a whole number"),
         (["media.host=on", "media.port=true"], "media.port: true: must be a whole number"),

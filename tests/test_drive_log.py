@@ -88,7 +88,9 @@ def test_a_killed_process_loses_at_most_its_last_line(tmp_path: Path) -> None:
     assert [json.loads(line)["text"].split()[0] for line in whole[1:]] == [str(n) for n in range(len(whole) - 1)]
     drive = read_drive(tmp_path)
     assert len(drive.sides["vehicle"].lines) == len(whole) - 1
-    assert drive.warnings[-1] == f"{tmp_path / 'drive.jsonl'}: has no end; the process was killed, or still runs"
+    assert (
+        drive.warnings[-1] == f"{tmp_path / 'drive.jsonl'}: was not closed; the process was killed or is still running"
+    )
 
 
 def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
@@ -101,7 +103,7 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
     assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", output)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
-    assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: has no end; the process was killed, or still runs"]
+    assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: was not closed; the process was killed or is still running"]
 
 
 def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> Non
 def test_a_relay_joins_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2
-    rule = "joins sides over RTSP, the graph of front_left uses its own transport; choose link=netns"
+    rule = "supports RTSP only; the graph of front_left has its own transport; choose link=netns"
     assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
 
 
@@ -170,7 +170,7 @@ def test_the_way_back_has_one_rate(tmp_path: Path) -> None:
     assert limited("link=relay", back.format("kbps: 70")).limit.rates(3).down == 70
     with pytest.raises(ConfigError, match=r"reverse\.file: donwlink.csv: no such file"):
         limited("link=netns", back.format("file: donwlink.csv"))
-    with pytest.raises(ConfigError, match=r"tcp\.bytes: .*: must be at least and at most"):
+    with pytest.raises(ConfigError, match=r"tcp\.bytes: .*: must be \[smallest, largest\]"):
         limited("link=netns", "link.tcp={flows: 1, bytes: [9, 3]}")
     with pytest.raises(ConfigError, match="choose link=netns"):
         limited("link=relay", "+link.tcp={flows: 1}")

@@ -137,7 +137,7 @@ def test_standard_input_and_output() -> None:
         ("no", "not JSON: Expecting value (column 1)"),
         ("", "not JSON: Expecting value (column 1)"),
         ("[]", "[]: must be a mapping with t and event"),
-        ('{"t": 0, "event": "clock_advanced"}', "t: 0: must not fall, the event before was at 0.5"),
+        ('{"t": 0, "event": "clock_advanced"}', "t: 0: must not decrease; the event before was at 0.5"),
         ('{"t": 1, "event": "clock"}', None),
         ('{"t": 1, "event": "bitrate_predicted", "kbps": NaN}', "not JSON: NaN is not a number"),
         ('{"t": 1, "event": "bitrate_predicted", "kbps": -1}', "kbps: -1: must be at least 0"),

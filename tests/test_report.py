@@ -100,7 +100,7 @@ def test_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
     for camera in one["cameras"]:
         assert re.search(rf"^ ?{camera['name']} +{camera['frames']} ", out, re.M), camera["name"]
     (note,) = one["notes"]
-    assert note.startswith("estimated quality: no camera has a rate-quality model; `tod-runner model ")
+    assert note.startswith("estimated quality: no camera has a rate-quality model; create them with `tod-runner model ")
     assert note in out
 
 

@@ -444,12 +444,12 @@ def listed(*names: str) -> list[rules.RuleCall]:
         (("demand_from_roi", "keep_operator_settings"), []),
         (
             ("total_from_prediction", "share_by_demand", "demand_from_roi", "scaling_from_rate_quality"),
-            ["automatic[1]: 'share_by_demand': needs demand, no rule before gives it"],
+            ["automatic[1]: 'share_by_demand': needs demand, which no earlier rule gives"],
         ),
         (
             ("fade_when_stale", "total_from_prediction", "demand_from_roi"),
             [
-                "automatic[0]: 'fade_when_stale': needs total, no rule before gives it",
+                "automatic[0]: 'fade_when_stale': needs total, which no earlier rule gives",
                 "automatic: ['fade_when_stale', 'total_from_prediction', 'demand_from_roi']: "
                 "no rule gives bitrate, scaling",
             ],

@@ -100,7 +100,7 @@ def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
     assert sorted(problems(tod, conf, *one("modes")), reverse=True) == [
         "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
-        "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must rise from 0",
+        "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must start at 0 and be strictly increasing",
     ]
 
 
@@ -197,7 +197,7 @@ def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> N
     conf.change("study/paper.yaml", {"[50, 63,": "[63, 50,"})
     (problem,) = problems(tod, conf, *one("study"))
     assert problem.startswith("~/study/paper.yaml: bitrates_kbps: [63, 50, ")
-    assert problem.endswith(": must rise")
+    assert problem.endswith(": must be strictly increasing")
 
 
 # --- how often Hydra composes -----------------------------------------------------------------------------------------

@@ -254,10 +254,10 @@ class Builder:
         cameras = tuple(self.vehicle.cameras.values()) if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling and link.kind == "relay":
-            rule = f"joins sides over RTSP, the graph of {dialling[0]} uses its own transport; choose link=netns"
+            rule = f"supports RTSP only; the graph of {dialling[0]} has its own transport; choose link=netns"
             self._refuse_link("kind", link.kind, rule)
         elif dialling and len(dialling) < len(cameras):
-            rule = f"joins cameras that all use RTSP, or none: the graph of {dialling[0]} uses its own transport"
+            rule = f"needs all cameras on RTSP or none: the graph of {dialling[0]} has its own transport"
             self._refuse_link("kind", link.kind, rule)
         if link.limit.tcp and link.kind == "relay":
             self._refuse_link("tcp", None, "needs packets of any protocol: choose link=netns")

@@ -106,7 +106,7 @@ def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reve
 def _tcp(data: Mapping[str, Any]) -> TcpFlows:
     sizes = data.get("bytes")
     if sizes and sizes[0] > sizes[1]:
-        raise ModelError("tcp.bytes", sizes, "must be at least and at most")
+        raise ModelError("tcp.bytes", sizes, "must be [smallest, largest]")
     return TcpFlows(
         data["flows"], (sizes[0], sizes[1]) if sizes else None, data.get("pause_s", 10), data.get("start_s", 0)
     )

@@ -62,7 +62,7 @@ def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:
     for index, call in enumerate(calls):
         for part in sorted(call.rule.needs - given):
             rule_name = repr(call.rule.name)
-            problems.append(ModelError(f"{mode}[{index}]", rule_name, f"needs {part}, no rule before gives it"))
+            problems.append(ModelError(f"{mode}[{index}]", rule_name, f"needs {part}, which no earlier rule gives"))
         given |= call.rule.gives
     missing = [part for part in rules.GIVEN if part not in given]
     if missing:

@@ -123,11 +123,11 @@ class RateQualityModel:
         if len(factors) != len(bounds):
             raise ModelError("b_min_kbps", bounds, f"must have {len(factors)} entries, one per scaling factor")
         if any(a >= b for a, b in pairwise(factors)):
-            raise ModelError("scaling", factors, "must rise")
+            raise ModelError("scaling", factors, "must be strictly increasing")
         if factors[0] <= 0 or factors[-1] > 1:
             raise ModelError("scaling", factors, "must lie in ]0, 1]")
         if bounds[0] != 0 or any(a >= b for a, b in pairwise(bounds)):
-            raise ModelError("b_min_kbps", bounds, "must rise from 0")
+            raise ModelError("b_min_kbps", bounds, "must start at 0 and be strictly increasing")
         if self.b_full <= self.b_min[-1]:
             raise ModelError("b_full_kbps", plain(self.b_full), f"must be above the last b_min, {bounds[-1]}")
         whole = tuple(bound for bound in bounds if isinstance(bound, int))
@@ -349,7 +349,7 @@ class Media(Endpoint):
     def __post_init__(self) -> None:
         first, last = self.rtp_ports
         if first >= last:
-            raise ModelError("rtp_ports", f"[{first}, {last}]", "must rise: the first and the last port")
+            raise ModelError("rtp_ports", f"[{first}, {last}]", "must be [first, last], first below last")
 
 
 @dataclass(frozen=True, slots=True)

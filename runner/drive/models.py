@@ -34,7 +34,7 @@ def find_models(
         return found, []
     which = "no camera" if not found else f"all but {', '.join(missing)}"
     verb = "has a rate-quality model" if not found else "have one"
-    how = "`tod-runner model vehicle=NAME sequence=DIR output=MODELS` measures them, models=MODELS takes them"
+    how = "create them with `tod-runner model vehicle=NAME sequence=DIR output=MODELS`, pass them with models=MODELS"
     return found, [f"estimated quality: {which} {verb}; {how}"]
 
 

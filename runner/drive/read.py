@@ -105,7 +105,7 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
     records = [line_from_json(line) if is_log(line) else parse(line) for line in lines[1:]]
     ended = bool(records) and isinstance(records[-1], Ended)
     if not ended:
-        warnings.append(f"{path}: has no end; the process was killed, or still runs")
+        warnings.append(f"{path}: was not closed; the process was killed or is still running")
     found = Side(began, records[:-1] if ended else records, ended)
     if dropped := sum(line.lines for line in found.of(LinesDropped)):
         warnings.append(f"{path}: {dropped} lines were dropped, since the disk was too slow")

@@ -302,7 +302,7 @@ def _series(drive: Drive, label: str) -> Series:
 def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
     """Problems with the clocks of the two sides."""
     if {"vehicle", "operator"} <= sides.keys() and not samples:
-        yield "the operator's log has no sample from the time of the vehicle's: not of one drive, or clocks far apart"
+        yield "the two logs do not overlap in time: different drives, or clocks far apart"
     received = [camera.received for camera in cameras.values() if camera.received]
     if _compared(received):
         return

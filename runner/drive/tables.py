@@ -11,11 +11,11 @@ TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
 MEANING = (
-    "Arrival and decode: latency since capture; ±: by how much it may be wrong, since two clocks measure it."
+    "Arrival and decode: latency since capture; ±: error bound of the comparison of both clocks."
     " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
     " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
-    " Quality is estimated from the bitrate: a frozen picture counts as what it was before, so look at the share of the"
-    " time beside it. Delivered: MSSIM of the picture on show, twice a second, against the scene at that time;"
+    " Quality is estimated from the bitrate: a frozen picture keeps its last estimate, so read it together with the"
+    " share of time frozen. Delivered: MSSIM of the picture on show, twice a second, against the scene at that time;"
     " of sources that are not rendered, against the stream as sent."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
@@ -28,7 +28,7 @@ def camera_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     bound = next((_bound(camera.arrival) for camera in drive.cameras.values()), "")  # of all: they share two clocks
     headings += (f"arrival, ms{bound}\n50 / 95 / 99 %", "decode, ms\n50 / 95 / 99 %")
     headings += ("freezes", "frozen s", "longest s", "lost\ndamaged", "rebuilt", f"{kind}\ndelivered")
-    headings += ("of the time\nfrozen",)
+    headings += ("time\nfrozen",)
     return headings, [_camera(camera) for camera in drive.cameras.values()]
 
 
@@ -39,7 +39,7 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
         "s",
         "MSSIM delivered, worst camera",
         "quality estimated",
-        "of the time frozen",
+        "time frozen",
         "latency ms (median, p95, p99)",
         "freezes",
         "frozen s",

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gi.repository import Gst
 
 HUNG_S = 5.0  # a state change that takes longer counts as hung
-HUNG = f"has not stopped within {HUNG_S:g} s, and is left alone"
+HUNG = f"did not stop within {HUNG_S:g} s, and was abandoned"
 
 _workers: set[threading.Thread] = set()
 _lock = threading.Lock()

@@ -167,7 +167,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
     if spec is None:
         return f"{factory} has no such property{suggest(key, (p.name for p in element.list_properties()))}"
     if not int(spec.flags) & GObject.ParamFlags.WRITABLE:
-        return f"{factory} does not let {key} be set"
+        return f"{key} of {factory} is read-only"
     kind = spec.value_type.name
     if not _readable(kind, text(value)):
         nicks = _nicks(spec)

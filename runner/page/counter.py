@@ -44,7 +44,7 @@ class LightToLight:
     """Latency from the screen through the camera to the page, ms.
 
     pictures, read      drawn, and those in which a counter was found
-    median, p95         from light to light
+    median, p95         glass to glass
     stated, bound       capture to drawing, as the page states it, and by how much that may be wrong, medians; None:
                         unknown
     decoded             capture to decoding, which the operator's side reports to the vehicle, median; None: unknown

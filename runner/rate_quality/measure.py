@@ -219,7 +219,7 @@ def _next(study: Study, criteria: ChoiceCriteria, points: Sequence[Point]) -> li
 
 def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
     if not clip.lossless:
-        yield f"{Path(clip.path).name} was compressed before ({clip.codec}): high qualities are flattered"
+        yield f"{Path(clip.path).name} is already compressed with loss ({clip.codec}): high scores are overestimated"
     _, form = as_filmed(camera, clip)
     if form:
         yield form

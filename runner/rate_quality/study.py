@@ -40,9 +40,9 @@ class Study:
     def __post_init__(self) -> None:
         scalings = [plain(factor) for factor in self.scalings]
         if any(a >= b for a, b in pairwise(scalings)):
-            raise ModelError("scalings", scalings, "must rise")
+            raise ModelError("scalings", scalings, "must be strictly increasing")
         if any(a >= b for a, b in pairwise(self.rates)):
-            raise ModelError("bitrates_kbps", list(self.rates), "must rise")
+            raise ModelError("bitrates_kbps", list(self.rates), "must be strictly increasing")
         if self.scheduler and self.workers != "dask":
             raise ModelError("scheduler", repr(self.scheduler), "is for workers=dask")
 

@@ -238,7 +238,7 @@ class _VehicleControl:
         """Before this vehicle has published anything, live telemetry is another vehicle's."""
         if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
             rule = "choose another `name`, or stop the other vehicle"
-            self._live.fail(RunError(f"a vehicle named {self._name} is at the broker already; {rule}"))
+            self._live.fail(RunError(f"a vehicle named {self._name} is already connected to the broker; {rule}"))
 
     def _on_state(self, message: MqttMessage) -> None:
         """A last will that the broker publishes late, when the vehicle is already back."""

@@ -36,7 +36,7 @@ VERBS = {
     "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link")),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
-    "latency": Verb("measure latency from light to light", "runner.verbs.latency", ("camera", "duration_s", "loop")),
+    "latency": Verb("measure glass-to-glass latency", "runner.verbs.latency", ("camera", "duration_s", "loop")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),

@@ -2,8 +2,8 @@
 
 Both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a drive
 through a bandwidth map in mode A. Open the page that it names, http://127.0.0.1:8090/, in a browser; the table in the
-terminal shows the same. Every camera runs at 5 Hz for each core, which carries eight full HD cameras, both sides and a
-browser without a GPU; give fps_max=40, or null for the cameras' own rates.
+terminal shows the same. Every camera runs at 5 Hz for each core, which carries the eight cameras of tum_q7, both sides
+and a browser without a GPU; give fps_max=40, or null for the cameras' own rates.
 
 With log=DIR both sides write their logs to DIR. With output=OUT a report is made at the end, as by the verb report
 (models= is passed to it); the drive is then stored in OUT/drive, unless log= names another directory. An experiment

@@ -1,6 +1,6 @@
 """usage: tod-runner latency camera=NAME [OVERRIDE ...] [duration_s=20] [loop=false]
 
-Measures latency from light to light: a camera of the vehicle films this machine's screen, on which one page shows a
+Measures glass-to-glass latency: a camera of the vehicle films this machine's screen, on which one page shows a
 counter, and another page shows the camera's picture and reads the counter in it. Both pages use this machine's clock:
 no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, with Ctrl-C, or
 if no counter was read for five minutes.
@@ -185,7 +185,7 @@ def _show(name: str, readings: Sequence[CounterReading], decoded_ms: Sequence[fl
 
 def _lines(name: str, found: LightToLight, looped: bool) -> Iterator[str]:
     yield f"{name}: counter read in {found.read} of {found.pictures} pictures"
-    yield f"  light to light      {found.median:4.0f} ms median, {found.p95:.0f} ms p95"
+    yield f"  glass to glass      {found.median:4.0f} ms median, {found.p95:.0f} ms p95"
     if found.stated is None or found.bound is None or found.outside is None:
         yield "  capture to drawing  unknown: no clocks were compared"
         return

@@ -1,7 +1,7 @@
 """usage: tod-runner quality DRIVE [DRIVE ...]
 
 Measure the pictures that the operator saw: twice a second, the picture on show against the scene that the camera saw
-then (MSSIM of luma at the camera's full size). Frozen, late and damaged pictures count as what they are. Needs drives
+then (MSSIM of luma at the camera's full size). Freezes, delay and damage lower the score. Needs drives
 with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise it is
 the stream as sent, and what the encoder lost is not included.
 

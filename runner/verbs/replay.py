@@ -189,7 +189,7 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
         if uplink and document["event"] == NAMES[LinkMeasured] and "camera" not in document:
             continue
         if document["t"] < last:
-            problem = f"t: {document['t']}: must not fall, the event before was at {last}"
+            problem = f"t: {document['t']}: must not decrease; the event before was at {last}"
             raise UserError(f"{name}: line {number}", "", None, problem)
         last = document["t"]
         yield document, parse(document)

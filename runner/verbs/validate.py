@@ -10,9 +10,9 @@ links are composed as they are.
 FILE, a word that ends in .yaml or .yml, limits the check to that file and the files that build on it. Its directory is
 conf=DIR, otherwise the nearest one above it that has folders of groups.
 
-If GStreamer is installed, also against its registry: elements, properties, types, ranges, and whether the properties
-that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends with status 2 and reports
-all problems at once.
+If GStreamer is installed, configurations are also checked against its registry: elements, properties, types, ranges,
+and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends
+with status 2 and reports all problems at once.
 
   tod-runner validate conf=my_vehicles                       your files, the step for your CI
   tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit

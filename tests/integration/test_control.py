@@ -266,7 +266,9 @@ def test_a_second_vehicle_of_the_same_name_is_refused(broker, vehicle):
     second = run("vehicle", *ROBOT, f"control.port={broker.port}", f"media.port={free_port()}")
     assert second.returncode == 1
     rule = "choose another `name`, or stop the other vehicle"
-    assert second.stderr.splitlines()[-1] == f"a vehicle named delivery_robot is at the broker already; {rule}"
+    assert (
+        second.stderr.splitlines()[-1] == f"a vehicle named delivery_robot is already connected to the broker; {rule}"
+    )
     assert operator.ask("1", event="mode_selected", mode="collective")["result"] == "applied"
     assert operator.states.queue[-1]["online"]
 

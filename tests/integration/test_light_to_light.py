@@ -1,4 +1,4 @@
-"""Latency from light to light, read by the page from the picture of a counter, agrees with what the page states."""
+"""Glass-to-glass latency, read by the page from the picture of a counter, agrees with what the page states."""
 
 import re
 import shutil
@@ -15,7 +15,7 @@ from runner.page.counter import CounterReading, counter_reading, light_to_light
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
 RESULT = re.compile(
     r"rear: counter read in (\d+) of (\d+) pictures\n"
-    r"  light to light +(\d+) ms median, \d+ ms p95\n"
+    r"  glass to glass +(\d+) ms median, \d+ ms p95\n"
     r"  capture to drawing +(\d+) ± (\d+) ms, as the page states it\n"
     r"  camera and screen +(-?\d+) ± \d+ ms, the difference; nothing is in between\n"
 )

@@ -153,7 +153,7 @@ def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_p
     vehicle.kill()
     vehicle.wait(timeout=15)
     drive = read_drive(tmp_path / "drive")
-    assert drive.warnings[-1].endswith("has no end; the process was killed, or still runs")
+    assert drive.warnings[-1].endswith("was not closed; the process was killed or is still running")
     assert len(drive.sides["vehicle"].lines) > 10
     assert run("replay", f"input={tmp_path / 'drive'}").returncode == 0
 

@@ -104,7 +104,7 @@ def test_a_model_writes_what_the_contract_requires(measured):
     assert clip["ti"] > 1
     assert (directory / "front_center.png").read_bytes().startswith(b"\x89PNG")
     assert (directory / "front_center.pdf").read_bytes().startswith(b"%PDF")
-    assert "was compressed before" in printed
+    assert "is already compressed with loss" in printed
     assert "the sequence is 320x192 at 25 Hz, the camera 1920x1040 at 40 Hz" in printed
 
 
@@ -401,7 +401,7 @@ def test_a_short_sequence_is_reported(tmp_path, cache):
     ("words", "expected"),
     [
         (["bitrates_kbps=[100]"], "study.bitrates_kbps: [100]: must have at least 2 entries"),
-        (["bitrates_kbps=[200,100]"], "study.bitrates_kbps: [200, 100]: must rise"),
+        (["bitrates_kbps=[200,100]"], "study.bitrates_kbps: [200, 100]: must be strictly increasing"),
         (
             ["scalings=[0.05,1]"],
             "scalings: 0.05 of 320x192: a side would be under 16 px, the factor must be at least 0.0833",

@@ -112,8 +112,8 @@ function sendSides() {
   const { width, height } = fullRegion(name());
   const roi = Object.fromEntries(SIDES.map((side) => [side, Math.round(+sides[side].value)]));
   const inside = roi.x >= 0 && roi.y >= 0 && roi.x + roi.width <= width && roi.y + roi.height <= height;
-  if (!inside) return complain(`the ROI leaves the image of ${width}×${height}`);
-  if (Math.min(roi.width, roi.height) < SMALLEST) return complain(`an ROI has at least ${SMALLEST}×${SMALLEST} pixels`);
+  if (!inside) return complain(`the ROI exceeds the ${width}×${height} image`);
+  if (Math.min(roi.width, roi.height) < SMALLEST) return complain(`the ROI must be at least ${SMALLEST}×${SMALLEST} pixels`);
   sendRegion(name(), roi);
   edited = new Set();
 }
