@@ -4,13 +4,14 @@
         for frame in frames:                          # waits for the next; ends when the with block is left
             detect(frame.image, frame.captured)       # uint8, height x width x 3, RGB
 
-Runs beside an operator or alone. A program that is slower than the cameras gets the newest picture of each and misses
-others; nothing queues up.
+Runs alone, or beside an operator as a viewer like any other (`media.max_viewers`). A program that is slower than the
+cameras gets the newest picture of each and misses others; nothing queues up.
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,8 @@ from runner.errors import UserError
 from runner.plans import compile_plans
 
 CHECK_S = 0.25  # how often cameras are checked for silence
+# A camera that has delivered FEW frames may be off: of each SELDOM_S it is expected for BRISK_S, and rebuilt meanwhile.
+FEW, BRISK_S, SELDOM_S = 5, 5.0, 30.0
 STOP_S = 1.0  # how long the last check may take
 
 
@@ -82,6 +85,8 @@ def live_frames(
 ) -> Iterator[Frames]:
     """Receive and decode cameras of a streaming vehicle; pipelines that fail or fall silent are rebuilt.
 
+    Those of cameras that stay silent, since they may be off, are rebuilt seldom.
+
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
     report     called with camera and what happened to it
@@ -96,12 +101,17 @@ def live_frames(
     plans = [plan for plan in compile_plans(vehicle) if cameras is None or plan.camera.name in cameras]
     frames, stopped = Frames(), threading.Event()
     side = apply.OperatorSide(plans, report, on_picture=frames.put)
-    wanted = {plan.camera.name: True for plan in plans}
+    expected = {plan.camera.name: True for plan in plans}
+    delivered, since = dict.fromkeys(expected, 0), dict.fromkeys(expected, time.monotonic())
 
     def watch() -> None:
         try:
             while not stopped.wait(CHECK_S):
-                side.sample(wanted)
+                now = time.monotonic()
+                for name, received in side.sample(expected).items():
+                    if received.frames - delivered[name] > FEW:
+                        delivered[name], since[name] = received.frames, now
+                    expected[name] = (now - since[name]) % SELDOM_S < BRISK_S
         finally:
             frames.close()  # nothing waits for pictures of a side that has failed
 
