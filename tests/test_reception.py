@@ -221,6 +221,32 @@ def test_in_mode_s_all_cameras_are_cut_by_one_factor_and_return() -> None:
     assert {drive.sent(name) for name in NAMES} == {(1000, 1.0)}
 
 
+def test_mode_s_entered_under_a_cap_returns_with_the_link() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    before = {name: drive.sent(name) for name in NAMES}
+    measured(drive, 0.1, 1200, "filling", 60)
+    capped = drive.total
+    drive.accept("mode_selected", t=0.1, mode="single")
+    assert drive.total == capped
+    for t in range(10, 400):
+        measured(drive, t / 25, 3200)
+    assert {name: drive.sent(name) for name in NAMES} == before
+
+
+def test_a_camera_switched_off_under_a_cap_returns_in_mode_s_as_without_it() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    before = drive.sent("rear")
+    measured(drive, 0.1, 1200, "filling", 60)
+    drive.accept("camera_switched", t=0.1, camera="rear", on=False)
+    drive.accept("mode_selected", t=0.1, mode="single")
+    drive.accept("camera_switched", t=0.1, camera="rear", on=True)
+    for t in range(10, 600):
+        measured(drive, t / 25, 3600)
+    assert drive.sent("rear") == before
+
+
 def test_floors_come_first_in_mode_s_too() -> None:
     drive = single("cameras.front.floor_kbps=900")
     measured(drive, 0.1, 1700, "filling", 60)

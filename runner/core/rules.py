@@ -487,6 +487,15 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
     return Decision(state.mode, draft.total, settings, asked, uncapped), memory
 
 
+def decide_without_link(vehicle: Vehicle, state: State, memory: Memory) -> Decision:
+    """What the rules would decide if no operator measured the uplink.
+
+    raises  RuleFailed
+    """
+    unmeasured = {name: past for name, past in memory.items() if name != cap_by_link.__name__}
+    return decide(vehicle, replace(state, link=None, operator_since=None), unmeasured)[0]
+
+
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
     """Why the parts of the draft that a rule has changed cannot be used; None if they can."""
     if not isinstance(draft, Draft):

@@ -71,7 +71,8 @@ class State:
 def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
     """The state after an event.
 
-    in_force  the decision that is applied when the event arrives: entering S or C starts from it
+    in_force  the decision that holds when the event arrives, without what the measured link takes off: entering S or C
+              starts from it
     raises    Refused
     """
     return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
@@ -131,23 +132,20 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
-    """What the cameras that are on send, or would send if an operator were connected, as settings of mode single."""
+    """What the cameras that are on are given, whether or not an operator is connected, as settings of mode single."""
     settings = ((name, in_force.settings[name]) for name in names or in_force.settings)
     return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 
 
 def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
-    """Change the mode without a jump: S keeps what is sent, C keeps the total unless the operator has set one.
-
-    What the measured link takes off the total now is not kept: mode C measures it again, and it returns with the link.
-    """
+    """Change the mode without a jump: S keeps the settings, C keeps the total unless the operator has set one."""
     if mode is state.mode:
         return {}
     match mode:
         case Mode.SINGLE:
             return {"mode": mode, "manual": {**state.manual, **keep(in_force)}}
         case Mode.COLLECTIVE:
-            total = in_force.uncapped if state.total_set is None else state.total_set
+            total = in_force.total if state.total_set is None else state.total_set
             return {"mode": mode, "collective_total": total}
         case Mode.AUTOMATIC:
             return {"mode": mode}

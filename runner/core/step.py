@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from runner.core import rules
 from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
-from runner.core.events import Event
+from runner.core.events import CameraSwitched, Event, ModeSelected
 from runner.core.model import Mode, Vehicle
 from runner.core.rules import Memory
 from runner.core.state import Refused, State, advance, keep
@@ -61,7 +62,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
     fault = run.fault
     state, memory, decision = run.state, run.memory, run.decision
     try:
-        state = advance(vehicle, run.state, event, run.decision)
+        state = advance(vehicle, run.state, event, _to_keep(vehicle, run, event))
     except Refused as reason:
         refused = str(reason)
         state = replace(run.state, t=event.t)
@@ -78,6 +79,14 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
                 state = replace(run.state, t=event.t)
     commands = difference(decision, run.commanded)
     return Run(state, memory, decision, after(run.commanded, commands), tuple(commands), refused, fault)
+
+
+def _to_keep(vehicle: Vehicle, run: Run, event: Event) -> Decision:
+    """The decision whose settings outlast an event. What the measured link takes off now returns with the link."""
+    if isinstance(event, (ModeSelected, CameraSwitched)) and run.decision.uncapped > run.decision.total:
+        with suppress(rules.RuleFailed):
+            return rules.decide_without_link(vehicle, run.state, run.memory)
+    return run.decision
 
 
 def _differ(now: object, before: object) -> bool:
