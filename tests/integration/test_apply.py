@@ -48,7 +48,7 @@ def test_bitrate_is_read_back_and_on_the_wire():
             assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 1.3 * 500_000  # two seconds at 40 Hz
 
 
-@pytest.mark.parametrize("kbps", [3, 9, 26])
+@pytest.mark.parametrize("kbps", [3, pytest.param(9, marks=pytest.mark.soak), 26])
 def test_the_lowest_bitrates_limit_the_encoder_too(kbps):
     """x264 takes a buffer below 1 kbit for none, and encodes without limit from its next start on: 40 Hz of noise."""
     with streaming(*NOISE) as (side, _, (plan,), _reported), watching(plan) as client:

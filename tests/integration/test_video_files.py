@@ -83,7 +83,10 @@ def decoded(path, whole=True):
     return [size for n, size in enumerate(sizes) if n == 0 or sizes[n - 1] != size], len(sizes)
 
 
-@pytest.mark.parametrize("sides", [(), ("graph=h264_srt",), ("graph=openh264_rtsp",)], indirect=True, ids=str)
+OPENH264 = pytest.param(("graph=openh264_rtsp",), marks=pytest.mark.soak)
+
+
+@pytest.mark.parametrize("sides", [(), ("graph=h264_srt",), OPENH264], indirect=True, ids=str)
 def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
     with sides.receiving() as operator:
         for size in ((160, 90), (640, 360), (320, 180)):
