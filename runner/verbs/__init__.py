@@ -28,6 +28,7 @@ class Verb(NamedTuple):
     takes: str = ""
 
 
+KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
         "print pipelines and decisions without starting them", "runner.verbs.print", ("total_kbps", "format")
@@ -44,6 +45,7 @@ VERBS = {
     "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE),
     "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
     "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
+    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
 }
 
@@ -58,6 +60,7 @@ EXTRAS = {
     "vmaf": ("imageio_ffmpeg",),
     "cluster": ("distributed",),
     "mcap": ("foxglove",),
+    "security": ("cryptography",),
 }
 
 

@@ -1,0 +1,45 @@
+"""Who may request what of a vehicle. Pure."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a holder of keys is for."""
+
+    VEHICLE = "vehicle"
+    BROKER = "broker"
+    CONTROLLER = "controller"  # an operator who may drive
+    WATCHER = "watcher"  # sees what the operator sees
+    PREDICTOR = "predictor"  # pQoS
+    POSITIONER = "positioner"  # localisation, where it is not on the vehicle
+
+
+PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
+SETTINGS = frozenset({"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set"})
+MAY_REQUEST: dict[Role, frozenset[str]] = {
+    Role.CONTROLLER: PRESENCE | SETTINGS,
+    Role.WATCHER: PRESENCE,
+    Role.PREDICTOR: frozenset({"bitrate_predicted"}),
+    Role.POSITIONER: frozenset({"position_reported"}),
+    Role.VEHICLE: frozenset(),
+    Role.BROKER: frozenset(),
+}
+PEOPLE = (Role.CONTROLLER, Role.WATCHER, Role.PREDICTOR, Role.POSITIONER)  # those that may request anything
+
+
+def denial(role: Role | None, event: str) -> str | None:
+    """Why a sender may not request an event; None if it may.
+
+    role   None: a sender that the vehicle's keys do not name
+    event  its name in schemas/event.schema.json
+    """
+    if role is None:
+        return "this operator is not among those that the vehicle's keys name"
+    if event in MAY_REQUEST[role]:
+        return None
+    takers = [other.value for other in PEOPLE if event in MAY_REQUEST[other]]
+    return f"a {role} may not request {event}; " + (
+        f"only {' or '.join(takers)} may" if takers else "nobody may: the vehicle makes it itself"
+    )

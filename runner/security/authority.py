@@ -1,0 +1,277 @@
+"""The directory of a small certificate authority: one directory for each holder of keys, to be copied to its machine.
+
+    authority/   the authority's certificate and key, and what it issued; it stays where it was made
+    broker/      for mosquitto
+    NAME/        for one vehicle, operator, predictor or positioner
+
+Whatever changes for one holder is written to the directories of all others that have to know it.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+
+from runner.core.roles import Role
+from runner.errors import RunError, UserError
+from runner.security import keyring
+from runner.security.broker_files import ACL, broker_settings
+from runner.security.certificates import Pair, new_authority, new_certificate, revocation_list, serial_of
+from runner.system.files import read_file, unfinished
+
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; the common name of a certificate is no longer
+RESERVED = ("authority", "broker")
+ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
+PASSWORDS, ACCESS, SETTINGS = "passwords", "access", "mosquitto.conf"
+VALID = timedelta(days=365)
+ROUNDS = 101  # of PBKDF2; the passwords have 256 random bits
+VIEWERS = (Role.CONTROLLER, Role.WATCHER)
+
+
+class Issued(msgspec.Struct, frozen=True):
+    """A certificate that was issued; the newest one of a name is the one in use.
+
+    serial   hexadecimal
+    hosts    addresses and DNS names at which the holder is reached
+    until    when it expires
+    revoked  since when it is not accepted any more; None: it is
+    """
+
+    name: str
+    role: Role
+    serial: str
+    hosts: tuple[str, ...]
+    until: datetime
+    revoked: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """An authority's directory. Only one process at a time changes it, see `opened`.
+
+    installed  where the broker's files will lie on the broker's machine
+    """
+
+    directory: Path
+    now: Callable[[], datetime] = lambda: datetime.now(UTC)
+    installed: str = "/etc/mosquitto/tod"
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Create the authority unless it exists, and keep other processes out.
+
+        raises  UserError if the directory holds something else, RunError if another process uses it
+        """
+        own = self._own
+        if not own.exists() and self.directory.is_dir() and any(self.directory.iterdir()):
+            rule = "must be a directory of `tod-runner keys`, or a new one: it holds other files"
+            raise UserError("command line", "output", str(self.directory), rule)
+        with _errors_named():
+            own.mkdir(parents=True, exist_ok=True)
+            self.directory.chmod(0o700)
+            with (own / LOCK).open("w") as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise RunError(f"{self.directory}: another process is changing these keys") from None
+                if not (own / ISSUED).exists():
+                    self._create()
+                yield
+
+    def holders(self) -> list[Issued]:
+        """The newest certificate of each name, in the order of first issue."""
+        return list({issued.name: issued for issued in self._issued()}.values())
+
+    def issue(self, name: str, role: Role, hosts: Sequence[str]) -> bool:
+        """Make a holder's directory; returns False if it has one already, with the same role and hosts.
+
+        raises  UserError for a name that is taken by another role or invalid
+        """
+        if not NAME.fullmatch(name) or (name in RESERVED) is not (role is Role.BROKER):
+            rule = f"must be 1 to 64 letters, digits, _ and -, and none of {', '.join(RESERVED)}"
+            raise UserError("command line", role, repr(name), rule)
+        present = next((issued for issued in self.holders() if issued.name == name), None)
+        if present and present.role is not role:
+            raise UserError("command line", role, repr(name), f"is taken: {name} is a {present.role}")
+        if present and self._in_use(present) and (not hosts or set(hosts) == set(present.hosts)):
+            return False
+        self._renew(name, role, tuple(hosts) or (present.hosts if present else ()))
+        return True
+
+    def rotate(self, name: str) -> None:
+        """New keys and passwords for a holder; its previous ones are not accepted any more.
+
+        raises  UserError for an unknown name
+        """
+        known = self._known(name, "rotate")
+        self._renew(known.name, known.role, known.hosts)
+
+    def revoke(self, name: str) -> None:
+        """Accept a holder's keys no more, and remove its directory.
+
+        raises  UserError for an unknown name
+        """
+        self._known(name, "revoke")
+        self._write_issued(self._revoked(name))
+        self._distribute()
+        shutil.rmtree(self.directory / name, ignore_errors=True)
+
+    # --- files --------------------------------------------------------------------------------------------------------
+
+    @property
+    def _own(self) -> Path:
+        return self.directory / "authority"
+
+    @property
+    def _pair(self) -> Pair:
+        return Pair(_read(self._own / keyring.AUTHORITY), _read(self._own / AUTHORITY_KEY))
+
+    def _create(self) -> None:
+        pair = new_authority("tod-runner authority", self.now())
+        _write(self._own / keyring.AUTHORITY, pair.certificate)
+        _write(self._own / AUTHORITY_KEY, pair.key)
+        _write(self._own / keyring.MEDIA_SECRET, _secret())
+        self._write_issued([])  # last: it says that the authority is complete
+
+    def _issued(self) -> list[Issued]:
+        return msgspec.json.decode(_read(self._own / ISSUED), type=list[Issued])
+
+    def _write_issued(self, issued: list[Issued]) -> None:
+        _write(self._own / ISSUED, msgspec.json.format(msgspec.json.encode(issued)))
+
+    def _known(self, name: str, argument: str) -> Issued:
+        active = {issued.name: issued for issued in self.holders() if not issued.revoked}
+        if name not in active:
+            raise UserError("command line", argument, repr(name), f"must be one of {', '.join(active) or '(none yet)'}")
+        return active[name]
+
+    def _revoked(self, name: str) -> list[Issued]:
+        """All that was issued, with what a name has had so far revoked."""
+        return [
+            msgspec.structs.replace(issued, revoked=self.now())
+            if issued.name == name and not issued.revoked
+            else issued
+            for issued in self._issued()
+        ]
+
+    def _in_use(self, issued: Issued) -> bool:
+        """Whether a holder has this certificate: a run that was killed may not have written it."""
+        certificate = self.directory / issued.name / keyring.CERTIFICATE
+        return not issued.revoked and certificate.exists() and serial_of(_read(certificate)) == int(issued.serial, 16)
+
+    def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
+        # Listed before it exists: a serial number that the authority does not know could never be revoked.
+        serial, until = secrets.randbits(159) | 1, self.now() + VALID
+        self._write_issued([*self._revoked(name), Issued(name, role, f"{serial:x}", hosts, until)])
+        pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
+        files = {
+            keyring.AUTHORITY: self._pair.certificate,
+            keyring.CERTIFICATE: pair.certificate,
+            keyring.KEY: pair.key,
+            keyring.SECRET: _secret(),
+            keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role)),
+            **self._files_of(name, role),
+        }
+        self._replace(name, files)
+        self._distribute()
+
+    def _files_of(self, name: str, role: Role) -> dict[str, bytes]:
+        """What holders of a role have beyond the keys that all have."""
+        media_secret = _read(self._own / keyring.MEDIA_SECRET)
+        if role is Role.VEHICLE:
+            return {keyring.PASSPHRASE: keyring.srt_passphrase(media_secret, name).encode()}
+        if role in VIEWERS:
+            return {keyring.MEDIA_SECRET: media_secret, keyring.TOKEN: _secret()}
+        if role is Role.BROKER:
+            return {ACCESS: ACL.encode(), SETTINGS: broker_settings(self.installed).encode()}
+        return {}
+
+    def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
+        """A holder's directory, as a whole or not at all."""
+        new, old, final = (
+            self.directory / f"{dot}{name}{end}" for dot, end in ((".", ".new"), (".", ".old"), ("", ""))
+        )
+        for left in (new, old):  # by a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        new.mkdir(mode=0o700)
+        for file, content in files.items():
+            _write(new / file, content)
+        if final.exists():
+            final.rename(old)
+        new.rename(final)
+        shutil.rmtree(old, ignore_errors=True)
+
+    def _distribute(self) -> None:
+        """Write who is accepted into the directories of all that have to know."""
+        issued, holders = self._issued(), list(filter(self._in_use, self.holders()))
+        gone = [each for each in issued if each.revoked and each.until > self.now()]
+        serials = [(int(each.serial, 16), each.revoked) for each in gone if each.revoked]
+        crl = revocation_list(self._pair, serials, self.now())
+        passwords = {each.name: _read(self.directory / each.name / keyring.SECRET) for each in holders}
+        for holder in holders:
+            directory = self.directory / holder.name
+            _write(directory / keyring.REVOKED, crl)
+            if holder.role is Role.VEHICLE:
+                _write(directory / keyring.PEOPLE, self._people(holder.name, holders, passwords))
+            elif holder.role is Role.BROKER:
+                lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())
+                _write(directory / PASSWORDS, "".join(lines).encode())
+
+    def _people(self, vehicle: str, holders: Sequence[Issued], secret: Mapping[str, bytes]) -> bytes:
+        people = {
+            each.name: keyring.Person(
+                each.role, keyring.rtsp_password(secret[each.name], vehicle) if each.role in VIEWERS else ""
+            )
+            for each in holders
+            if each.role not in (Role.VEHICLE, Role.BROKER)
+        }
+        return msgspec.json.format(msgspec.json.encode(people))
+
+
+def _password_line(name: str, password: str) -> str:
+    """A line of mosquitto's password file: PBKDF2-SHA512, as `mosquitto_passwd` writes it."""
+    salt = secrets.token_bytes(12)
+    digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, ROUNDS)
+    return f"{name}:$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}\n"
+
+
+def _secret() -> bytes:
+    return secrets.token_urlsafe(32).encode()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return read_file(path, keyring.LONGEST)
+    except ValueError as error:
+        raise RunError(f"{path}: {error}") from None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file atomically; only its owner may read it, unless it is public."""
+    with unfinished(path) as part:
+        part.unlink(missing_ok=True)
+        mode = 0o644 if path.name in keyring.PUBLIC else 0o600
+        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def _errors_named() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"{error.filename}: {(error.strerror or str(error)).lower()}") from None

@@ -1,0 +1,53 @@
+"""What mosquitto needs to serve vehicles and operators that nobody else may join."""
+
+from __future__ import annotations
+
+PORT = 8883  # IANA: secure-mqtt
+
+# %u is the user name: an operator's id in a topic is true, and a vehicle speaks for itself only. The vehicle checks
+# what the role of an operator allows.
+ACL = """\
+pattern write tod/+/request/%u
+pattern write tod/+/reception/%u
+pattern read tod/+/reply/%u
+pattern read tod/+/clock/%u
+pattern read tod/+/state
+pattern read tod/+/telemetry
+pattern read tod/+/configuration
+pattern read tod/+/advice
+pattern write tod/%u/state
+pattern write tod/%u/telemetry
+pattern write tod/%u/configuration
+pattern write tod/%u/advice
+pattern write tod/%u/reply/+
+pattern write tod/%u/clock/+
+pattern read tod/%u/request/+
+pattern read tod/%u/reception/+
+"""
+
+
+def broker_settings(directory: str, host: str = "", port: int = PORT) -> str:
+    """mosquitto.conf: TLS 1.3 with certificates and passwords on both sides, nothing for anybody else.
+
+    directory  where the broker's files lie
+    host       address to listen on; "": all
+    """
+    return "\n".join(
+        (
+            "per_listener_settings false",
+            "allow_anonymous false",
+            f"password_file {directory}/passwords",
+            f"acl_file {directory}/access",
+            "persistence false",
+            "set_tcp_nodelay true",
+            "max_packet_size 1100000",
+            f"listener {port} {host}".rstrip(),
+            f"cafile {directory}/ca.crt",
+            f"certfile {directory}/own.crt",
+            f"keyfile {directory}/own.key",
+            f"crlfile {directory}/crl.pem",
+            "require_certificate true",
+            "tls_version tlsv1.3",
+            "",
+        )
+    )

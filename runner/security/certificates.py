@@ -1,0 +1,155 @@
+"""Certificates and revocation lists (RFC 5280) by the package `cryptography`. Times are passed in."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timedelta
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from runner.core.roles import Role
+
+EARLIER = timedelta(hours=1)  # a holder's clock may be behind when it gets its certificate
+AUTHORITY_YEARS = 20
+YEAR = timedelta(days=365)
+# A side is a server for one protocol and a client for another: RTSP, MQTT, HTTPS.
+USES = {Role.BROKER: [ExtendedKeyUsageOID.SERVER_AUTH]}
+BOTH = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+
+
+class Pair(NamedTuple):
+    """A certificate and its private key, PEM."""
+
+    certificate: bytes
+    key: bytes
+
+
+def new_authority(name: str, now: datetime) -> Pair:
+    """A self-signed certificate that may sign those of holders and nothing else."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    builder = (
+        _builder(subject, subject, key, x509.random_serial_number(), now, AUTHORITY_YEARS * YEAR)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
+    )
+    return Pair(_pem(builder.sign(key, hashes.SHA256())), _key_pem(key))
+
+
+def new_certificate(
+    authority: Pair, name: str, role: Role, hosts: Sequence[str], serial: int, now: datetime, valid: timedelta
+) -> Pair:
+    """A holder's certificate and key: its name as common name, its role as organizational unit.
+
+    hosts  addresses and DNS names at which it is reached as a server
+    """
+    issuer, signer = _loaded(authority)
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name(
+        [x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role), x509.NameAttribute(NameOID.COMMON_NAME, name)]
+    )
+    builder = (
+        _builder(subject, issuer.subject, key, serial, now, valid)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(digital_signature=True), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(USES.get(role, BOTH)), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_general_name(host) for host in (*hosts, name)]), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()),
+            critical=False,
+        )
+    )
+    return Pair(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
+
+
+def revocation_list(authority: Pair, revoked: Iterable[tuple[int, datetime]], now: datetime) -> bytes:
+    """A CRL, PEM, of serial numbers and since when they are revoked. It does not expire before the authority does.
+
+    An expired list would lock everybody out: OpenSSL then refuses every certificate.
+    """
+    issuer, signer = _loaded(authority)
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(issuer.subject)
+        .last_update(now - EARLIER)
+        .next_update(now + AUTHORITY_YEARS * YEAR)
+    )
+    for serial, since in revoked:
+        entry = x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(since).build()
+        builder = builder.add_revoked_certificate(entry)
+    return builder.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+
+def serial_of(certificate: bytes) -> int:
+    """Serial number of a certificate, PEM."""
+    return x509.load_pem_x509_certificate(certificate).serial_number
+
+
+def serials_of(crl: bytes) -> frozenset[int]:
+    """Serial numbers in a revocation list, PEM.
+
+    raises  ValueError
+    """
+    return frozenset(entry.serial_number for entry in x509.load_pem_x509_crl(crl))
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    serial: int,
+    now: datetime,
+    valid: timedelta,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(serial)
+        .not_valid_before(now - EARLIER)
+        .not_valid_after(now + valid)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=digital_signature,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=key_cert_sign,
+        crl_sign=crl_sign,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _loaded(authority: Pair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    key = serialization.load_pem_private_key(authority.key, password=None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    return x509.load_pem_x509_certificate(authority.certificate), key
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )

@@ -1,0 +1,221 @@
+"""What one holder of keys has in its directory, read when a side starts and again when a file changes.
+
+ca.crt          certificate of the authority
+own.crt         its certificate: name, role, hosts
+own.key         its private key
+own.json        its name and role
+own.secret      from which its passwords follow, see `derived`
+crl.pem         certificates that are not accepted any more
+people.json     vehicle only: by name, role and RTSP password of those that may reach it
+srt.passphrase  vehicle only
+media.secret    controllers and watchers only: from which the SRT passphrase of each vehicle follows
+page.token      controllers and watchers only: for browsers on other machines
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import stat
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import msgspec
+
+from runner.core.roles import Role
+from runner.errors import UserError
+from runner.system.files import read_file
+
+AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "own.secret", "own.json"
+REVOKED, PEOPLE = "crl.pem", "people.json"
+PASSPHRASE, MEDIA_SECRET, TOKEN = "srt.passphrase", "media.secret", "page.token"
+PUBLIC = (AUTHORITY, CERTIFICATE, HOLDER, REVOKED)  # others may read these
+LONGEST = 1_000_000  # bytes of a file
+LOOK_S = 1.0  # how often a file is looked at for changes
+
+T = TypeVar("T")
+
+
+class Person(msgspec.Struct, frozen=True):
+    """Someone who may reach a vehicle.
+
+    rtsp  password for the vehicle's RTSP server, user name is the person's; "" for a role that sees no video
+    """
+
+    role: Role
+    rtsp: str = ""
+
+
+class Holder(msgspec.Struct, frozen=True):
+    """Whose keys these are."""
+
+    name: str
+    role: Role
+
+
+def derived(secret: bytes, purpose: str) -> str:
+    """A password that follows from a secret and tells nothing about it (HMAC-SHA256, RFC 2104); 43 characters."""
+    digest = hmac.new(secret, purpose.encode(), hashlib.sha256).digest()
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
+def rtsp_password(secret: bytes, vehicle: str) -> str:
+    """Of one operator for one vehicle: what one vehicle knows opens no other."""
+    return derived(secret, f"rtsp {vehicle}")
+
+
+def mqtt_password(secret: bytes) -> str:
+    return derived(secret, "mqtt")
+
+
+def srt_passphrase(media_secret: bytes, vehicle: str) -> str:
+    return derived(media_secret, f"srt {vehicle}")
+
+
+class Watched(Generic[T]):
+    """A value read from a file, and again when the file has changed. From any thread.
+
+    A file that cannot be used leaves the last value in force, and is reported once.
+
+    read       reads the value; may raise UserError
+    on_report  called with what is wrong with a new file
+    raises     UserError if it cannot be read at first
+    """
+
+    def __init__(self, path: Path, read: Callable[[], T], on_report: Callable[[str], None]) -> None:
+        self._path, self._read, self._on_report = path, read, on_report
+        self._lock = threading.Lock()
+        self._version, self._looked = self._stat(), time.monotonic()
+        self._value = read()
+
+    def get(self) -> T:
+        with self._lock:
+            now = time.monotonic()
+            if now - self._looked > LOOK_S:
+                self._looked = now
+                self._renew()
+            return self._value
+
+    def _renew(self) -> None:
+        version = self._stat()
+        if version == self._version:
+            return
+        self._version = version
+        try:
+            self._value = self._read()
+        except UserError as error:
+            self._on_report(f"{error}; what it held before stays in force")
+
+    def _stat(self) -> tuple[int, int, int] | None:
+        try:
+            found = self._path.stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_ino, found.st_size
+
+
+@dataclass(frozen=True, slots=True)
+class Keyring:
+    """A holder's directory of keys, complete and readable by its owner only.
+
+    raises  UserError, from `of`, that names every problem
+    """
+
+    directory: Path
+
+    @staticmethod
+    def of(directory: Path, *needed: str) -> Keyring:
+        """Check that all files are in place.
+
+        needed  names of files beyond those that every holder has
+        raises  UserError
+        """
+        ring = Keyring(directory)
+        names = (AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER, REVOKED, *needed)
+        problems = [f"{name}: {problem}" for name in names if (problem := ring._problem(name))]
+        if problems:
+            rule = "must be a directory that `tod-runner keys` made, copied as it is"
+            raise UserError("keys", "", str(directory), f"{rule}: {'; '.join(problems)}")
+        return ring
+
+    @property
+    def authority(self) -> Path:
+        return self.directory / AUTHORITY
+
+    @property
+    def certificate(self) -> Path:
+        return self.directory / CERTIFICATE
+
+    @property
+    def key(self) -> Path:
+        return self.directory / KEY
+
+    @property
+    def revocation_list(self) -> Path:
+        return self.directory / REVOKED
+
+    @property
+    def holder(self) -> Holder:
+        return self._decoded(HOLDER, Holder)
+
+    @property
+    def secret(self) -> bytes:
+        return self.read(SECRET)
+
+    @property
+    def passphrase(self) -> str:
+        """That encrypts this vehicle's SRT streams."""
+        return self.read(PASSPHRASE).decode()
+
+    def read(self, name: str) -> bytes:
+        """Content of a file, without the end of line that an editor may have added.
+
+        raises  UserError
+        """
+        try:
+            return read_file(self.directory / name, LONGEST).strip()
+        except ValueError as error:
+            raise UserError("keys", name, str(self.directory), str(error)) from None
+
+    def revoked(self) -> frozenset[int]:
+        """Serial numbers that are not accepted any more."""
+        from runner.security.certificates import serials_of
+
+        try:
+            return serials_of(self.read(REVOKED))
+        except ValueError as error:
+            raise self._error(REVOKED, error) from None
+
+    def people(self) -> Mapping[str, Person]:
+        """Who may reach this vehicle, by name."""
+        return self._decoded(PEOPLE, dict[str, Person])
+
+    def watched_people(self, on_report: Callable[[str], None]) -> Watched[Mapping[str, Person]]:
+        return Watched(self.directory / PEOPLE, self.people, on_report)
+
+    def watched_revoked(self, on_report: Callable[[str], None]) -> Watched[frozenset[int]]:
+        return Watched(self.revocation_list, self.revoked, on_report)
+
+    def _decoded(self, name: str, kind: type[T]) -> T:
+        try:
+            return msgspec.json.decode(self.read(name), type=kind)
+        except msgspec.MsgspecError as error:
+            raise self._error(name, error) from None
+
+    def _error(self, name: str, error: Exception) -> UserError:
+        return UserError("keys", name, str(self.directory), f"not as `tod-runner keys` writes it: {error}")
+
+    def _problem(self, name: str) -> str | None:
+        path = self.directory / name
+        try:
+            mode = path.stat().st_mode
+        except OSError as error:
+            return (error.strerror or str(error)).lower()
+        if name not in PUBLIC and mode & (stat.S_IRWXG | stat.S_IRWXO):
+            return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
+        return None

@@ -1,0 +1,72 @@
+"""usage: tod-runner keys output=DIR [vehicle=NAME] [controller=NAME] [watcher=NAME] [predictor=NAME] [positioner=NAME]
+                              [broker=HOST] [host=HOST[,HOST...]] [rotate=NAME] [revoke=NAME]
+
+Make the keys that vehicles, operators and broker need once they talk over a network: a certificate authority in
+DIR/authority, the broker's files in DIR/broker, and DIR/NAME for everybody else. Copy each directory to its machine, as
+it is; DIR/authority stays. What exists is kept, so that names can be added at any time.
+
+  vehicle     its `name` in the configuration     host  addresses or DNS names of that vehicle, or of an operator whose
+  controller  an operator who may drive                 page is served to other machines
+  watcher     sees the pictures                   broker  address or DNS name of the machine with the MQTT broker
+  predictor   sends predicted bitrates
+  positioner  sends positions
+
+rotate=NAME replaces keys and passwords, revoke=NAME withdraws them. Both take effect where the changed directories are
+copied to; the last line of the output names these. A certificate is valid for a year.
+
+  tod-runner keys output=keys vehicle=tum_q7 host=10.0.0.2 controller=alice broker=10.0.0.1
+  tod-runner keys output=keys watcher=bob
+  tod-runner keys output=keys revoke=bob
+  tod-runner keys output=keys                      list what was issued
+"""
+
+from __future__ import annotations
+
+from runner.core.roles import PEOPLE, Role
+from runner.errors import UserError
+from runner.security.authority import Authority, Issued
+from runner.verbs import Arguments
+
+ROLES = (Role.VEHICLE, *PEOPLE)
+
+
+def run(arguments: Arguments) -> int:
+    if arguments.overrides:
+        raise UserError("command line", "", arguments.overrides[0], "keys need no configuration; see --help")
+    output = arguments.path("output")
+    if output is None:
+        raise UserError("command line", "output", None, "must be given, the directory of all keys")
+    values = arguments.values
+    hosts = tuple(filter(None, values.get("host", "").split(",")))
+    named = [role for role in ROLES if role in values]
+    if hosts and len([role for role in named if role is not Role.BROKER]) == 0:
+        raise UserError("command line", "host", values["host"], "must come with the name of a vehicle or operator")
+    authority = Authority(output)
+    with authority.opened():
+        changed = [values[role] for role in named if authority.issue(values[role], role, _hosts_of(role, named, hosts))]
+        if "broker" in values and authority.issue("broker", Role.BROKER, (values["broker"],)):
+            changed.append("broker")
+        for action in (authority.rotate, authority.revoke):
+            if name := values.get(action.__name__):
+                action(name)
+                changed.append(name)
+        for issued in authority.holders():
+            print(_described(issued))
+        to_copy = sorted({*changed, *(each.name for each in authority.holders() if changed)} & set(_present(authority)))
+    if changed:
+        print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
+    return 0
+
+
+def _hosts_of(role: Role, named: list[Role], hosts: tuple[str, ...]) -> tuple[str, ...]:
+    """Hosts belong to the vehicle if one is named, otherwise to the operator."""
+    return hosts if role is Role.VEHICLE or Role.VEHICLE not in named else ()
+
+
+def _present(authority: Authority) -> list[str]:
+    return [issued.name for issued in authority.holders() if not issued.revoked]
+
+
+def _described(issued: Issued) -> str:
+    state = f"revoked {issued.revoked:%Y-%m-%d}" if issued.revoked else f"valid until {issued.until:%Y-%m-%d}"
+    return f"{issued.role:11}{issued.name:20}{state}{'  ' if issued.hosts else ''}{', '.join(issued.hosts)}"

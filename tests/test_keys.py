@@ -1,0 +1,234 @@
+"""Keys: what each holder gets, what nobody else may read, and what rotating and revoking change."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from runner.__main__ import main
+from runner.core.events import EVENTS
+from runner.core.roles import MAY_REQUEST, PEOPLE, Role, denial
+from runner.errors import RunError, UserError
+from runner.security import keyring
+from runner.security.authority import Authority, Issued
+from runner.security.keyring import Keyring
+
+NOW = datetime(2026, 5, 1, tzinfo=UTC)
+FIRST = ("vehicle=car", "host=10.0.0.2,car.example", "controller=alice", "broker=10.0.0.1")
+
+
+@pytest.fixture
+def authority(tmp_path):
+    authority = Authority(tmp_path / "keys", lambda: NOW)
+    with authority.opened():
+        authority.issue("car", Role.VEHICLE, ["10.0.0.2", "car.example"])
+        authority.issue("broker", Role.BROKER, ["10.0.0.1"])
+        for role in PEOPLE:
+            authority.issue(f"a-{role}", role, [])
+        yield authority
+
+
+def certificate(authority, name):
+    return x509.load_pem_x509_certificate((authority.directory / name / "own.crt").read_bytes())
+
+
+def verified(authority, name, *options):
+    """Output of OpenSSL, which knows nothing of this project."""
+    directory = authority.directory
+    words = ["-CAfile", directory / "authority/ca.crt", *options, directory / name / "own.crt"]
+    ended = subprocess.run(["openssl", "verify", *words], capture_output=True, text=True, check=False)
+    return ended.stdout + ended.stderr
+
+
+def test_a_certificate_states_name_role_hosts_and_term(authority):
+    car = certificate(authority, "car")
+    assert [each.value for each in car.subject] == ["vehicle", "car"]
+    assert car.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == "car"
+    hosts = car.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(each) for each in hosts.get_values_for_type(x509.IPAddress)] == ["10.0.0.2"]
+    assert hosts.get_values_for_type(x509.DNSName) == ["car.example", "car"]
+    assert car.not_valid_after == (NOW + timedelta(days=365)).replace(tzinfo=None)
+    assert "own.crt: OK" in verified(authority, "car", "-attime", str(int(NOW.timestamp())), "-purpose", "sslserver")
+    assert "own.crt: OK" in verified(authority, "a-watcher", "-attime", str(int(NOW.timestamp())))
+    late = str(int((NOW + timedelta(days=366)).timestamp()))
+    assert "certificate has expired" in verified(authority, "car", "-attime", late)
+
+
+def test_nobody_else_may_read_what_is_secret(authority):
+    for path in authority.directory.rglob("*"):
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if path.is_file() and path.name not in ("ca.crt", "own.crt", "own.json", "crl.pem", ".lock"):
+            assert mode == 0o600, path
+    assert stat.S_IMODE(authority.directory.stat().st_mode) == 0o700
+
+
+def test_each_holder_gets_what_its_role_needs(authority):
+    common = {"ca.crt", "own.crt", "own.key", "own.secret", "own.json", "crl.pem"}
+    extra = {
+        "car": {"people.json", "srt.passphrase"},
+        "broker": {"passwords", "access", "mosquitto.conf"},
+        "a-controller": {"media.secret", "page.token"},
+        "a-watcher": {"media.secret", "page.token"},
+        "a-predictor": set(),
+        "a-positioner": set(),
+    }
+    for name, files in extra.items():
+        assert set(os.listdir(authority.directory / name)) == common | files
+
+
+def test_vehicle_and_operator_derive_the_same_passwords(authority):
+    car, operator = Keyring.of(authority.directory / "car"), Keyring.of(authority.directory / "a-controller")
+    assert car.people()["a-controller"].rtsp == keyring.rtsp_password(operator.secret, "car")
+    assert car.people()["a-controller"].rtsp != keyring.rtsp_password(operator.secret, "another")
+    assert car.people()["a-predictor"].rtsp == ""
+    passphrase = keyring.srt_passphrase(operator.read(keyring.MEDIA_SECRET), "car")
+    assert car.read(keyring.PASSPHRASE).decode() == passphrase
+    assert 10 <= len(passphrase) <= 79
+    assert {name: person.role for name, person in car.people().items()} == {f"a-{role}": role for role in PEOPLE}
+
+
+def test_issuing_again_changes_nothing(authority):
+    before = certificate(authority, "car").serial_number
+    assert not authority.issue("car", Role.VEHICLE, [])
+    assert not authority.issue("car", Role.VEHICLE, ["car.example", "10.0.0.2"])
+    assert certificate(authority, "car").serial_number == before
+    assert authority.issue("car", Role.VEHICLE, ["10.0.0.3"])
+    assert certificate(authority, "car").serial_number != before
+
+
+def test_what_a_killed_run_left_out_is_made_by_the_next_one(authority):
+    killed = Issued("bob", Role.WATCHER, "ab", (), NOW + timedelta(days=1))
+    authority._write_issued([*authority._issued(), killed])
+    authority.issue("eve", Role.WATCHER, [])
+    assert set(Keyring(authority.directory / "car").people()) == {"eve", *(f"a-{role}" for role in PEOPLE)}
+    assert authority.issue("bob", Role.WATCHER, [])
+    assert "bob" in Keyring(authority.directory / "car").people()
+    assert Keyring(authority.directory / "car").revoked() == {0xAB}
+
+
+@pytest.mark.parametrize("action", ["rotate", "revoke"])
+def test_all_others_learn_what_is_accepted_no_more(authority, action):
+    before, secret = certificate(authority, "a-watcher").serial_number, (authority.directory / "a-watcher/own.secret")
+    old = secret.read_bytes()
+    getattr(authority, action)("a-watcher")
+    for name in ("car", "a-controller", "broker"):
+        assert Keyring(authority.directory / name).revoked() == {before}
+    passwords = (authority.directory / "broker/passwords").read_text()
+    people = Keyring(authority.directory / "car").people()
+    if action == "rotate":
+        assert secret.read_bytes() != old
+        assert people["a-watcher"].rtsp == keyring.rtsp_password(secret.read_bytes(), "car")
+    else:
+        assert not secret.exists()
+        assert "a-watcher" not in people
+        assert "a-watcher" not in passwords
+
+
+def test_problems_of_a_directory_are_named_at_once(authority):
+    car = authority.directory / "car"
+    (car / "own.key").unlink()
+    (car / "own.secret").chmod(0o644)
+    with pytest.raises(UserError) as raised:
+        Keyring.of(car, keyring.MEDIA_SECRET)
+    assert str(raised.value).endswith(
+        "own.key: no such file or directory; own.secret: others may read it (mode 644); chmod 600; "
+        "media.secret: no such file or directory"
+    )
+
+
+def test_two_processes_do_not_change_the_same_keys(authority):
+    other = Authority(authority.directory)
+    with pytest.raises(RunError, match="another process is changing these keys"), other.opened():
+        pass
+
+
+# --- the verb ---------------------------------------------------------------------------------------------------------
+
+
+def test_one_command_makes_what_a_vehicle_and_an_operator_need(tmp_path, capsys):
+    output = tmp_path / "keys"
+    assert main(["keys", f"output={output}", *FIRST]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in printed[:3]] == [["vehicle", "car"], ["controller", "alice"], ["broker"] * 2]
+    assert printed[0].endswith("10.0.0.2, car.example")
+    assert printed[-1] == f"copy to their machines: {output}/alice, {output}/broker, {output}/car"
+    secrets = {path.read_text().strip() for path in output.rglob("*") if path.name in ("own.secret", "media.secret")}
+    assert not any(secret in line for secret in secrets for line in printed)
+    assert main(["keys", f"output={output}", *FIRST]) == 0
+    assert "copy" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "command line: output: must be given, the directory of all keys"),
+        (("output={}", "vehicle=a b"), "command line: vehicle: 'a b': must be 1 to 64 letters, digits, _ and -"),
+        (("output={}", "vehicle=broker"), "command line: vehicle: 'broker': must be 1 to 64 letters"),
+        (("output={}", "host=10.0.0.2"), "command line: host: 10.0.0.2: must come with the name of a vehicle"),
+        (("output={}", "revoke=x"), "command line: revoke: 'x': must be one of (none yet)"),
+        (("output={}", "modes=paper"), "command line: modes=paper: keys need no configuration"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, capsys, words, message):
+    assert main(["keys", *(word.format(tmp_path / "keys") for word in words)]) == 2
+    assert capsys.readouterr().err.startswith(message)
+
+
+def test_a_directory_with_other_files_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main(["keys", f"output={tmp_path}", *FIRST]) == 2
+    assert "it holds other files" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == ["mine.txt"]
+
+
+def test_a_name_has_one_role(tmp_path, capsys):
+    assert main(["keys", f"output={tmp_path / 'keys'}", *FIRST]) == 0
+    assert main(["keys", f"output={tmp_path / 'keys'}", "watcher=alice"]) == 2
+    assert "'alice': is taken: alice is a controller" in capsys.readouterr().err
+
+
+# --- roles x events ---------------------------------------------------------------------------------------------------
+
+OWN = ("link_measured", "copies_counted", "control_passed", "clock_advanced")
+PRESENCE = ("operator_connected", "operator_disconnected")
+ALLOWED = {
+    Role.CONTROLLER: {*EVENTS} - {*OWN, "bitrate_predicted", "position_reported"},
+    Role.WATCHER: {*PRESENCE},
+    Role.PREDICTOR: {"bitrate_predicted"},
+    Role.POSITIONER: {"position_reported"},
+    Role.VEHICLE: set(),
+    Role.BROKER: set(),
+    None: set(),
+}
+
+
+@pytest.mark.parametrize("role", [*Role, None])
+@pytest.mark.parametrize("event", EVENTS)
+def test_what_a_role_may_request(role, event):
+    assert (denial(role, event) is None) == (event in ALLOWED[role])
+
+
+def test_a_denial_names_who_may():
+    assert set(MAY_REQUEST) == set(Role)
+    assert denial(Role.WATCHER, "total_set") == "a watcher may not request total_set; only controller may"
+    assert denial(Role.WATCHER, "clock_advanced").endswith("nobody may: the vehicle makes it itself")
+    assert denial(None, "total_set") == "this operator is not among those that the vehicle's keys name"
+
+
+def test_keys_load_nothing_that_drives():
+    code = (
+        "import sys; import runner.verbs.keys; print([m for m in ('gi', 'hydra', 'numpy', 'paho') if m in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_json_files_are_readable(authority):
+    assert json.loads((authority.directory / "car/people.json").read_text())["a-watcher"]["role"] == "watcher"
