@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
     from runner.gst.pictures import LumaPlane
+    from runner.gst.secure import StreamLogin
     from runner.gst.sequence import Form
     from runner.gst.video_reader import Unit
     from runner.lanes import LaneSet
+    from runner.security.keyring import Keyring
 
 __all__ = [
     "TYPELIBS",
@@ -165,27 +167,36 @@ class VehicleSide:
 
     on_report  called, from another thread, when a camera's pipeline starts, stops or fails
     video      where to keep what is sent; None: nowhere
+    keyring    of this vehicle: viewers are admitted by certificate and password, everything is encrypted; None: nothing
     raises     RunError if the port is in use, or something that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
     """
 
     def __init__(
-        self, plans: Sequence[Plan], media: Media, on_report: OnReport, video: VideoFiles | None = None
+        self,
+        plans: Sequence[Plan],
+        media: Media,
+        on_report: OnReport,
+        video: VideoFiles | None = None,
+        keyring: Keyring | None = None,
     ) -> None:
         self._on_report, self._video = on_report, video
+        passphrase = keyring.passphrase if keyring else None
         plans = _kept(plans, video)
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
         self._server: CameraServer | None = None
-        self._callers = {p.camera.name: CameraCaller(p, self._build, on_report) for p in plans if not p.serves}
+        self._callers = {
+            p.camera.name: CameraCaller(p, self._build, on_report, passphrase) for p in plans if not p.serves
+        }
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, on_report)
+                self._server = CameraServer(served, media, self._build, on_report, keyring)
             for caller in self._callers.values():
                 caller.start()
 
@@ -300,6 +311,8 @@ class OperatorSide:
     arrivals    record when each access unit arrived, for the samples
     video       where to keep what is received; None: nowhere
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
+    keyring     of this operator; None: to a vehicle that does not ask
+    vehicle     its name, as its certificate must state it
     raises      RunError if something that `video` needs is not installed
     """
 
@@ -312,12 +325,20 @@ class OperatorSide:
         arrivals: bool = False,
         video: VideoFiles | None = None,
         operator: str = "",
+        keyring: Keyring | None = None,
+        vehicle: str = "",
     ) -> None:
         plans = _kept(plans, video)
         self._glib = _Glib()
         self._gathered = gathered = Gathered(on_report)
+        login: StreamLogin | None = None
+        if keyring:
+            from runner.gst.secure import StreamLogin
+
+            login = StreamLogin(keyring, vehicle, lambda what: gathered("keys", what))
         self._receivers = {
-            plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator) for plan in plans
+            plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator, login)
+            for plan in plans
         }
 
         def start() -> None:

@@ -14,8 +14,8 @@ from runner.core.model import (
     PLACEHOLDER,
     Camera,
     Element,
-    Endpoint,
     Graph,
+    Media,
     ModelError,
     Recording,
     Roi,
@@ -166,7 +166,7 @@ class Plan:
 
 def compile_graph(
     camera: Camera,
-    media: Endpoint,
+    media: Media,
     index: int = 0,
     clip: str | None = None,
     recording: Recording | None = None,
@@ -255,8 +255,8 @@ def shell(elements: Iterable[Element]) -> str:
     return " ! ".join(" ".join(map(shlex.quote, _tokens(element, str))) for element in elements)
 
 
-def rtsp_url(media: Endpoint, camera: str) -> str:
-    return f"rtsp://{media.host}:{media.port}/{camera}"
+def rtsp_url(media: Media, camera: str) -> str:
+    return f"{'rtsps' if media.secure else 'rtsp'}://{media.host}:{media.port}/{camera}"
 
 
 def video_codec(graph: Graph) -> str:
@@ -316,7 +316,7 @@ def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> N
             raise ModelError(f"recording.elements[{index}].name", repr(element.name), rule)
 
 
-def _values(camera: Camera, media: Endpoint, index: int, clip: str | None) -> dict[str, Value]:
+def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[str, Value]:
     """The values of the placeholders of a camera's source and graph."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"

@@ -11,10 +11,10 @@ import pytest
 from helpers import CONF, vehicle
 
 from runner.core.commands import KnobValue
-from runner.core.model import Camera, Element, Endpoint, Graph, KnobTarget, ModelError, Roi, Source
+from runner.core.model import Camera, Element, Graph, KnobTarget, Media, ModelError, Roi, Source
 from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
 
-MEDIA = Endpoint("127.0.0.1", 8554)
+MEDIA = Media("127.0.0.1", 8554, rtp_ports=(20000, 20999), session_timeout_s=10, max_viewers=1)
 LEFT = vehicle("modes=paper").cameras["front_left"]
 ROBOT = vehicle("vehicle=delivery_robot").cameras["front"]  # its full image is cut out of a native one
 GRAPHS = sorted(path.stem for path in (CONF / "graph").glob("*.yaml"))

@@ -91,11 +91,13 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not all(map(self.fine, ("media", "control", "page", "log", "latency"))):
+        if not all(map(self.fine, ("media", "control", "page", "log", "latency", "keys", "insecure"))):
             return None
         media = self.part(("media",), _media)
         if media is None:
             return None
+        keys = document.get("keys")  # older drives lack it
+        media = replace(media, secure=keys is not None)
         control = Endpoint(document["control"]["host"], document["control"]["port"])
         built = {name: camera for name, camera in cameras.items() if camera}
         self.built = set(built)
@@ -124,6 +126,8 @@ class Builder:
             recording=recording,
             log_video=document["log"]["video"],
             expires_s=float(document["control"]["expires_s"]),
+            keys=keys,
+            insecure=document.get("insecure", False),
         )
 
     def finished(self, built: T | None) -> T:
@@ -285,7 +289,7 @@ class Builder:
             elif key == "clip" and not Path(str(given)).is_file():
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
-    def _check_compiles(self, camera: Camera, media: Endpoint, index: int, recording: Recording | None) -> None:
+    def _check_compiles(self, camera: Camera, media: Media, index: int, recording: Recording | None) -> None:
         """Check that everything that source, graph and recording refer to exists."""
         anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
         try:

@@ -340,11 +340,13 @@ class Media(Endpoint):
     rtp_ports          first and last UDP port for RTP and RTCP; a camera takes two
     session_timeout_s  a viewer that sends neither requests nor RTCP for this long is dropped
     max_viewers        simultaneous viewers of one camera outside the vehicle
+    secure             whether it serves RTSP over TLS, with SRTP
     """
 
     rtp_ports: tuple[int, int]
     session_timeout_s: int
     max_viewers: int
+    secure: bool = False
 
     def __post_init__(self) -> None:
         first, last = self.rtp_ports
@@ -399,6 +401,8 @@ class Vehicle:
     expires_s  age from which the vehicle drops a request, in addition to the round trip
     log_video  whether the log of a drive holds the video of every camera
     latency    what follows from latency for the speed
+    keys       directory that `tod-runner keys` made for this side; None: nothing is encrypted or authenticated
+    insecure   whether that is intended where video or control leave this machine
     """
 
     name: str
@@ -413,6 +417,8 @@ class Vehicle:
     expires_s: float
     log_video: bool = False
     latency: LatencyLimit = LatencyLimit()
+    keys: str | None = None
+    insecure: bool = False
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

@@ -13,7 +13,7 @@ from fcntl import ioctl
 
 from gi.repository import GstRtspServer
 
-from runner.gst.viewers import StreamViewer, operator_of
+from runner.gst.viewers import StreamViewer
 
 USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data stays unacknowledged for this long (RFC 5482)
 KEEPALIVE_S, KEEPALIVES = 2, 3  # a machine that answers none of this many probes, this far apart, is gone
@@ -51,8 +51,8 @@ class RtspConnection:
     def __str__(self) -> str:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
 
-    def identify(self, agent: str | None) -> None:
-        self.viewer = self.viewer._replace(operator=operator_of(agent))
+    def identify(self, operator: str | None) -> None:
+        self.viewer = self.viewer._replace(operator=operator or "")
 
     def carry_video(self) -> None:
         """This connection will carry video: the kernel closes it when data is no longer acknowledged."""

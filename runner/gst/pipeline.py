@@ -8,6 +8,7 @@ from typing import Any
 from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
+from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
@@ -17,6 +18,7 @@ from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
+SRT_KEY_BYTES = 32  # AES-256
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
 
 
@@ -172,3 +174,16 @@ def counted(identity: Gst.Element) -> tuple[int, int]:
     """Buffers and bytes that an identity has passed."""
     stats = identity.get_property("stats")
     return stats.get_value("num-buffers"), stats.get_value("num-bytes")
+
+
+def encrypt(pipeline: Gst.Bin, passphrase: str) -> None:
+    """Set the passphrase of the pipeline's SRT elements.
+
+    raises  RunError if it has none: its transport cannot be encrypted
+    """
+    found = [element for element in pipeline.iterate_recurse() if element.find_property("passphrase")]
+    for element in found:
+        element.set_property("passphrase", passphrase)
+        element.set_property("pbkeylen", SRT_KEY_BYTES)
+    if not found:
+        raise RunError("with keys only RTSP and SRT are possible: this graph's transport is not encrypted")

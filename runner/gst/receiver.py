@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from gi.repository import GObject, Gst, GstSdp
 
@@ -21,6 +22,9 @@ from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records import Arrival
 from runner.system.recent import RecentValue
+
+if TYPE_CHECKING:
+    from runner.gst.secure import StreamLogin
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
@@ -79,6 +83,7 @@ class Receiver:
     arrivals    record when each access unit arrived
     video       where to keep what is received; the plan then has `video`
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
+    login       how it proves who it is; None: to a vehicle that does not ask
     """
 
     def __init__(
@@ -90,8 +95,9 @@ class Receiver:
         arrivals: bool = False,
         video: VideoFiles | None = None,
         operator: str = "",
+        login: StreamLogin | None = None,
     ) -> None:
-        self._on_report, self._video, self._operator = on_report, video, operator
+        self._on_report, self._video, self._operator, self._login = on_report, video, operator, login
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
@@ -210,6 +216,8 @@ class Receiver:
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
+        if self._login:
+            self._login.prepare(pipeline, self._client)
         if GObject.signal_lookup("select-stream", self._client):
             take_feedback(self._client, self._on_profile)
         if self._operator and self._client.find_property("user-agent"):

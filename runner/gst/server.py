@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 
@@ -21,8 +22,12 @@ from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
-from runner.gst.viewers import admit, over_uplink
+from runner.gst.viewers import admit, operator_of, over_uplink
 from runner.system.ports import check_port_free
+
+if TYPE_CHECKING:
+    from runner.gst.secure import ViewerCheck
+    from runner.security.keyring import Keyring
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 
@@ -93,12 +98,25 @@ class CameraServer:
 
     build      makes a `CameraPipeline` from each new pipeline
     on_report  called when pipelines start and stop, and when viewers are disconnected
+    keyring    of this vehicle; None: anybody may watch, and nothing is encrypted
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, build: Build, on_report: OnReport) -> None:
+    def __init__(
+        self,
+        plans: Sequence[Plan],
+        media: Media,
+        build: Build,
+        on_report: OnReport,
+        keyring: Keyring | None = None,
+    ) -> None:
         check_port_free(media)
+        self._viewers: ViewerCheck | None = None
+        if keyring:
+            from runner.gst.secure import ViewerCheck
+
+            self._viewers = ViewerCheck(keyring, lambda what: on_report("keys", what))
         self._media, self._build, self._on_report = media, build, on_report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
@@ -114,6 +132,8 @@ class CameraServer:
         self._threads = GstRtspServer.RTSPThreadPool()
         self._threads.set_max_threads(-1)  # one per client
         self._server.set_thread_pool(self._threads)
+        if self._viewers:
+            self._server.set_auth(self._viewers.auth)
         self._server.connect("client-connected", self._on_connected)
         self._addresses = _address_pool(media)
         self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
@@ -148,10 +168,13 @@ class CameraServer:
             factory.set_address_pool(self._addresses)
         if int(settings.get("dscp", -1)) >= 0:
             factory.set_dscp_qos(int(settings["dscp"]))
-        if int(settings.get("retransmission_ms", 0)):
-            factory.set_retransmission_time(int(settings["retransmission_ms"]) * Gst.MSECOND)
+        repairs = int(settings.get("retransmission_ms", 0))
+        if repairs:
+            factory.set_retransmission_time(repairs * Gst.MSECOND)
             factory.set_do_retransmission(True)
-            factory.set_profiles(GstRtsp.RTSPProfile.AVPF | GstRtsp.RTSPProfile.AVP)
+        if self._viewers:
+            factory.set_permissions(self._viewers.permissions)
+        factory.set_profiles(_profiles(repairs > 0, self._viewers is not None))
         return factory
 
     def _on_configure(self, _factory: object, media: GstRtspServer.RTSPMedia, camera: _Camera) -> None:
@@ -319,7 +342,7 @@ class CameraServer:
             newcomer = self._connections.get(client)
             if camera is None or newcomer is None:
                 return UNAVAILABLE
-            newcomer.identify(_user_agent(context))
+            newcomer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
             if camera.name in newcomer.cameras:
                 return OK
             there = [c for c in self._connections.values() if camera.name in c.cameras]
@@ -412,8 +435,12 @@ class CameraServer:
         self._wake(left)
         for name in left:
             self._unblock(name, now)
+        if self._viewers:
+            self._viewers.refresh()
         for client, connection in connections:
-            if lags.get(connection, 0) > LAG_S:
+            if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
+                self._close(connection, "its keys are not accepted any more")
+            elif lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
@@ -453,6 +480,16 @@ class CameraServer:
     def _is_silent(self, camera: str) -> bool:
         pipeline = self.pipelines.get(camera)
         return pipeline is not None and (pipeline.paused or bool(pipeline.source_fault))
+
+
+def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
+    """With feedback for retransmission, and without for players that do not know it (RFC 4585); as SRTP (RFC 5124)."""
+    plain, feedback = (
+        (GstRtsp.RTSPProfile.SAVP, GstRtsp.RTSPProfile.SAVPF)
+        if secure
+        else (GstRtsp.RTSPProfile.AVP, GstRtsp.RTSPProfile.AVPF)
+    )
+    return feedback | plain if repairs else plain
 
 
 def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool | None:

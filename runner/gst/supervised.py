@@ -12,7 +12,7 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 from runner.gst.aside import HUNG, set_state_aside
 from runner.gst.outage import Outage
-from runner.gst.pipeline import Build, CameraPipeline
+from runner.gst.pipeline import Build, CameraPipeline, encrypt
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to end, whose port it needs
@@ -107,11 +107,14 @@ class SupervisedPipeline:
 class CameraCaller:
     """One camera's supervised pipeline on the vehicle.
 
-    build  makes a `CameraPipeline` from each new pipeline
+    build       makes a `CameraPipeline` from each new pipeline
+    passphrase  that encrypts the stream; None: it is not encrypted
     """
 
-    def __init__(self, plan: Plan, build: Build, on_report: Callable[[str, str], None]) -> None:
-        self._plan, self._build = plan, build
+    def __init__(
+        self, plan: Plan, build: Build, on_report: Callable[[str, str], None], passphrase: str | None = None
+    ) -> None:
+        self._plan, self._build, self._passphrase = plan, build, passphrase
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: on_report(name, what))
@@ -124,5 +127,7 @@ class CameraCaller:
         self._supervised.stop()
 
     def _on_built(self, pipeline: Any) -> Gst.Pad:
+        if self._passphrase:
+            encrypt(pipeline, self._passphrase)
         self.pipeline = self._build(pipeline, self._plan)
         return pipeline.get_by_name(self._plan.vehicle[-1].name).get_static_pad("sink")

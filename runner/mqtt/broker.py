@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -11,20 +12,20 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from runner.core.model import Endpoint
 from runner.errors import RunError
+from runner.security.broker_files import broker_settings
 from runner.system import children, signals
 from runner.system.ports import check_port_free
 
 START_S = 5.0
 END_S = 0.3  # the broker stores nothing that would take time to write
 KEPT_LINES = 20
+OPEN = ("allow_anonymous true", "persistence false", "set_tcp_nodelay true")
 # Log errors only: otherwise each connection adds a line.
 SETTINGS = (
-    "allow_anonymous true",
-    "persistence false",
-    "set_tcp_nodelay true",
     "connection_messages false",
     "user root",  # when started by root: after a change of user the kernel no longer ends it with this process
     "log_type error",
@@ -33,13 +34,21 @@ SETTINGS = (
 
 
 class Broker:
-    """mosquitto as a child process that ends with this one."""
+    """mosquitto as a child process that ends with this one.
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    keys  the broker's directory of keys; None: it serves anybody
+    """
+
+    def __init__(self, endpoint: Endpoint, keys: Path | None = None) -> None:
         self._address = (endpoint.host, endpoint.port)
         self._where = f"{endpoint.host}:{endpoint.port}"
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
-        settings = (f"listener {endpoint.port} {endpoint.host}", *SETTINGS, "")
+        listener = (
+            broker_settings(str(keys.absolute()), endpoint.host, endpoint.port).splitlines()
+            if keys
+            else (f"listener {endpoint.port} {endpoint.host}", *OPEN)
+        )
+        settings = (*listener, *SETTINGS, "")
         file = os.memfd_create("mosquitto.conf")
         try:
             os.write(file, "\n".join(settings).encode())
@@ -79,6 +88,10 @@ class Broker:
         message = self._last_line() if self._process.poll() is not None else "it does not answer"
         raise RunError(f"mosquitto does not start on {self._where}: {message}; choose another control.port")
 
+    def reload(self) -> None:
+        """Read passwords and revocation list again; whoever is not accepted any more is disconnected."""
+        self._process.send_signal(signal.SIGHUP)
+
     def end(self) -> None:
         self._process.terminate()
         children.end(self._process, END_S)
@@ -95,13 +108,14 @@ class Broker:
 
 
 @contextmanager
-def private_broker(endpoint: Endpoint) -> Iterator[Broker]:
-    """mosquitto on one address, without authentication or persistence, for the duration of the block.
+def private_broker(endpoint: Endpoint, keys: Path | None = None) -> Iterator[Broker]:
+    """mosquitto on one address, without persistence, for the duration of the block.
 
+    keys    the broker's directory of keys; None: it serves anybody
     raises  RunError if mosquitto is missing or does not start
     """
     check_port_free(endpoint)
-    broker = Broker(endpoint)
+    broker = Broker(endpoint, keys)
     try:
         broker.wait_until_it_answers()
         yield broker

@@ -18,6 +18,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.core.model import Endpoint
 from runner.errors import RunError
+from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
@@ -61,6 +62,7 @@ class ControlLink:
     listen        by topic filter, the callback for its messages
     on_connected  called with True when messages for this side will reach it, with False when the connection is lost
     on_report     called with one line when the broker cannot be reached, once for each reason, and when it can again
+    login         how to prove who this side is; None: to a broker that does not ask
 
     A message whose callback raises is reported and counted in `dropped`; the link continues.
     """
@@ -72,7 +74,9 @@ class ControlLink:
         listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         on_report: Callable[[str], None],
+        login: Login | None = None,
     ) -> None:
+        self._login = login
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._on_report = on_connected, on_report
         self._connection_fault: str | None = None  # why there is no connection, as reported
@@ -133,6 +137,9 @@ class ControlLink:
         client.on_broken = self._on_broken
         client.connect_timeout = CONNECT_S
         client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
+        if self._login:
+            client.tls_set_context(self._login.context)
+            client.on_pre_connect = self._log_in
         topic, message = self._will
         client.will_set(topic, json.dumps(message), qos=1, retain=_kept(topic))
         client.on_socket_open = _settle
@@ -143,6 +150,11 @@ class ControlLink:
         for wanted, function in self._listen.items():
             client.message_callback_add(wanted, self._guarded(function))
         return client
+
+    def _log_in(self, client: Client, _data: object) -> None:
+        """Keys may have been replaced since the last connection."""
+        assert self._login
+        client.username_pw_set(self._login.user, self._login.refresh())
 
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:

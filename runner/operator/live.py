@@ -22,12 +22,16 @@ from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
+from runner.core.roles import Role
 from runner.drive.log import Log
-from runner.errors import RunError
+from runner.errors import RunError, UserError
+from runner.mqtt.login import Login
 from runner.operator.log import DriveLog
 from runner.operator.station import Station
 from runner.plans import compile_plans
 from runner.records import Outcome
+from runner.security.exposure import keyring_of
+from runner.security.keyring import MEDIA_SECRET, Keyring
 
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
@@ -167,6 +171,15 @@ class LiveOperator:
         return now - self._online_at
 
 
+def _keyring(vehicle: Vehicle) -> Keyring | None:
+    """raises UserError for keys that are missing, incomplete, or of a holder that sees no video"""
+    keyring = keyring_of(vehicle, MEDIA_SECRET)
+    if keyring and keyring.holder.role not in (Role.CONTROLLER, Role.WATCHER):
+        found = f"{keyring.holder.role} {keyring.holder.name}"
+        raise UserError("keys", "", vehicle.keys, f"must be those of a controller or a watcher, not of {found}")
+    return keyring
+
+
 @contextmanager
 def live_operator(
     overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
@@ -182,7 +195,8 @@ def live_operator(
     config = configuration(overrides, conf, runnable=False, check=apply.check_plan)
     vehicle, document = config.vehicle(), config.document
     plans = compile_plans(vehicle)
-    station = Station(vehicle, agreement.settings(document))
+    keyring = _keyring(vehicle)
+    station = Station(vehicle, agreement.settings(document), Login(keyring) if keyring else None)
     versions = apply.versions(element for plan in plans for element in plan.operator)
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
@@ -192,7 +206,14 @@ def live_operator(
     def build(on_unit: OnUnit | None) -> OperatorSide:
         logged = log is not None
         return apply.OperatorSide(
-            plans, station.report, on_unit, arrivals=logged, video=video, operator=station.identity
+            plans,
+            station.report,
+            on_unit,
+            arrivals=logged,
+            video=video,
+            operator=station.identity,
+            keyring=keyring,
+            vehicle=vehicle.name,
         )
 
     operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)

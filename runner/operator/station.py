@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from runner.configuration import agreement
 from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
+from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     APPLY_S,
     MAX_ROUND_TRIP_S,
@@ -90,14 +91,15 @@ class Station:
     """One operator's end of the control link, and the measurements of reception.
 
     settings   those that the vehicle's configuration must agree with, see `runner.configuration.agreement`
+    login      of this operator; None: to a broker that does not ask, under an id of its own
     listeners  must be added before `connect`
 
     Requests go out through `ask`; samples of the cameras' counters come in through `take`.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath) -> None:
+    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath, login: Login | None = None) -> None:
         self._vehicle, self._settings = vehicle, settings
-        self.identity = uuid.uuid4().hex[:12]  # of this operator
+        self.identity = login.user if login else uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
@@ -131,7 +133,7 @@ class Station:
         self._requests = topic(vehicle.name, "request", self.identity)
         self._receptions = topic(vehicle.name, "reception", self.identity)
         self._link = ControlLink(
-            vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note
+            vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note, login
         )
 
     def connect(self) -> None:

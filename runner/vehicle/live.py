@@ -22,10 +22,12 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress, Vehicle
+from runner.core.roles import Role, denial
 from runner.drive.log import Log
-from runner.errors import RunError
+from runner.errors import RunError, UserError
 from runner.graph import rtsp_url
 from runner.mqtt.link import ControlLink
+from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OFFLINE,
     MqttMessage,
@@ -38,6 +40,8 @@ from runner.mqtt.messages import (
 )
 from runner.plans import compile_plans, render_missing
 from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetry, VehicleState, to_json
+from runner.security.exposure import keyring_of
+from runner.security.keyring import PASSPHRASE, PEOPLE, Holder, Keyring
 from runner.system.kernel_clock import clock_error_s
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
@@ -152,8 +156,15 @@ class _VehicleControl:
     Nothing is published until it is known that no other vehicle of this name is at the broker.
     """
 
-    def __init__(self, vehicle: Vehicle, document: Mapping[str, Any], on_report: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        document: Mapping[str, Any],
+        on_report: Callable[[str], None],
+        keyring: Keyring | None = None,
+    ) -> None:
         self._name, self._on_report = vehicle.name, on_report
+        self._people = keyring.watched_people(on_report) if keyring else None
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._alone = threading.Event()
@@ -165,9 +176,9 @@ class _VehicleControl:
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        self._link = ControlLink(
-            vehicle.control, (self._topic("state"), OFFLINE), listen, self._on_connected, on_report
-        )
+        login = Login(keyring) if keyring else None
+        will = (self._topic("state"), OFFLINE)
+        self._link = ControlLink(vehicle.control, will, listen, self._on_connected, on_report, login)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -210,10 +221,22 @@ class _VehicleControl:
             self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
         request = Request(message.sender, parsed.document, answer, parsed.as_of)
-        if parsed.problem:
-            self._live.loop.refuse(request, parsed.problem)
+        problem = parsed.problem or self._denial(message.sender, parsed.document.get("event"))
+        if problem:
+            self._live.loop.refuse(request, problem)
         else:
             self._live.loop.take(request)
+
+    def may_control(self, operator: str) -> bool:
+        """Whether an operator may drive."""
+        return self._denial(operator, "mode_selected") is None
+
+    def _denial(self, sender: str, event: Any) -> str | None:
+        """Why a sender may not request an event; None if it may, as anybody may without keys."""
+        if self._people is None:
+            return None
+        person = self._people.get().get(sender)
+        return denial(person.role if person else None, str(event))
 
     def _on_reception(self, message: MqttMessage) -> None:
         received = time.time()
@@ -253,6 +276,15 @@ class _VehicleControl:
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
+def _keyring(vehicle: Vehicle) -> Keyring | None:
+    """raises UserError for keys that are missing, incomplete, or another vehicle's"""
+    keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
+    if keyring and keyring.holder != Holder(vehicle.name, Role.VEHICLE):
+        found = f"{keyring.holder.role} {keyring.holder.name}"
+        raise UserError("keys", "", vehicle.keys, f"must be those of vehicle {vehicle.name}, not of {found}")
+    return keyring
+
+
 @contextmanager
 def live_vehicle(
     overrides: Sequence[str] = (),
@@ -273,6 +305,7 @@ def live_vehicle(
 
     config = configuration(overrides, conf, check=apply.check_plan)
     (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
+    keyring = _keyring(vehicle)
     render_missing(vehicle, progress)
     plans = compile_plans(vehicle)
     apply.check_machine(plans)
@@ -285,9 +318,9 @@ def live_vehicle(
         drive.note(what)
 
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
-    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video)
-    control = _VehicleControl(vehicle, document, report)
-    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report)
+    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
+    control = _VehicleControl(vehicle, document, report, keyring)
+    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report, control.may_control)
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:

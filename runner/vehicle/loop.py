@@ -83,9 +83,10 @@ class _PendingReply(NamedTuple):
 class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` their events.
 
-    publish    called with the state (decided and applied) whenever it changed, and telemetry a few times a second;
-               returns False for one that has to wait, since the control link is behind
-    on_report  called with one line on what happened and its result
+    publish      called with the state (decided and applied) whenever it changed, and telemetry a few times a second;
+                 returns False for one that has to wait, since the control link is behind
+    on_report    called with one line on what happened and its result
+    may_control  whether an operator may be in control, now
 
     An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
     something (time.monotonic), `busy_with` what it is doing.
@@ -98,6 +99,7 @@ class ControlLoop:
     log: Log
     publish: Callable[[VehicleState | Telemetry | SpeedAdvice], bool]
     on_report: Callable[[str], None]
+    may_control: Callable[[str], bool] = lambda operator: True
     refused: int = 0
     errors: int = 0
     beat: float = 0.0
@@ -117,7 +119,7 @@ class ControlLoop:
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
-        self._operators = Operators(self.vehicle.expires_s)
+        self._operators = Operators(self.vehicle.expires_s, self.may_control)
         self._uplink = MeasuredUplink(self.vehicle)
         self._in_control = ""
         self._watched = 0.0  # when operators were last watched

@@ -8,7 +8,7 @@ back. One of those present is in control.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
@@ -32,11 +32,12 @@ class _Operator:
 class Operators:
     """All operators known to the vehicle.
 
-    expires_s  age from which a request is dropped, beyond the measured round trip
+    expires_s    age from which a request is dropped, beyond the measured round trip
+    may_control  whether an operator may be in control, now
     """
 
-    def __init__(self, expires_s: float) -> None:
-        self._expires_s = expires_s
+    def __init__(self, expires_s: float, may_control: Callable[[str], bool] = lambda name: True) -> None:
+        self._expires_s, self._may_control = expires_s, may_control
         self._known: dict[str, _Operator] = {}
         self._control = ""  # the operator that was last in control
 
@@ -47,7 +48,7 @@ class Operators:
     @property
     def in_control(self) -> str:
         """The operator in control, "" for none."""
-        return self._control if self._control in self.present else ""
+        return self._control if self._control in self.present and self._may_control(self._control) else ""
 
     def _pass_control(self, t: float) -> None:
         """Control stays with an operator that is present; then it passes to the one that has been present longest.
@@ -55,7 +56,7 @@ class Operators:
         One that fell silent keeps it until another has been heard for SILENT_S since: where nobody was heard meanwhile,
         the link was down, and whoever is heard first after it must not take the pictures from the one that drives.
         """
-        present = {name: operator.since for name, operator in self._known.items() if operator.present}
+        present = {name: o.since for name, o in self._known.items() if o.present and self._may_control(name)}
         if not present or self._control in present:
             return
         longest = min(present, key=lambda name: present[name])

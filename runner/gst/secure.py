@@ -1,0 +1,141 @@
+"""Encryption and authentication of the streams: RTSP over TLS with SRTP, SRT with a passphrase.
+
+Peers are checked here and not by GLib: it knows no revocation lists, and a vehicle is known by its name, not by the
+address at which it happens to be reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
+
+from runner.core.roles import Role
+from runner.errors import RunError
+from runner.gst.pipeline import encrypt
+from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, rtsp_password, srt_passphrase
+
+VIEWER = "viewer"  # the role of the server library that may open and watch a camera
+
+
+class PeerCheck:
+    """Decides which certificates are accepted: the authority's, in their term, and not revoked.
+
+    on_report  called with what is wrong with a new revocation list
+    """
+
+    def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
+        self._authority = Gio.TlsCertificate.new_from_file(str(keyring.authority))
+        self._revoked = keyring.watched_revoked(on_report)
+
+    def holder(self, certificate: Gio.TlsCertificate | None) -> Holder | str:
+        """Whose certificate it is, or why it is not accepted."""
+        if certificate is None:
+            return "it has no certificate"
+        if wrong := certificate.verify(None, self._authority):
+            return f"its certificate is not accepted: {', '.join(wrong.value_nicks)}"
+        read = x509.load_der_x509_certificate(bytes(certificate.props.certificate))
+        if read.serial_number in self._revoked.get():
+            return "its certificate is revoked"
+        name, role = (
+            str(read.subject.get_attributes_for_oid(oid)[0].value)
+            for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME)
+        )
+        return Holder(name, Role(role))
+
+
+class _Certificate(Gio.TlsInteraction):  # type: ignore[misc]
+    """Presents a client's certificate when the server asks for it."""
+
+    def __init__(self, certificate: Gio.TlsCertificate) -> None:
+        super().__init__()
+        self._certificate = certificate
+
+    def do_request_certificate(
+        self, connection: Gio.TlsConnection, _flags: object, _cancellable: object
+    ) -> Gio.TlsInteractionResult:
+        connection.set_certificate(self._certificate)
+        return Gio.TlsInteractionResult.HANDLED
+
+
+def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
+    """raises RunError for files that do not fit together"""
+    try:
+        return Gio.TlsCertificate.new_from_files(str(keyring.certificate), str(keyring.key))
+    except GLib.Error as error:
+        raise RunError(f"{keyring.directory}: {error.message}") from None
+
+
+class StreamLogin:
+    """How an operator's receivers prove who they are, and know the vehicle.
+
+    vehicle  its name
+    """
+
+    def __init__(self, keyring: Keyring, vehicle: str, on_report: Callable[[str], None]) -> None:
+        self._keyring, self._vehicle = keyring, vehicle
+        self._check = PeerCheck(keyring, on_report)
+
+    def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> None:
+        """Set up a new pipeline and its client. The files of the keyring are read again each time."""
+        keyring = self._keyring
+        if not client.find_property("tls-interaction"):
+            encrypt(pipeline, srt_passphrase(keyring.read(MEDIA_SECRET), self._vehicle))
+            return
+        client.set_property("tls-interaction", _Certificate(own_certificate(keyring)))
+        # Nobody else's certificate is signed by this one: none is accepted without the signal.
+        client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate)))
+        client.set_property("user-id", keyring.holder.name)
+        client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
+        client.connect("accept-certificate", self._accept)
+
+    def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
+        return self._check.holder(certificate) == Holder(self._vehicle, Role.VEHICLE)
+
+
+class ViewerCheck:
+    """Who may watch: holders of an accepted certificate, with the password of the user that it names."""
+
+    def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
+        self._check = PeerCheck(keyring, on_report)
+        self._people = keyring.watched_people(on_report)
+        self._on_report = on_report
+        self._known: Mapping[str, str] = {}  # passwords given to the library, by user
+        self.auth = GstRtspServer.RTSPAuth()
+        self.auth.set_tls_certificate(own_certificate(keyring))
+        self.auth.set_tls_authentication_mode(Gio.TlsAuthenticationMode.REQUIRED)
+        self.auth.set_supported_methods(GstRtsp.RTSPAuthMethod.DIGEST)
+        self.auth.connect("accept-certificate", self._accept)
+        self.permissions = GstRtspServer.RTSPPermissions()
+        for name in (GstRtspServer.RTSP_PERM_MEDIA_FACTORY_ACCESS, GstRtspServer.RTSP_PERM_MEDIA_FACTORY_CONSTRUCT):
+            self.permissions.add_permission_for_role(VIEWER, name, True)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Let the library know the users of now."""
+        people = {name: person.rtsp for name, person in self._people.get().items() if person.rtsp}
+        for name in self._known.keys() - people.keys():
+            self.auth.remove_digest(name)
+        for name, password in people.items():
+            if self._known.get(name) != password:
+                token = GstRtspServer.RTSPToken()
+                token.set_string(GstRtspServer.RTSP_TOKEN_MEDIA_FACTORY_ROLE, VIEWER)
+                self.auth.add_digest(name, password, token)
+        self._known = people
+
+    def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
+        """The holder of a client's certificate; None if it is not accepted, any more."""
+        tls = client.get_connection().get_tls()
+        holder = self._check.holder(tls.get_peer_certificate() if tls else None)
+        return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
+
+    def _accept(self, _auth: object, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
+        holder = self._check.holder(certificate)
+        if isinstance(holder, Holder):
+            if holder.name in self._known:
+                return True
+            holder = f"{holder.name} may not watch"
+        self._on_report(f"refused an RTSP client: {holder}")
+        return False

@@ -1,0 +1,310 @@
+"""Keys: who holds them drives and sees; who does not is refused, by real GStreamer, mosquitto and OpenSSL."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from rig import free_port, process, until
+from runner.core.commands import Command
+from runner.core.model import Endpoint
+from runner.core.roles import Role
+from runner.mqtt.broker import private_broker
+from runner.operator.live import live_operator
+from runner.security import keyring
+from runner.security.authority import Authority
+from runner.security.keyring import Keyring
+
+CAMERAS = ("front", "rear")
+WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "~cameras.mast", "page.serve=false", "pqos=constant")
+NAME = "delivery_robot"
+
+
+def issue(directory, now=None, **names):
+    authority = Authority(directory, (lambda: now) if now else lambda: datetime.now(UTC))
+    with authority.opened():
+        authority.issue("broker", Role.BROKER, ["127.0.0.1"])
+        authority.issue(NAME, Role.VEHICLE, ["127.0.0.1"])
+        for name, role in names.items():
+            authority.issue(name, Role(role), [])
+    return directory
+
+
+@pytest.fixture
+def keys(tmp_path):
+    people = {"alice": "controller", "bob": "watcher", "pqos": "predictor", "gnss": "positioner"}
+    return issue(tmp_path / "keys", **people)
+
+
+def changed(keys, action, name):
+    """Rotate or revoke, as the verb does."""
+    authority = Authority(keys)
+    with authority.opened():
+        getattr(authority, action)(name)
+
+
+# --- control ----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def driving(keys, *words):
+    """A vehicle with keys and its broker; yields (broker, words for the operator)."""
+    media, control = free_port(), Endpoint("127.0.0.1", free_port())
+    common = (*WORDS, f"media.port={media}", f"control.port={control.port}", *words)
+    with private_broker(control, keys / "broker") as broker, process("vehicle", *common, f"keys={keys / NAME}"):
+        yield broker, common
+
+
+@contextmanager
+def operating(keys, common, name):
+    with live_operator([*common, f"keys={keys / name}"]) as operator:
+        operator.start()
+        yield operator
+
+
+def asked(operator, event):
+    """The vehicle's answer to a request."""
+    answers = []
+    operator.station.ask(event, answers.append)
+    return until(lambda: answers)[0]
+
+
+def frames(operator):
+    return {name: counters.frames for name, counters in operator.station.samples.items()}
+
+
+def test_video_and_control_pass_and_each_role_may_do_what_it_is_for(keys):
+    with driving(keys) as (_, common), operating(keys, common, "alice") as alice:
+        until(lambda: alice.station.state)
+        until(lambda: frames(alice) and min(frames(alice).values()) > 10)
+        assert alice.station.identity == "alice"
+        assert asked(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+        with operating(keys, common, "bob") as bob:
+            until(lambda: bob.station.state)
+            refused = asked(bob, {"event": "total_set", "kbps": 10})
+            assert (refused.result, refused.reason) == (
+                "refused",
+                "a watcher may not request total_set; only controller may",
+            )
+            assert asked(bob, {"event": "operator_connected"}).result == "applied"
+        state = alice.station.state
+        assert state.mode == "collective"
+
+
+def stands_still(operator):
+    before = frames(operator)
+    time.sleep(1)
+    return frames(operator) == before
+
+
+def mosquitto(program, endpoint, holder, *words, password=None, cafile=None, tls=True, user=None):
+    """Exit status of a mosquitto client with a holder's keys, and what it printed."""
+    ring = Keyring(holder)
+    command = [program, "-h", endpoint.host, "-p", str(endpoint.port), "-q", "1", "-V", "mqttv5"]
+    if tls:
+        command += ["--cafile", cafile or ring.authority, "--cert", ring.certificate, "--key", ring.key]
+    own = keyring.mqtt_password(ring.secret) if password is None else password
+    if own:
+        command += ["-u", user or ring.holder.name, "-P", own]
+    done = subprocess.run([*command, *words], capture_output=True, text=True, timeout=20, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture
+def broker(keys):
+    endpoint = Endpoint("127.0.0.1", free_port())
+    with private_broker(endpoint, keys / "broker"):
+        yield endpoint
+
+
+def published(endpoint, holder, topic, **how):
+    return mosquitto("mosquitto_pub", endpoint, holder, "-t", topic, "-m", "x", **how)
+
+
+@pytest.mark.parametrize(
+    ("holder", "topic", "allowed"),
+    [
+        ("alice", f"tod/{NAME}/request/alice", True),
+        ("alice", f"tod/{NAME}/request/bob", False),
+        ("alice", f"tod/{NAME}/state", False),
+        ("alice", f"tod/{NAME}/reply/alice", False),
+        (NAME, f"tod/{NAME}/state", True),
+        (NAME, f"tod/{NAME}/reply/alice", True),
+        (NAME, "tod/another/state", False),
+        (NAME, "tod/another/reply/alice", False),
+    ],
+)
+def test_nobody_speaks_for_another(keys, broker, holder, topic, allowed):
+    status, output = published(broker, keys / holder, topic)
+    assert (status, "failed: Not authorized" in output) == (0, not allowed), output
+
+
+def test_the_broker_refuses_intruders(keys, broker, tmp_path):
+    topic = f"tod/{NAME}/request/alice"
+    assert published(broker, keys / "alice", topic) == (0, "")
+    others = issue(tmp_path / "others", alice="controller")
+    late = issue(tmp_path / "late", now=datetime.now(UTC) - timedelta(days=400), alice="controller")
+    for intruder, how in (
+        (keys / "alice", {"password": ""}),
+        (keys / "alice", {"password": "guessed"}),
+        (keys / "alice", {"user": "bob"}),
+        (keys / "alice", {"tls": False}),
+        (others / "alice", {"cafile": keys / "alice" / "ca.crt"}),
+        (late / "alice", {"cafile": keys / "alice" / "ca.crt"}),
+    ):
+        assert published(broker, intruder, topic, **how)[0] != 0, (intruder, how)
+    assert published(broker, keys / "alice", topic) == (0, "")
+
+
+def test_what_is_revoked_is_disconnected_and_stays_out(keys):
+    old = keys.parent / "old"
+    shutil.copytree(keys / "alice", old)
+    with (
+        driving(keys) as (broker, common),
+        operating(keys, common, "bob") as bob,
+        live_operator([*common, f"keys={old}"]) as alice,
+    ):
+        alice.start()
+        until(lambda: alice.station.state and bob.station.state and min(frames(alice).values(), default=0) > 10)
+        changed(keys, "revoke", "alice")
+        broker.reload()
+        began = time.monotonic()
+        until(lambda: alice.station.state is None)
+        until(lambda: stands_still(alice))
+        assert time.monotonic() - began < 5
+        assert bob.station.state
+        assert published(broker_of(common), old, f"tod/{NAME}/request/alice")[0] != 0
+
+
+def broker_of(common):
+    port = next(word for word in common if word.startswith("control.port="))
+    return Endpoint("127.0.0.1", int(port.partition("=")[2]))
+
+
+# --- video ------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def sending(keys, *words):
+    """A vehicle's cameras; yields (plans, reports)."""
+    from runner.apply import VehicleSide, check_plan
+    from runner.configuration.config import configuration
+    from runner.plans import compile_plans
+
+    own = [*WORDS, f"media.port={free_port()}", f"keys={keys / NAME}", *words]
+    vehicle = configuration(own, check=check_plan).vehicle()
+    plans, reports = compile_plans(vehicle), []
+    side = VehicleSide(
+        plans, vehicle.media, lambda who, what: reports.append(f"{who}: {what}"), keyring=Keyring(keys / NAME)
+    )
+    knobs = {"sending": True, "size": (320, 180), "bitrate": 300}
+    side.turn([Command(camera, knob, value) for camera in CAMERAS for knob, value in knobs.items()])
+    try:
+        yield plans, reports
+    finally:
+        side.stop()
+
+
+@contextmanager
+def watching(plans, holder, vehicle=NAME):
+    """A function that returns the frames received of each camera, and the side's messages."""
+    from runner.apply import OperatorSide
+
+    messages = []
+    side = OperatorSide(
+        plans,
+        lambda cameras, what: messages.append(f"{cameras}: {what}"),
+        keyring=Keyring(holder) if holder else None,
+        vehicle=vehicle,
+    )
+    try:
+        yield lambda: {name: each.frames for name, each in side.sample(dict.fromkeys(CAMERAS, True)).items()}, messages
+    finally:
+        side.stop()
+
+
+@pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
+def test_pictures_come_to_who_has_keys(keys, graph):
+    with sending(keys, f"graph={graph}") as (plans, _), watching(plans, keys / "bob") as (seen, messages):
+        until(lambda: min(seen().values()) > 10, every_s=0.1)
+        assert not messages, messages
+
+
+def test_rtsp_refuses_intruders(keys, tmp_path):
+    others = issue(tmp_path / "others", alice="controller")
+    wrong = tmp_path / "wrong"
+    shutil.copytree(keys / "alice", wrong)
+    (wrong / keyring.SECRET).write_text("guessed")
+    with sending(keys) as (plans, reports):
+        intruders = (others / "alice", wrong, keys / "pqos", None)
+        with ExitStack() as stack:
+            all_seen = [stack.enter_context(watching(plans, holder)) for holder in intruders]
+            with watching(plans, keys / "alice") as (seen, _):
+                until(lambda: min(seen().values()) > 30, every_s=0.1)
+            for holder, (own, _) in zip(intruders, all_seen, strict=True):
+                assert set(own().values()) == {0}, holder
+    assert any("refused an RTSP client" in what for what in reports)
+    secret = (keys / "alice" / keyring.SECRET).read_text()
+    assert not any(secret in what for what in reports)
+
+
+def test_an_operator_knows_its_vehicle(keys):
+    """Another vehicle of the same fleet answers at that address."""
+    with sending(keys) as (plans, _), watching(plans, keys / "alice", vehicle="another") as (seen, _):
+        end = time.monotonic() + 4
+        while time.monotonic() < end:
+            assert set(seen().values()) == {0}
+            time.sleep(0.2)
+
+
+def test_plain_rtsp_is_not_answered(keys):
+    with sending(keys) as (plans, _):
+        plain = [replace(plan, operator=_unencrypted(plan)) for plan in plans]
+        with watching(plain, None) as (seen, _), watching(plans, keys / "alice") as (own, _):
+            until(lambda: min(own().values()) > 30, every_s=0.1)
+            assert set(seen().values()) == {0}
+
+
+def _unencrypted(plan):
+    client, *rest = plan.operator
+    location = client.properties["location"].replace("rtsps:", "rtsp:")
+    return (replace(client, properties={**client.properties, "location": location}), *rest)
+
+
+# --- what is refused before anything starts ---------------------------------------------------------------------------
+
+
+def refusal(verb, *words):
+    with process(verb, *words, "duration_s=1") as child:
+        output, _ = child.communicate(timeout=60)
+    return child.returncode, output.strip()
+
+
+@pytest.mark.parametrize("verb", ["vehicle", "operator"])
+def test_a_network_needs_keys(verb):
+    words = (*WORDS, "media.host=192.0.2.1", "control.host=192.0.2.2")
+    assert refusal(verb, *words) == (
+        2,
+        "command line: keys: media.host 192.0.2.1 and control.host 192.0.2.2 are reached over a network: "
+        "give keys=DIR, made by `tod-runner keys`, or insecure=true",
+    )
+
+
+def test_keys_of_another_role_are_refused(keys):
+    status, output = refusal("vehicle", *WORDS, f"keys={keys / 'alice'}")
+    assert (status, "people.json: no such file" in output) == (2, True)
+    status, output = refusal("operator", *WORDS, f"keys={keys / 'pqos'}")
+    assert (status, "media.secret: no such file" in output) == (2, True)
+    shutil.copytree(keys / "bob", keys / "copy")
+    (keys / "copy" / "own.json").write_text('{"name": "bob", "role": "predictor"}')
+    status, output = refusal("operator", *WORDS, f"keys={keys / 'copy'}")
+    assert (status, output) == (
+        2,
+        f"keys: {keys / 'copy'}: must be those of a controller or a watcher, not of predictor bob",
+    )
