@@ -12,7 +12,6 @@ from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import KEPT, NTP_EPOCH_S, RTP_HZ, MediaClock
-from runner.gst.pipeline import counted
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -116,6 +115,7 @@ class Receiver:
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
         self._damage, self._damaged = Damage(self._codec), 0
+        self._frames = self._bytes = 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
@@ -208,10 +208,9 @@ class Receiver:
         self._damage = Damage(self._codec, lasts=self._built)
         self._built = True
         self._close_filter()
-        self._moved = (self._before.frames, time.monotonic())
+        self._moved = (self._frames, time.monotonic())
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
-        self._received = pipeline.get_by_name("received")
         self._begun = self._inspects = False
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
@@ -224,12 +223,13 @@ class Receiver:
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
             VideoFile(self._video, self._name, "operator", _came, self._on_report).follow(pipeline)
-        self._received.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
+        received = pipeline.get_by_name("received").get_static_pad("src")
+        received.add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
         if self._untimed and (depayloader := pipeline.get_by_name(self._untimed)):
             depayloader.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
-        return self._received.get_static_pad("src")
+        return received
 
     def _on_progress(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
         """The client is connecting and the server answers: over a slow link this takes time."""
@@ -263,12 +263,11 @@ class Receiver:
 
     def _count(self) -> Reception:
         before = self._before
-        frames, size = counted(self._received)
         caps = self._sink.get_static_pad("sink").get_current_caps()
         picture = caps.get_structure(0) if caps else None
         return Reception(
-            frames=before.frames + frames,
-            bytes=before.bytes + size,
+            frames=self._frames,
+            bytes=self._bytes,
             damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
@@ -302,6 +301,8 @@ class Receiver:
                 self._unread.append(self._newest)
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
+        self._bytes += buffer.get_size()
+        self._frames += 1  # after its arrival: a sample has no frame without it
         # The depayloader marks the very first unit, and each unit with missing packets.
         incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
         damaged = self._damage.add(incomplete, lambda: bytes(buffer.extract_dup(0, HEAD_BYTES)))
