@@ -26,6 +26,7 @@ MAY_REQUEST: dict[Role, frozenset[str]] = {
     Role.VEHICLE: frozenset(),
     Role.BROKER: frozenset(),
 }
+VIEWERS = (Role.CONTROLLER, Role.WATCHER)  # those that see pictures
 PEOPLE = (Role.CONTROLLER, Role.WATCHER, Role.PREDICTOR, Role.POSITIONER)  # those that may request anything
 
 

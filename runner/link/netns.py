@@ -59,7 +59,8 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
                 port = tunnel.answer()["port"]
                 _connect(ip, devices, (machine, vehicle))
                 broker = Endpoint(machine, control.port)
-                both = overrides(Endpoint(machine if dials else vehicle, media.port), broker)
+                # A namespace of this process's own is as private as loopback.
+                both = (*overrides(Endpoint(machine if dials else vehicle, media.port), broker), "insecure=true")
                 with _competing(limit.tcp, (machine, port), inside) as (tcp, notes):
                     yield Ends(inside, both, both, broker, ChildShaper(tunnel, tcp), notes)
         finally:

@@ -137,12 +137,13 @@ class ControlLink:
         client.on_broken = self._on_broken
         client.connect_timeout = CONNECT_S
         client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
-        if self._login:
-            client.tls_set_context(self._login.context)
-            client.on_pre_connect = self._log_in
         topic, message = self._will
         client.will_set(topic, json.dumps(message), qos=1, retain=_kept(topic))
         client.on_socket_open = _settle
+        if self._login:
+            client.tls_set_context(self._login.context)
+            client.on_pre_connect = self._log_in
+            client.on_socket_open = self._check_broker
         client.on_connect_fail = lambda *_: self._failed_to_connect(sys.exception())
         client.on_connect = self._connected
         client.on_subscribe = self._subscribed
@@ -155,6 +156,11 @@ class ControlLink:
         """Keys may have been replaced since the last connection."""
         assert self._login
         client.username_pw_set(self._login.user, self._login.refresh())
+
+    def _check_broker(self, client: Client, data: object, sock: Any) -> None:
+        assert self._login
+        self._login.check(sock)
+        _settle(client, data, sock)
 
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:

@@ -24,6 +24,7 @@ from runner.configuration.config import configuration
 from runner.core.model import suggest
 from runner.errors import UserError
 from runner.plans import compile_plans
+from runner.security.exposure import viewer_keyring
 
 CHECK_S = 0.25  # how often cameras are checked for silence
 # A camera that has delivered FEW frames may be off: of each SELDOM_S it is expected for BRISK_S, and rebuilt meanwhile.
@@ -90,7 +91,7 @@ def live_frames(
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
     report     called with camera and what happened to it
-    raises     ConfigError, UserError for an unknown camera
+    raises     ConfigError, UserError for an unknown camera, and for keys that are missing
     """
     from runner import apply
 
@@ -100,7 +101,8 @@ def live_frames(
             raise UserError("cameras", "", name, f"unknown camera{suggest(name, vehicle.cameras)}")
     plans = [plan for plan in compile_plans(vehicle) if cameras is None or plan.camera.name in cameras]
     frames, stopped = Frames(), threading.Event()
-    side = apply.OperatorSide(plans, report, on_picture=frames.put)
+    keyring = viewer_keyring(vehicle)
+    side = apply.OperatorSide(plans, report, on_picture=frames.put, keyring=keyring, vehicle=vehicle.name)
     expected = {plan.camera.name: True for plan in plans}
     delivered, since = dict.fromkeys(expected, 0), dict.fromkeys(expected, time.monotonic())
 

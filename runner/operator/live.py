@@ -22,16 +22,14 @@ from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
-from runner.core.roles import Role
 from runner.drive.log import Log
-from runner.errors import RunError, UserError
+from runner.errors import RunError
 from runner.mqtt.login import Login
 from runner.operator.log import DriveLog
 from runner.operator.station import Station
 from runner.plans import compile_plans
 from runner.records import Outcome
-from runner.security.exposure import keyring_of
-from runner.security.keyring import MEDIA_SECRET, Keyring
+from runner.security.exposure import viewer_keyring
 
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
@@ -171,15 +169,6 @@ class LiveOperator:
         return now - self._online_at
 
 
-def _keyring(vehicle: Vehicle) -> Keyring | None:
-    """raises UserError for keys that are missing, incomplete, or of a holder that sees no video"""
-    keyring = keyring_of(vehicle, MEDIA_SECRET)
-    if keyring and keyring.holder.role not in (Role.CONTROLLER, Role.WATCHER):
-        found = f"{keyring.holder.role} {keyring.holder.name}"
-        raise UserError("keys", "", vehicle.keys, f"must be those of a controller or a watcher, not of {found}")
-    return keyring
-
-
 @contextmanager
 def live_operator(
     overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
@@ -195,7 +184,7 @@ def live_operator(
     config = configuration(overrides, conf, runnable=False, check=apply.check_plan)
     vehicle, document = config.vehicle(), config.document
     plans = compile_plans(vehicle)
-    keyring = _keyring(vehicle)
+    keyring = viewer_keyring(vehicle)
     station = Station(vehicle, agreement.settings(document), Login(keyring) if keyring else None)
     versions = apply.versions(element for plan in plans for element in plan.operator)
     drive = Log(log, "operator", document if log else {}, versions, station.note)

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.core.roles import Role
+from runner.core.roles import VIEWERS, Role
 from runner.errors import RunError, UserError
 from runner.security import keyring
 from runner.security.broker_files import ACL, broker_settings
@@ -37,7 +37,6 @@ ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
 PASSWORDS, ACCESS, SETTINGS = "passwords", "access", "mosquitto.conf"
 VALID = timedelta(days=365)
 ROUNDS = 101  # of PBKDF2; the passwords have 256 random bits
-VIEWERS = (Role.CONTROLLER, Role.WATCHER)
 
 
 class Issued(msgspec.Struct, frozen=True):

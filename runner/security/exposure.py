@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 from pathlib import Path
+from typing import NamedTuple
 
 from runner.core.model import Vehicle
+from runner.core.roles import VIEWERS, Role
 from runner.errors import UserError
-from runner.security.keyring import Keyring
+from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, Holder, Keyring
 
 
 def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
@@ -24,6 +26,57 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
         rule = "are reached over a network: give keys=DIR, made by `tod-runner keys`, or insecure=true"
         raise UserError("command line", "keys", None, f"{' and '.join(exposed)} {rule}")
     return None
+
+
+class KeysOfAll(NamedTuple):
+    """Directories of keys of the broker and of both sides."""
+
+    broker: Path
+    vehicle: Path
+    controller: Path
+
+    @staticmethod
+    def of(vehicle: Vehicle) -> KeysOfAll | None:
+        """For a process that runs both sides: `keys` then names the directory with everybody's; None: it is not set.
+
+        raises  UserError
+        """
+        if vehicle.keys is None:
+            return None
+        directory = Path(vehicle.keys)
+        holders = {path.parent: Keyring(path.parent).holder for path in sorted(directory.glob(f"*/{HOLDER}"))}
+        found = {
+            role: next((path for path, holder in holders.items() if holder.role is role), None)
+            for role in (Role.BROKER, Role.CONTROLLER)
+        }
+        own = next((path for path, holder in holders.items() if holder == Holder(vehicle.name, Role.VEHICLE)), None)
+        broker, controller = found.values()
+        if not (broker and controller and own):
+            lacking = {"broker=localhost": broker, f"vehicle={vehicle.name}": own, "controller=NAME": controller}
+            words = " ".join(word for word, path in lacking.items() if path is None)
+            raise UserError("keys", "", vehicle.keys, f"lacks keys: tod-runner keys output={vehicle.keys} {words}")
+        return KeysOfAll(broker, own, controller)
+
+
+def vehicle_keyring(vehicle: Vehicle) -> Keyring | None:
+    """The vehicle's keys; raises UserError as `keyring_of`, and for those of another holder."""
+    keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
+    if keyring and keyring.holder != Holder(vehicle.name, Role.VEHICLE):
+        raise _of_another(keyring, f"vehicle {vehicle.name}")
+    return keyring
+
+
+def viewer_keyring(vehicle: Vehicle) -> Keyring | None:
+    """The keys of someone who sees a vehicle's pictures; raises UserError as `keyring_of`, and for other roles."""
+    keyring = keyring_of(vehicle, MEDIA_SECRET)
+    if keyring and keyring.holder.role not in VIEWERS:
+        raise _of_another(keyring, "a controller or a watcher")
+    return keyring
+
+
+def _of_another(keyring: Keyring, expected: str) -> UserError:
+    found = f"{keyring.holder.role} {keyring.holder.name}"
+    return UserError("keys", "", str(keyring.directory), f"must be those of {expected}, not of {found}")
 
 
 def is_loopback(host: str) -> bool:

@@ -22,9 +22,9 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress, Vehicle
-from runner.core.roles import Role, denial
+from runner.core.roles import denial
 from runner.drive.log import Log
-from runner.errors import RunError, UserError
+from runner.errors import RunError
 from runner.graph import rtsp_url
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
@@ -40,8 +40,8 @@ from runner.mqtt.messages import (
 )
 from runner.plans import compile_plans, render_missing
 from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetry, VehicleState, to_json
-from runner.security.exposure import keyring_of
-from runner.security.keyring import PASSPHRASE, PEOPLE, Holder, Keyring
+from runner.security.exposure import vehicle_keyring
+from runner.security.keyring import Keyring
 from runner.system.kernel_clock import clock_error_s
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
@@ -276,15 +276,6 @@ class _VehicleControl:
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
-def _keyring(vehicle: Vehicle) -> Keyring | None:
-    """raises UserError for keys that are missing, incomplete, or another vehicle's"""
-    keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
-    if keyring and keyring.holder != Holder(vehicle.name, Role.VEHICLE):
-        found = f"{keyring.holder.role} {keyring.holder.name}"
-        raise UserError("keys", "", vehicle.keys, f"must be those of vehicle {vehicle.name}, not of {found}")
-    return keyring
-
-
 @contextmanager
 def live_vehicle(
     overrides: Sequence[str] = (),
@@ -305,7 +296,7 @@ def live_vehicle(
 
     config = configuration(overrides, conf, check=apply.check_plan)
     (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
-    keyring = _keyring(vehicle)
+    keyring = vehicle_keyring(vehicle)
     render_missing(vehicle, progress)
     plans = compile_plans(vehicle)
     apply.check_machine(plans)

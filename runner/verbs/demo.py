@@ -8,7 +8,7 @@ and a browser without a GPU; give fps_max=40, or null for the cameras' own rates
 With log=DIR both sides write their logs to DIR. With output=OUT a report is made at the end, as by the verb report
 (models= is passed to it); the drive is then stored in OUT/drive, unless log= names another directory. An experiment
 defines the drives; one with several runs makes several drives and compares them. With link= a link of limited rate
-connects both sides.
+connects both sides. keys= names the directory with everybody's keys, see the verb keys.
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
@@ -42,6 +42,7 @@ from runner.errors import UserError
 from runner.link import LimitedLink, check_possible, limited_link
 from runner.mqtt.broker import private_broker
 from runner.plans import render_missing
+from runner.security.exposure import KeysOfAll
 from runner.system import children, signals
 from runner.system.children import VerbProcess
 from runner.verbs import Arguments
@@ -62,6 +63,7 @@ class _Run(NamedTuple):
     directory   where it is logged; None: not logged
     document    its composed configuration
     duration_s  of the drive
+    keys        of broker and both sides; None: nothing is encrypted
     """
 
     name: str
@@ -71,6 +73,7 @@ class _Run(NamedTuple):
     link: LinkSettings | None
     document: dict[str, Any]
     duration_s: float
+    keys: KeysOfAll | None
 
 
 def run(arguments: Arguments) -> int:
@@ -136,11 +139,15 @@ def _prepared(
     config = config.drivable(apply.check_plan)
     config.pqos()
     vehicle = config.vehicle()
+    keys = KeysOfAll.of(vehicle)
+    if keys and link and link.kind == "relay":
+        rule = "rewrites ports in RTSP, which keys encrypt; link=netns passes it unread"
+        raise UserError("command line", "link", link.kind, rule)
     duration_s = arguments.number("duration_s")
     duration_s = config.experiment().duration_s if duration_s is None else duration_s
     with progress_bar() as progress:
         render_missing(vehicle, progress)
-    return _Run(name, own, vehicle, directory, link, config.document, duration_s)
+    return _Run(name, own, vehicle, directory, link, config.document, duration_s, keys)
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
@@ -181,8 +188,8 @@ def _drive(run: _Run) -> None:
     with (
         signals.stopping(END_S),
         _link(run) as (link, log),
-        private_broker(link.broker if link else run.vehicle.control) as broker,
-        _sides(own, link, run.duration_s) as (vehicle, operator),
+        private_broker(link.broker if link else run.vehicle.control, run.keys.broker if run.keys else None) as broker,
+        _sides(own, link, run) as (vehicle, operator),
     ):
         for note in link.notes if link else ():
             say(note)
@@ -205,14 +212,17 @@ def _drive(run: _Run) -> None:
 
 
 @contextmanager
-def _sides(words: Sequence[str], link: LimitedLink | None, duration_s: float) -> Iterator[tuple[VerbProcess, ...]]:
+def _sides(words: Sequence[str], link: LimitedLink | None, run: _Run) -> Iterator[tuple[VerbProcess, ...]]:
     """Both sides as processes, vehicle and operator. The vehicle's error output is shown only if it failed."""
     to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
+    if run.keys:
+        to_vehicle = (*to_vehicle, f"keys={run.keys.vehicle}")
+        to_operator = (*to_operator, f"keys={run.keys.controller}")
     with tempfile.TemporaryFile("w+") as stderr, ExitStack() as stack:
         before = link.vehicle_command if link else ()
         sides = (
             VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr),
-            VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={duration_s}"]),
+            VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={run.duration_s}"]),
         )
         for side in sides:
             stack.enter_context(signals.urgent(side.kill))

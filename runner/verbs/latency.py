@@ -30,6 +30,7 @@ from runner.core.model import Camera, Vehicle, suggest
 from runner.errors import UserError
 from runner.operator.station import Listener
 from runner.records import Note
+from runner.security.exposure import KeysOfAll
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
@@ -64,6 +65,7 @@ def run(arguments: Arguments) -> int:
     looped = arguments.choice("loop", ("false", "true")) == "true"
     vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
     camera = _camera(vehicle, arguments.values.get("camera"))
+    keys = KeysOfAll.of(vehicle) if looped else None
     sys.setswitchinterval(SWITCH_S)
     readings: deque[CounterReading] = deque(maxlen=MOST_READINGS)
 
@@ -73,9 +75,10 @@ def run(arguments: Arguments) -> int:
 
     with ExitStack() as stack:
         if looped:
-            stack.enter_context(private_broker(vehicle.control))
-            stack.enter_context(_filmed(arguments, camera))
-        operator = stack.enter_context(live_operator(arguments.overrides, arguments.conf))
+            stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None))
+            stack.enter_context(_filmed(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
+        own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
+        operator = stack.enter_context(live_operator(own, arguments.conf))
         page = PageServer(operator.vehicle, operator.station, on_counter)
         stack.callback(page.stop)
         page.start()
@@ -101,11 +104,11 @@ def _camera(vehicle: Vehicle, name: str | None) -> Camera:
 
 
 @contextmanager
-def _filmed(arguments: Arguments, camera: Camera) -> Iterator[None]:
+def _filmed(arguments: Arguments, camera: Camera, more: Sequence[str]) -> Iterator[None]:
     """The vehicle's side, one of whose cameras delivers pictures of the counter."""
     from runner.vehicle.live import live_vehicle
 
-    words = [*arguments.overrides, f"+source@cameras.{camera.name}.source=appsrc"]
+    words = [*arguments.overrides, *more, f"+source@cameras.{camera.name}.source=appsrc"]
     with (
         progress_bar() as progress,
         live_vehicle(words, arguments.conf, say=say, progress=progress) as vehicle,

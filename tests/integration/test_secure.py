@@ -15,8 +15,10 @@ from rig import free_port, process, until
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
+from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
 from runner.operator.live import live_operator
+from runner.records import Sample
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring
@@ -277,6 +279,19 @@ def _unencrypted(plan):
     return (replace(client, properties={**client.properties, "location": location}), *rest)
 
 
+def test_a_demo_with_keys_streams(keys, tmp_path):
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    with process("demo", *WORDS, *ports, f"keys={keys}", "duration_s=4", f"log={tmp_path / 'drive'}") as demo:
+        output, _ = demo.communicate(timeout=60)
+    assert demo.returncode == 0, output
+    sampled = list(read_drive(tmp_path / "drive").sides["operator"].of(Sample))
+    assert min(camera.frames for camera in sampled[-1].cameras.values()) > 20
+    everything = b"".join(path.read_bytes() for path in (tmp_path / "drive").iterdir()) + output.encode()
+    for path in keys.rglob("*"):
+        if path.name in (keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN):
+            assert path.read_bytes() not in everything, path
+
+
 # --- what is refused before anything starts ---------------------------------------------------------------------------
 
 
@@ -294,6 +309,20 @@ def test_a_network_needs_keys(verb):
         "command line: keys: media.host 192.0.2.1 and control.host 192.0.2.2 are reached over a network: "
         "give keys=DIR, made by `tod-runner keys`, or insecure=true",
     )
+
+
+def test_a_relay_cannot_read_what_keys_encrypt(keys, tmp_path):
+    words = (*WORDS, "link=relay", f"keys={keys}", f"log={tmp_path / 'drive'}")
+    assert refusal("demo", *words) == (
+        2,
+        "command line: link: relay: rewrites ports in RTSP, which keys encrypt; link=netns passes it unread",
+    )
+
+
+def test_a_demo_names_the_keys_that_it_lacks(keys):
+    changed(keys, "revoke", "alice")
+    status, output = refusal("demo", *WORDS, f"keys={keys}")
+    assert (status, output) == (2, f"keys: {keys}: lacks keys: tod-runner keys output={keys} controller=NAME")
 
 
 def test_keys_of_another_role_are_refused(keys):
