@@ -22,7 +22,6 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress, Vehicle
-from runner.core.roles import denial
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
@@ -43,6 +42,7 @@ from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetr
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.system.kernel_clock import clock_error_s
+from runner.vehicle.access import Access
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
 
@@ -164,7 +164,6 @@ class _VehicleControl:
         keyring: Keyring | None = None,
     ) -> None:
         self._name, self._on_report = vehicle.name, on_report
-        self._people = keyring.watched_people(on_report) if keyring else None
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._alone = threading.Event()
@@ -221,22 +220,10 @@ class _VehicleControl:
             self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
         request = Request(message.sender, parsed.document, answer, parsed.as_of)
-        problem = parsed.problem or self._denial(message.sender, parsed.document.get("event"))
-        if problem:
-            self._live.loop.refuse(request, problem)
+        if parsed.problem:
+            self._live.loop.refuse(request, parsed.problem)
         else:
             self._live.loop.take(request)
-
-    def may_control(self, operator: str) -> bool:
-        """Whether an operator may drive."""
-        return self._denial(operator, "mode_selected") is None
-
-    def _denial(self, sender: str, event: Any) -> str | None:
-        """Why a sender may not request an event; None if it may, as anybody may without keys."""
-        if self._people is None:
-            return None
-        person = self._people.get().get(sender)
-        return denial(person.role if person else None, str(event))
 
     def _on_reception(self, message: MqttMessage) -> None:
         received = time.time()
@@ -311,7 +298,7 @@ def live_vehicle(
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
     control = _VehicleControl(vehicle, document, report, keyring)
-    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report, control.may_control)
+    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report, Access(keyring, report))
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:

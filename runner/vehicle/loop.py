@@ -41,6 +41,7 @@ from runner.records import (
     applied_to_json,
 )
 from runner.schema import event_problem
+from runner.vehicle.access import Access
 from runner.vehicle.inbox import WAITING, Answer, Inbox, Item, Reported, Request
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.uplink import MeasuredUplink
@@ -86,7 +87,7 @@ class ControlLoop:
     publish      called with the state (decided and applied) whenever it changed, and telemetry a few times a second;
                  returns False for one that has to wait, since the control link is behind
     on_report    called with one line on what happened and its result
-    may_control  whether an operator may be in control, now
+    access       who may request what
 
     An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
     something (time.monotonic), `busy_with` what it is doing.
@@ -99,7 +100,7 @@ class ControlLoop:
     log: Log
     publish: Callable[[VehicleState | Telemetry | SpeedAdvice], bool]
     on_report: Callable[[str], None]
-    may_control: Callable[[str], bool] = lambda operator: True
+    access: Access = field(default_factory=Access)
     refused: int = 0
     errors: int = 0
     beat: float = 0.0
@@ -119,7 +120,7 @@ class ControlLoop:
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
-        self._operators = Operators(self.vehicle.expires_s, self.may_control)
+        self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
         self._uplink = MeasuredUplink(self.vehicle)
         self._in_control = ""
         self._watched = 0.0  # when operators were last watched
@@ -256,6 +257,10 @@ class ControlLoop:
 
     def _answer_request(self, request: Request) -> None:
         t = self._now()
+        name = str(request.document.get("event"))
+        if request.sender and (denied := self.access.denial(request.sender, name, self._operators.in_control)):
+            self._refuse(denied, t, request.answer)
+            return
         stamped = {**request.document, "t": t}
         problem = event_problem(stamped)
         event = None if problem else parse(stamped)

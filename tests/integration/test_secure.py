@@ -40,7 +40,7 @@ def issue(directory, now=None, **names):
 
 @pytest.fixture
 def keys(tmp_path):
-    people = {"alice": "controller", "bob": "watcher", "pqos": "predictor", "gnss": "positioner"}
+    people = {"alice": "controller", "carol": "controller", "bob": "watcher", "pqos": "predictor", "gnss": "positioner"}
     return issue(tmp_path / "keys", **people)
 
 
@@ -95,6 +95,10 @@ def test_video_and_control_pass_and_each_role_may_do_what_it_is_for(keys):
                 "a watcher may not request total_set; only controller may",
             )
             assert asked(bob, {"event": "operator_connected"}).result == "applied"
+        with operating(keys, common, "carol") as carol:
+            until(lambda: carol.station.state)
+            refused = asked(carol, {"event": "total_set", "kbps": 10})
+            assert (refused.result, refused.reason) == ("refused", "alice is in control")
         state = alice.station.state
         assert state.mode == "collective"
 
@@ -321,6 +325,7 @@ def test_a_relay_cannot_read_what_keys_encrypt(keys, tmp_path):
 
 def test_a_demo_names_the_keys_that_it_lacks(keys):
     changed(keys, "revoke", "alice")
+    changed(keys, "revoke", "carol")
     status, output = refusal("demo", *WORDS, f"keys={keys}")
     assert (status, output) == (2, f"keys: {keys}: lacks keys: tod-runner keys output={keys} controller=NAME")
 

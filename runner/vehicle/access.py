@@ -1,0 +1,39 @@
+"""Who may request what of this vehicle, by its keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from runner.core.roles import SETTINGS, Role, denial
+from runner.security.keyring import Keyring, Person, Watched
+
+
+class Access:
+    """Answers for each request. Without keys anybody may request anything: nobody can prove who it is.
+
+    on_report  called with what is wrong with a new list of people
+    """
+
+    def __init__(self, keyring: Keyring | None = None, on_report: Callable[[str], None] = print) -> None:
+        self._people: Watched[Mapping[str, Person]] | None = None
+        if keyring:
+            self._people = keyring.watched_people(on_report)
+
+    def denial(self, sender: str, event: str, in_control: str) -> str | None:
+        """Why a sender may not request an event now; None if it may.
+
+        in_control  the operator in control, "" for none; while there is one, no other changes what is sent
+        """
+        if self._people is None:
+            return None
+        if why := denial(self._role(sender), event):
+            return why
+        return f"{in_control} is in control" if event in SETTINGS and in_control not in ("", sender) else None
+
+    def may_control(self, operator: str) -> bool:
+        return self._people is None or self._role(operator) is Role.CONTROLLER
+
+    def _role(self, name: str) -> Role | None:
+        assert self._people
+        person = self._people.get().get(name)
+        return person.role if person else None
