@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import socket
 import subprocess
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
@@ -16,6 +18,9 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
+from runner.errors import RunError
+from runner.link import Limit, limited_link
+from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.operator.live import live_operator
 from runner.records import Sample
@@ -26,6 +31,17 @@ from runner.security.keyring import Keyring
 CAMERAS = ("front", "rear")
 WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "~cameras.mast", "page.serve=false", "pqos=constant")
 NAME = "delivery_robot"
+
+
+def _may_not():
+    try:
+        _check_allowed()
+    except RunError as error:
+        return str(error)
+    return "" if shutil.which("ip") else "iproute2 is not installed"
+
+
+needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 
 
 def issue(directory, now=None, **names):
@@ -294,6 +310,55 @@ def test_a_demo_with_keys_streams(keys, tmp_path):
     for path in keys.rglob("*"):
         if path.name in (keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN):
             assert path.read_bytes() not in everything, path
+
+
+# --- what others on the network can read ------------------------------------------------------------------------------
+
+LEGIBLE = (b"delivery_robot", b"front", b"alice", b"operator_connected", b'"event"', b'"cameras"', b"RTSP/1.0", b"x264")
+START_CODES = tuple(b"\0\0\0\1" + bytes([kind]) for kind in (0x67, 0x68, 0x65, 0x41, 0x06))
+
+
+@contextmanager
+def captured(address):
+    """The packets of the network device with an address, as one string of bytes, once the block has ended."""
+    shown = json.loads(subprocess.check_output(["ip", "-j", "addr"], text=True))
+    devices = {each["local"]: device["ifname"] for device in shown for each in device["addr_info"] if "local" in each}
+    packets = []
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003)) as tap:
+        tap.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8_000_000)
+        tap.bind((devices[address], 0))
+        yield packets
+        tap.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                packets.append(tap.recv(65_536))
+
+
+@needs_root
+@pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
+@pytest.mark.parametrize("encrypted", [True, False])
+def test_nothing_on_the_wire_can_be_read(keys, encrypted, graph, tmp_path):
+    media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
+    limit = Limit(lambda t: 20_000, queue_ms=200, delay_ms=0)
+    words = (*WORDS, f"graph={graph}", *([] if graph == "h264_rtsp" else [f"graph.first_port={free_port()}"]))
+    own = {name: [f"keys={keys / name}"] if encrypted else [] for name in (NAME, "alice")}
+    with (
+        limited_link("netns", limit, media, control, lambda line: None, dials=graph == "h264_srt") as link,
+        private_broker(link.broker, keys / "broker" if encrypted else None),
+        captured(link.broker.host) as packets,
+        process("vehicle", *words, *link.vehicle_overrides, *own[NAME], before=link.vehicle_command),
+        live_operator([*words, *link.operator_overrides, *own["alice"]]) as operator,
+    ):
+        operator.start()
+        until(lambda: operator.station.state and min(frames(operator).values(), default=0) > 20)
+        assert asked(operator, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+    everything = b"".join(packets)
+    assert len(packets) > 200
+    legible = [text for text in (*LEGIBLE, *START_CODES) if text in everything]
+    if encrypted:
+        assert legible == []
+    else:
+        assert {b"delivery_robot", b"front", b'"event"'} <= set(legible)
 
 
 # --- what is refused before anything starts ---------------------------------------------------------------------------
