@@ -150,6 +150,8 @@ class Receiver:
             self._foreign_reported = True
             self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
         now = time.monotonic()
+        if self._login and self._login.is_withdrawn():
+            self._supervised.restart("the vehicle's keys are not accepted any more")
         if not self.should_send:
             self._silent = now
         if received.frames != self._moved[0] or self.should_send is False:

@@ -77,6 +77,7 @@ class StreamLogin:
     def __init__(self, keyring: Keyring, vehicle: str, on_report: Callable[[str], None]) -> None:
         self._keyring, self._vehicle = keyring, vehicle
         self._check = PeerCheck(keyring, on_report)
+        self._last: Gio.TlsCertificate | None = None  # that was accepted
 
     def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> None:
         """Set up a new pipeline and its client. The files of the keyring are read again each time."""
@@ -92,7 +93,12 @@ class StreamLogin:
         client.connect("accept-certificate", self._accept)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
-        return self._check.holder(certificate) == Holder(self._vehicle, Role.VEHICLE)
+        self._last = certificate if self._check.holder(certificate) == Holder(self._vehicle, Role.VEHICLE) else None
+        return self._last is not None
+
+    def is_withdrawn(self) -> bool:
+        """Whether the certificate that the vehicle uses is not accepted any more."""
+        return self._last is not None and isinstance(self._check.holder(self._last), str)
 
 
 class ViewerCheck:
@@ -103,8 +109,9 @@ class ViewerCheck:
         self._people = keyring.watched_people(on_report)
         self._on_report = on_report
         self._known: Mapping[str, str] = {}  # passwords given to the library, by user
+        self._own, self._used = keyring.watched_certificate(on_report), b""
+        self._keyring = keyring
         self.auth = GstRtspServer.RTSPAuth()
-        self.auth.set_tls_certificate(own_certificate(keyring))
         self.auth.set_tls_authentication_mode(Gio.TlsAuthenticationMode.REQUIRED)
         self.auth.set_supported_methods(GstRtsp.RTSPAuthMethod.DIGEST)
         self.auth.connect("accept-certificate", self._accept)
@@ -114,7 +121,13 @@ class ViewerCheck:
         self.refresh()
 
     def refresh(self) -> None:
-        """Let the library know the users of now."""
+        """Let the library know the certificate and the users of now.
+
+        raises  RunError for a certificate and a key that do not fit together
+        """
+        if self._used != (own := self._own.get()):
+            self.auth.set_tls_certificate(own_certificate(self._keyring))
+            self._used = own
         people = {name: person.rtsp for name, person in self._people.get().items() if person.rtsp}
         for name in self._known.keys() - people.keys():
             self.auth.remove_digest(name)

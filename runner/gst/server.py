@@ -113,6 +113,7 @@ class CameraServer:
     ) -> None:
         check_port_free(media)
         self._viewers: ViewerCheck | None = None
+        self._keys_fault = ""  # as reported
         if keyring:
             from runner.gst.secure import ViewerCheck
 
@@ -436,7 +437,7 @@ class CameraServer:
         for name in left:
             self._unblock(name, now)
         if self._viewers:
-            self._viewers.refresh()
+            self._refresh_keys()
         for client, connection in connections:
             if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
                 self._close(connection, "its keys are not accepted any more")
@@ -445,6 +446,16 @@ class CameraServer:
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
         return True
+
+    def _refresh_keys(self) -> None:
+        """New files may come one by one."""
+        assert self._viewers
+        try:
+            self._viewers.refresh()
+        except RunError as error:
+            if self._keys_fault != str(error):
+                self._on_report("keys", str(error))
+            self._keys_fault = str(error)
 
     def _lag(self, connection: RtspConnection) -> float:
         there = (other for other in self._connections.values() if other is not connection)

@@ -106,6 +106,9 @@ class ControlLink:
         """
         if not self._listening.is_set():
             return True
+        if self._login and self._login.has_changed():
+            self._drop_connection()
+            return True
         if not behind and _is_one_of(SUPERSEDED, topic) and self.is_behind():
             return False
         self._send(topic, message)
@@ -130,6 +133,11 @@ class ControlLink:
             return not poll.poll(0)
         except (OSError, TypeError, ValueError):  # the connection has just been lost
             return False
+
+    def _drop_connection(self) -> None:
+        """The loop then connects again."""
+        with suppress(OSError, AttributeError):  # it has just been lost
+            self._client.socket().shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
 
     def _new_client(self) -> _Client:
         # With an id of its own, a new connection ends the old one, whose will the broker would publish later otherwise.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ssl
+from collections.abc import Callable
 from typing import Any
 
 from runner.core.roles import Role
@@ -11,10 +12,16 @@ from runner.security.keyring import Keyring, mqtt_password
 
 
 class Login:
-    """User name, password and TLS settings of a holder of keys. The files are read again for each connection."""
+    """User name, password and TLS settings of a holder of keys. The files are read again for each connection.
 
-    def __init__(self, keyring: Keyring) -> None:
+    on_report  called with what is wrong with new files
+    """
+
+    def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
         self._keyring = keyring
+        self._revoked = keyring.watched_revoked(on_report)
+        self._own = keyring.watched_certificate(on_report)
+        self._broker, self._used = 0, b""  # serial number of the broker's certificate, own certificate, in use
         self.user = keyring.holder.name
         self.context = ssl.create_default_context(cafile=keyring.authority)
         self.context.check_hostname = False  # see `check`
@@ -27,6 +34,7 @@ class Login:
 
         raises  OSError, ssl.SSLError, UserError for files that cannot be used
         """
+        self._used = self._own.get()
         self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
         self.context.load_verify_locations(self._keyring.revocation_list)
         return mqtt_password(self._keyring.secret)
@@ -40,3 +48,8 @@ class Login:
         subject = dict(pair for entry in certificate.get("subject", ()) for pair in entry)
         if subject.get("organizationalUnitName") != Role.BROKER:
             raise RunError("what answers there is not the broker: its certificate is of another role")
+        self._broker = int(certificate["serialNumber"], 16)
+
+    def has_changed(self) -> bool:
+        """Whether the connection has to be made anew: the broker's keys were withdrawn, or there are new ones."""
+        return self._broker in self._revoked.get() or self._used != self._own.get()

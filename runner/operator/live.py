@@ -24,7 +24,6 @@ from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
-from runner.mqtt.login import Login
 from runner.operator.log import DriveLog
 from runner.operator.station import Station
 from runner.plans import compile_plans
@@ -185,7 +184,7 @@ def live_operator(
     vehicle, document = config.vehicle(), config.document
     plans = compile_plans(vehicle)
     keyring = viewer_keyring(vehicle)
-    station = Station(vehicle, agreement.settings(document), Login(keyring) if keyring else None)
+    station = Station(vehicle, agreement.settings(document), keyring)
     versions = apply.versions(element for plan in plans for element in plan.operator)
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:

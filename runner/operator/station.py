@@ -45,6 +45,7 @@ from runner.records import (
     VehicleState,
     to_json,
 )
+from runner.security.keyring import Keyring
 from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange, latency
 from runner.system.kernel_clock import clock_error_s
 from runner.system.recent import CURRENT_S
@@ -91,14 +92,15 @@ class Station:
     """One operator's end of the control link, and the measurements of reception.
 
     settings   those that the vehicle's configuration must agree with, see `runner.configuration.agreement`
-    login      of this operator; None: to a broker that does not ask, under an id of its own
+    keyring    of this operator; None: for a broker that does not ask, under an id of its own
     listeners  must be added before `connect`
 
     Requests go out through `ask`; samples of the cameras' counters come in through `take`.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath, login: Login | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath, keyring: Keyring | None = None) -> None:
         self._vehicle, self._settings = vehicle, settings
+        login = Login(keyring, self.note) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
         self.listeners: list[Listener] = []

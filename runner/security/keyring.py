@@ -198,6 +198,9 @@ class Keyring:
     def watched_people(self, on_report: Callable[[str], None]) -> Watched[Mapping[str, Person]]:
         return Watched(self.directory / PEOPLE, self.people, on_report)
 
+    def watched_certificate(self, on_report: Callable[[str], None]) -> Watched[bytes]:
+        return Watched(self.certificate, lambda: self.read(CERTIFICATE), on_report)
+
     def watched_revoked(self, on_report: Callable[[str], None]) -> Watched[frozenset[int]]:
         return Watched(self.revocation_list, self.revoked, on_report)
 

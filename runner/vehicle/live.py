@@ -175,7 +175,7 @@ class _VehicleControl:
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        login = Login(keyring) if keyring else None
+        login = Login(keyring, on_report) if keyring else None
         will = (self._topic("state"), OFFLINE)
         self._link = ControlLink(vehicle.control, will, listen, self._on_connected, on_report, login)
 

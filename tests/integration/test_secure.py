@@ -204,6 +204,36 @@ def test_what_is_revoked_is_disconnected_and_stays_out(keys):
         assert published(broker_of(common), old, f"tod/{NAME}/request/alice")[0] != 0
 
 
+def test_a_vehicle_whose_keys_are_withdrawn_is_seen_no_more(keys):
+    old = keys.parent / "old"
+    shutil.copytree(keys / NAME, old)
+    with sending(keys, vehicle_keys=old) as (plans, _), watching(plans, keys / "alice") as (seen, messages):
+        until(lambda: min(seen().values()) > 10, every_s=0.1)
+        changed(keys, "rotate", NAME)
+        began = time.monotonic()
+        until(lambda: any("the vehicle's keys are not accepted any more" in what for what in seen() and messages))
+        assert time.monotonic() - began < 5
+        time.sleep(1)
+        before = seen()
+        time.sleep(2)
+        assert seen() == before
+
+
+def test_rotated_keys_take_effect_without_a_restart(keys):
+    """Of everybody, while the vehicle streams."""
+    with driving(keys) as (broker, common), operating(keys, common, "alice") as alice:
+        until(lambda: alice.station.state and min(frames(alice).values(), default=0) > 10)
+        for name in ("broker", NAME, "alice"):
+            changed(keys, "rotate", name)
+        broker.end()
+        with private_broker(broker_of(common), keys / "broker"):
+            until(lambda: alice.station.state is None)
+            until(lambda: alice.station.state)
+            before = frames(alice)
+            until(lambda: min(frames(alice).values()) > max(before.values()) + 20)
+            assert asked(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+
+
 def broker_of(common):
     port = next(word for word in common if word.startswith("control.port="))
     return Endpoint("127.0.0.1", int(port.partition("=")[2]))
@@ -213,7 +243,7 @@ def broker_of(common):
 
 
 @contextmanager
-def sending(keys, *words):
+def sending(keys, *words, vehicle_keys=None):
     """A vehicle's cameras; yields (plans, reports)."""
     from runner.apply import VehicleSide, check_plan
     from runner.configuration.config import configuration
@@ -223,7 +253,10 @@ def sending(keys, *words):
     vehicle = configuration(own, check=check_plan).vehicle()
     plans, reports = compile_plans(vehicle), []
     side = VehicleSide(
-        plans, vehicle.media, lambda who, what: reports.append(f"{who}: {what}"), keyring=Keyring(keys / NAME)
+        plans,
+        vehicle.media,
+        lambda who, what: reports.append(f"{who}: {what}"),
+        keyring=Keyring(vehicle_keys or keys / NAME),
     )
     knobs = {"sending": True, "size": (320, 180), "bitrate": 300}
     side.turn([Command(camera, knob, value) for camera in CAMERAS for knob, value in knobs.items()])
