@@ -15,6 +15,7 @@ import os
 import random
 import sys
 import time
+import traceback
 from collections.abc import Callable
 
 import clocks
@@ -54,7 +55,10 @@ def main(chosen: list[str]) -> int:
     for name in chosen or PARTS:
         began = time.monotonic()
         print(f"--- {name}", flush=True)
-        problems = PARTS[name](seed, scale)
+        try:
+            problems = PARTS[name](seed, scale)
+        except Exception:  # the other parts are run all the same
+            problems = [traceback.format_exc()]
         print(f"--- {name}: {len(problems)} problems, {time.monotonic() - began:.0f} s", flush=True)
         failed += [f"{name}: {problem}" for problem in problems]
     print("\n".join(failed) or "no problems")

@@ -75,9 +75,13 @@ class System:
         with self.operator_log.open("rb") as file:
             file.seek(max(0, self.operator_log.stat().st_size - 200_000))
             lines = file.read().split(b"\n")[1:-1]
-        newest = next(line for line in reversed(lines) if b'"log": "sample"' in line)
+        newest = next((line for line in reversed(lines) if b'"log": "sample"' in line), b'{"cameras": {}}')
         cameras: dict[str, Any] = json.loads(newest)["cameras"]
         return cameras
+
+    def received(self) -> bool:
+        """Whether every camera has come to the operator."""
+        return self.operator_log.exists() and all(self.samples().get(name, {}).get("frames") for name in CAMERAS)
 
     def tracebacks(self) -> list[str]:
         """The first traceback in the output of each process."""
@@ -99,7 +103,7 @@ def running(*words: str) -> Iterator[tuple[System, Operator]]:
             for name in ("broker", "vehicle", "operator"):
                 system.start(name)
             operator = Operator(system.broker)
-            until(lambda: flowing(operator), seconds=30, every_s=0.1)
+            until(lambda: flowing(operator) and system.received(), seconds=30, every_s=0.1)
             yield system, operator
         finally:
             system.stop()
