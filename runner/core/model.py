@@ -356,18 +356,20 @@ class Media(Endpoint):
 
 @dataclass(frozen=True, slots=True)
 class PageSettings:
-    """The operator's page, on 127.0.0.1.
+    """The operator's page.
 
+    host     address that it is served at
     late_ms  age of a picture when drawn, above which it is marked as late
     """
 
     serve: bool
     port: int
     late_ms: float
+    host: str = "127.0.0.1"
 
     @property
     def endpoint(self) -> Endpoint:
-        return Endpoint("127.0.0.1", self.port)
+        return Endpoint(self.host, self.port)
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ class StreamLogin:
     """
 
     def __init__(self, keyring: Keyring, vehicle: str, on_report: Callable[[str], None]) -> None:
-        self._keyring, self._vehicle = keyring, vehicle
+        self._keyring, self._vehicle, self._expected = keyring, vehicle, Holder(vehicle, Role.VEHICLE)
         self._check = PeerCheck(keyring, on_report)
         self._last: Gio.TlsCertificate | None = None  # that was accepted
 
@@ -93,7 +93,7 @@ class StreamLogin:
         client.connect("accept-certificate", self._accept)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
-        self._last = certificate if self._check.holder(certificate) == Holder(self._vehicle, Role.VEHICLE) else None
+        self._last = certificate if self._check.holder(certificate) == self._expected else None
         return self._last is not None
 
     def is_withdrawn(self) -> bool:

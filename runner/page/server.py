@@ -6,6 +6,7 @@ import asyncio
 import logging
 import mimetypes
 import socket
+import ssl
 import threading
 import time
 from collections import deque
@@ -19,6 +20,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web_protocol import RequestHandler
 
 from runner.core.model import Camera, Vehicle, plain
+from runner.errors import RunError
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, Recent
 from runner.mqtt.messages import read_message
@@ -26,8 +28,10 @@ from runner.operator.station import Listener, Station
 from runner.page.control import Control
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
+from runner.page.login import COOKIE, SESSION_S, PageLogin
 from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
+from runner.security.keyring import Keyring
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
 
@@ -45,7 +49,19 @@ ENDS = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 CLOSED_ABOVE_BYTES = 1_048_576  # a longer message is not read
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
-    "frame-ancestors 'none'"
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'self'; object-src 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "Cache-Control": "no-cache",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+# What a browser needs before it has logged in.
+UNPROTECTED = (
+    "/login",
+    "/login/challenge",
+    *(f"/static/{name}" for name in ("login.js", "login.css", "style.css")),
 )
 
 
@@ -56,13 +72,21 @@ class PageServer(Listener):
 
     on_counter  called, in the page's thread, with what a page read of the counter that a camera films; None: such
                 messages are refused
+    keyring     of the operator, to serve other machines: by HTTPS, to those that have its token; None: loopback only
     raises      RunError if the port is in use or plotly is not installed
     """
 
     def __init__(
-        self, vehicle: Vehicle, station: Station, on_counter: Callable[[CounterReading], None] | None = None
+        self,
+        vehicle: Vehicle,
+        station: Station,
+        on_counter: Callable[[CounterReading], None] | None = None,
+        keyring: Keyring | None = None,
     ) -> None:
         self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
+        self._keyring = keyring
+        self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
+        self._refusals = 0
         check_port_free(vehicle.page.endpoint)
         self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
         self._plotly = plotly_script("page")
@@ -79,7 +103,9 @@ class PageServer(Listener):
     @property
     def url(self) -> str:
         host, port = self._address
-        return f"http://{host}:{port}/"
+        if self._keyring is None:
+            return f"http://{host}:{port}/"
+        return f"https://{next(iter(self._keyring.holder.hosts), host)}:{port}/"
 
     def start(self) -> None:
         self._thread.start()
@@ -107,18 +133,23 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        app = web.Application(middlewares=[self._heard, _guard])
+        app = web.Application(middlewares=[self._heard, self._guard])
         app.router.add_get("/live", self._on_viewer)
         app.router.add_get("/plotly.js", lambda _: _script(self._plotly))
         app.router.add_get("/", _served(STATIC / "index.html"))
         app.router.add_get("/counter", _served(STATIC / "counter.html"))
+        if self._login:
+            app.router.add_get("/login", _served(STATIC / "login.html"))
+            app.router.add_post("/login/challenge", self._on_challenge)
+            app.router.add_post("/login", self._on_login)
         for file in STATIC.iterdir():
             app.router.add_get(f"/static/{file.name}", _served(file))
         self._runner = web.AppRunner(
             app, access_log=None, logger=self._logger(), shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
         )
         await self._runner.setup()
-        self._server = await self._loop.create_server(self._connection, *self._address)
+        tls = _tls(self._keyring) if self._keyring else None
+        self._server = await self._loop.create_server(self._connection, *self._address, ssl=tls)
 
     def _logger(self) -> logging.Logger:
         """Reports the server library's warnings, without its tracebacks."""
@@ -148,6 +179,49 @@ class PageServer(Listener):
         """A request is complete."""
         self._silent.discard(request.protocol)
         response: web.StreamResponse = await handler(request)
+        return response
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Only pages of this server, by its own name, and from other machines only those that have logged in.
+
+        No other site in the same browser may read or send anything, whatever name it gives this server (DNS rebinding).
+        """
+        sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
+        names = self._keyring.holder.hosts if self._keyring else ("127.0.0.1", "localhost")
+        allowed = {f"{name}:{sockname[1]}" for name in names}
+        scheme, origin = "https" if self._login else "http", request.headers.get("Origin")
+        foreign = origin is not None and origin not in {f"{scheme}://{name}" for name in allowed}
+        if request.headers.get("Host") not in allowed or foreign or (request.method == "POST" and origin is None):
+            raise web.HTTPForbidden(text="only for pages of this server\n")
+        if not self._may_see(request):
+            if request.path == "/":
+                raise web.HTTPSeeOther("/login")
+            if request.path not in UNPROTECTED:
+                raise web.HTTPUnauthorized(text="log in first, at /login\n")
+        response: web.StreamResponse = await handler(request)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    async def _on_challenge(self, _request: web.Request) -> web.Response:
+        assert self._login
+        return web.json_response({"challenge": self._login.challenge(time.monotonic())})
+
+    async def _on_login(self, request: web.Request) -> web.Response:
+        assert self._login
+        try:
+            document = read_message(await request.read())
+        except ValueError as problem:
+            raise web.HTTPBadRequest(text=f"{problem}\n") from None
+        challenge, answer = (str(document.get(key, "")) for key in ("challenge", "answer"))
+        session = self._login.open(challenge, answer, time.monotonic())
+        if session is None:
+            self._refusals += 1
+            self._station.note(f"page: {request.remote} did not have the token ({self._refusals} refused so far)")
+            raise web.HTTPForbidden(text="not the token of this page\n")
+        response = web.Response(text="welcome\n")
+        response.set_cookie(COOKIE, session, max_age=int(SESSION_S), secure=True, httponly=True, samesite="Strict")
         return response
 
     def _add_sample(self, sample: Sample) -> None:
@@ -181,7 +255,7 @@ class PageServer(Listener):
         self._viewers.add(viewer)
         self._control.opened(token, time.monotonic())
         self._tell_control()
-        tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(_ping(ws))]
+        tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(self._ping(ws, request))]
         try:
             await self._listen(ws, viewer)
         except TimeoutError:
@@ -206,6 +280,17 @@ class PageServer(Listener):
                 await asyncio.wait_for(ws.pong(message.data), SILENT_S)
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._on_message(viewer, message.data)
+
+    async def _ping(self, ws: web.WebSocketResponse, request: web.Request) -> None:
+        """Ping a viewer regularly, so that it answers, as long as it may watch."""
+        with suppress(ConnectionError):  # the reader of the socket ends it
+            while self._may_see(request):
+                await asyncio.sleep(PING_S)
+                await ws.ping()
+            await ws.close(message=b"log in again")
+
+    def _may_see(self, request: web.Request) -> bool:
+        return self._login is None or self._login.accepts(request.cookies.get(COOKIE), time.monotonic())
 
     def _greet(self, viewer: PageViewer) -> None:
         viewer.tell("hello", {**_introduction(self._vehicle), "answer_s": self._station.answer_s})
@@ -300,14 +385,6 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
         pass  # the reader of the socket ends it
 
 
-async def _ping(ws: web.WebSocketResponse) -> None:
-    """Ping a viewer regularly, so that it answers."""
-    with suppress(ConnectionError):  # the reader of the socket ends it
-        while True:
-            await asyncio.sleep(PING_S)
-            await ws.ping()
-
-
 def _introduction(vehicle: Vehicle) -> dict[str, Any]:
     """What a page must know about the vehicle first."""
     cameras = [
@@ -328,19 +405,15 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
     return {"vehicle": vehicle.name, "cameras": cameras, "late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
 
 
-@web.middleware
-async def _guard(request: web.Request, handler: Any) -> web.StreamResponse:
-    """Only pages of this server, by its own name: no other site in the same browser may read or send anything."""
-    sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
-    allowed = {f"{host}:{sockname[1]}" for host in ("127.0.0.1", "localhost")}
-    origin = request.headers.get("Origin")
-    if request.headers.get("Host") not in allowed or (origin and origin.removeprefix("http://") not in allowed):
-        raise web.HTTPForbidden(text="only for pages of this server\n")
-    response: web.StreamResponse = await handler(request)
-    if not response.prepared:
-        response.headers["Content-Security-Policy"] = POLICY
-        response.headers["Cache-Control"] = "no-cache"
-    return response
+def _tls(keyring: Keyring) -> ssl.SSLContext:
+    """raises RunError"""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    try:
+        context.load_cert_chain(keyring.certificate, keyring.key)
+    except (OSError, ssl.SSLError) as error:
+        raise RunError(f"{keyring.directory}: {error}") from None
+    return context
 
 
 def _served(file: Path) -> Any:

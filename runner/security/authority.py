@@ -180,7 +180,7 @@ class Authority:
             keyring.CERTIFICATE: pair.certificate,
             keyring.KEY: pair.key,
             keyring.SECRET: _secret(),
-            keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role)),
+            keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role, hosts)),
             **self._files_of(name, role),
         }
         self._replace(name, files)

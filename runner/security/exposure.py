@@ -9,7 +9,7 @@ from typing import NamedTuple
 from runner.core.model import Vehicle
 from runner.core.roles import VIEWERS, Role
 from runner.errors import UserError
-from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, Holder, Keyring
+from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, TOKEN, Keyring
 
 
 def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
@@ -49,7 +49,9 @@ class KeysOfAll(NamedTuple):
             role: next((path for path, holder in holders.items() if holder.role is role), None)
             for role in (Role.BROKER, Role.CONTROLLER)
         }
-        own = next((path for path, holder in holders.items() if holder == Holder(vehicle.name, Role.VEHICLE)), None)
+        own = next(
+            (path for path, its in holders.items() if (its.name, its.role) == (vehicle.name, Role.VEHICLE)), None
+        )
         broker, controller = found.values()
         if not (broker and controller and own):
             lacking = {"broker=localhost": broker, f"vehicle={vehicle.name}": own, "controller=NAME": controller}
@@ -61,7 +63,7 @@ class KeysOfAll(NamedTuple):
 def vehicle_keyring(vehicle: Vehicle) -> Keyring | None:
     """The vehicle's keys; raises UserError as `keyring_of`, and for those of another holder."""
     keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
-    if keyring and keyring.holder != Holder(vehicle.name, Role.VEHICLE):
+    if keyring and (keyring.holder.name, keyring.holder.role) != (vehicle.name, Role.VEHICLE):
         raise _of_another(keyring, f"vehicle {vehicle.name}")
     return keyring
 
@@ -71,6 +73,24 @@ def viewer_keyring(vehicle: Vehicle) -> Keyring | None:
     keyring = keyring_of(vehicle, MEDIA_SECRET)
     if keyring and keyring.holder.role not in VIEWERS:
         raise _of_another(keyring, "a controller or a watcher")
+    return keyring
+
+
+def page_keyring(vehicle: Vehicle) -> Keyring | None:
+    """The keys by which the page is served to other machines; None: it is served on loopback.
+
+    raises  UserError if it is to be served elsewhere without keys
+    """
+    if is_loopback(vehicle.page.host):
+        return None
+    if vehicle.keys is None:
+        rule = "is reached over a network: give keys=DIR, made by `tod-runner keys`; browsers play video by HTTPS only"
+        raise UserError("command line", "page.host", vehicle.page.host, rule)
+    keyring = Keyring.of(Path(vehicle.keys), TOKEN)
+    if not keyring.holder.hosts:
+        rule = "does not name the addresses of the page: tod-runner keys output=DIR"
+        who = f"{keyring.holder.role}={keyring.holder.name}"
+        raise UserError("keys", "", vehicle.keys, f"{rule} {who} host={vehicle.page.host}")
     return keyring
 
 

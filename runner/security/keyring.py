@@ -52,10 +52,14 @@ class Person(msgspec.Struct, frozen=True):
 
 
 class Holder(msgspec.Struct, frozen=True):
-    """Whose keys these are."""
+    """Whose keys these are.
+
+    hosts  addresses and DNS names at which the holder is reached
+    """
 
     name: str
     role: Role
+    hosts: tuple[str, ...] = ()
 
 
 def derived(secret: bytes, purpose: str) -> str:
@@ -166,6 +170,9 @@ class Keyring:
     @property
     def secret(self) -> bytes:
         return self.read(SECRET)
+
+    def watched_token(self, on_report: Callable[[str], None]) -> Watched[bytes]:
+        return Watched(self.directory / TOKEN, lambda: self.read(TOKEN), on_report)
 
     @property
     def passphrase(self) -> str:

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from runner.operator.live import LiveOperator, live_operator
+from runner.security.exposure import page_keyring
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, streaming
@@ -63,7 +64,7 @@ def _served(operator: LiveOperator) -> Iterator[PageServer | None]:
         return
     from runner.page.server import PageServer
 
-    page = PageServer(vehicle, station)
+    page = PageServer(vehicle, station, keyring=page_keyring(vehicle))
     page.start()
     station.listeners.append(page)
     station.note(f"page: {page.url}")

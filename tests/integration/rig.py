@@ -134,10 +134,10 @@ def free_port() -> int:
     raise AssertionError("unreachable")
 
 
-def answers(port: int) -> bool:
-    """Whether a server listens on a local port."""
+def answers(port: int, host: str = "127.0.0.1") -> bool:
+    """Whether a server listens on a port."""
     with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+        return probe.connect_ex((host, port)) == 0
 
 
 def until(done: Callable[[], Any], seconds: float = WAIT_S, every_s: float = 0.01) -> Any:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import re
 import shutil
 import signal
+import socket
+import ssl
+import subprocess
 import time
 from contextlib import contextmanager
 from functools import partial
@@ -16,9 +20,11 @@ import pytest
 from browser import all_live, luma, measure, opened, send, shot, state_when, until
 from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_compiler, process
 from runner.core.model import Endpoint
+from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
 from runner.records import Sample
+from runner.security.authority import Authority
 
 pytestmark = [
     pytest.mark.gst,
@@ -250,3 +256,81 @@ def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
         until(lambda: all(camera["drawn"] > counted[name]["drawn"] + 5 for name, camera in measure(page).items()))
         assert "live" not in {camera["status"] for camera in measure(page).values()}
         until(lambda: {camera["status"] for camera in measure(page).values()} == {"frozen"})  # "lost" on a busy machine
+
+
+def _own_address():
+    """An address of this machine that others may reach it at."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            pytest.skip("this machine has no network")
+        return probe.getsockname()[0]
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    """The page of an operator, served at an address that is not loopback: (url, keys)."""
+    here = _own_address()
+    keys, port = tmp_path / "keys", free_port()
+    authority = Authority(keys)
+    with authority.opened():
+        authority.issue("broker", Role.BROKER, ["localhost"])
+        authority.issue("delivery_robot", Role.VEHICLE, [])
+        authority.issue("alice", Role.CONTROLLER, [here])
+    words = (*ROBOT, f"page.host={here}", f"page.port={port}", f"keys={keys}")
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}", "duration_s=600")
+    with process("demo", *words, *ports, stdout=subprocess.DEVNULL):
+        until(lambda: answers(port, here), seconds=60)
+        yield f"https://{here}:{port}/", keys / "alice"
+
+
+def test_a_browser_elsewhere_needs_the_token(chromium, elsewhere):
+    url, alice = elsewhere
+    token = (alice / "page.token").read_text()
+    with chromium.new_context(ignore_https_errors=True) as tab:  # its authority is not known to this browser
+        page = tab.new_page()
+        page.goto(url)
+        assert page.url == f"{url}login"
+        page.fill("#token", "guessed")
+        page.click("button")
+        until(lambda: "not the token" in page.locator("#problem").inner_text())
+        shot(page, "login")
+        page.fill("#token", token)
+        page.click("button")
+        page.wait_for_url(url)
+        until(lambda: page.evaluate("window.tod !== undefined"))
+        all_live(page)
+        authority = Authority(alice.parent)
+        with authority.opened():
+            authority.rotate("alice")
+        until(lambda: page.reload() and page.url == f"{url}login", every_s=1)
+
+
+def test_pages_of_other_sites_and_names_are_refused(elsewhere):
+    """Cross-site WebSocket, DNS rebinding, another site's form, a path that climbs up, and no session at all."""
+    url, alice = elsewhere
+    host = url.removeprefix("https://").rstrip("/")
+    own = {"Host": host, "Origin": url.rstrip("/")}
+    tls = ssl.create_default_context(cafile=alice / "ca.crt")
+
+    def status(path, method="GET", **headers):
+        connection = http.client.HTTPSConnection(*host.split(":"), context=tls, timeout=10)
+        connection.request(method, path, headers={**own, **headers})
+        found = connection.getresponse()
+        connection.close()
+        return found.status
+
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    upgrade["Sec-WebSocket-Key"] = "dGhlIHNhbXBsZSBub25jZQ=="
+    assert status("/login") == 200
+    assert status("/login", Host="evil.example:8090") == 403
+    assert status("/login", Origin="https://evil.example") == 403
+    assert status("/login/challenge", "POST") == 200
+    assert status("/login/challenge", "POST", Origin="https://evil.example") == 403
+    assert status("/live?viewer=x", **upgrade) == 401
+    assert status("/live?viewer=x", **upgrade, Cookie="tod_session=guessed") == 401
+    assert status("/static/main.js") == 401
+    assert status("/static/../../../../etc/passwd") in (401, 404)
+    assert status("/static/%2e%2e/%2e%2e/server.py") in (401, 404)
+    assert status("/") == 303

@@ -1,0 +1,56 @@
+"""Logging in to the page from another machine."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+
+from runner.page.login import CHALLENGE_S, CHALLENGES, SESSION_S, PageLogin
+
+
+def answer(challenge: str, token: bytes = b"token") -> str:
+    return hmac.new(token, challenge.encode(), hashlib.sha256).hexdigest()
+
+
+def test_a_right_answer_opens_a_session_for_its_time() -> None:
+    login = PageLogin(lambda: b"token")
+    challenge = login.challenge(0)
+    session = login.open(challenge, answer(challenge), 1)
+    assert session is not None
+    assert login.accepts(session, 1 + SESSION_S)
+    assert not login.accepts(session, 2 + SESSION_S)
+    assert not login.accepts(None, 1)
+    assert not login.accepts("guessed", 1)
+
+
+def test_an_answer_is_good_once_in_time_and_with_the_token() -> None:
+    login = PageLogin(lambda: b"token")
+    challenge = login.challenge(0)
+    assert login.open(challenge, answer(challenge), 0)
+    assert login.open(challenge, answer(challenge), 0) is None  # replayed
+    challenge = login.challenge(0)
+    assert login.open(challenge, answer(challenge, b"another"), 0) is None
+    assert login.open(challenge, answer(challenge), 0) is None  # the challenge is used up
+    challenge = login.challenge(0)
+    assert login.open(challenge, answer(challenge), CHALLENGE_S + 0.1) is None
+    assert login.open("made up", answer("made up"), 0) is None
+    challenge = login.challenge(0)
+    assert login.open(challenge, "ä\ud800", 0) is None
+
+
+def test_a_new_token_ends_all_sessions() -> None:
+    tokens = [b"token"]
+    login = PageLogin(lambda: tokens[-1])
+    challenge = login.challenge(0)
+    session = login.open(challenge, answer(challenge), 0)
+    assert login.accepts(session, 1)
+    tokens.append(b"new")
+    assert not login.accepts(session, 1)
+
+
+def test_what_is_kept_is_bounded() -> None:
+    login = PageLogin(lambda: b"token")
+    challenges = [login.challenge(n / 1000) for n in range(3 * CHALLENGES)]
+    assert len(login._challenges) == CHALLENGES
+    assert login.open(challenges[0], answer(challenges[0]), 1) is None
+    assert login.open(challenges[-1], answer(challenges[-1]), 1)
