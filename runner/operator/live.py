@@ -29,6 +29,7 @@ from runner.operator.station import Station
 from runner.plans import compile_plans
 from runner.records import Outcome
 from runner.security.exposure import viewer_keyring
+from runner.system.service import notify
 
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
@@ -82,6 +83,7 @@ class LiveOperator:
         self._latest_start = time.monotonic() + START_S
         self._thread.start()
         self._reporting.start()
+        notify("READY=1")
 
     def _await_vehicle(self) -> None:
         """The vehicle should know of this operator before its cameras begin to fill the link."""
@@ -105,6 +107,7 @@ class LiveOperator:
 
     def stop(self) -> None:
         """Sign off from the vehicle, and end."""
+        notify("STOPPING=1")
         self.end()
         for thread in (self._thread, self._reporting):
             if thread.ident:
@@ -150,6 +153,7 @@ class LiveOperator:
 
     def _sample(self, side: OperatorSide) -> None:
         self.station.take(side.sample(self.station.sending()))
+        notify("WATCHDOG=1")
         while self._requests and self._driven_s() >= self._requests[0].at_s:
             request = self._requests.popleft()
             self.station.ask(request.event, partial(self._note_reply, request))

@@ -42,6 +42,7 @@ from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetr
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.system.kernel_clock import clock_error_s
+from runner.system.service import notify
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import Reported, Request
 from runner.vehicle.loop import ControlLoop
@@ -83,9 +84,11 @@ class LiveVehicle:
         raises  RunError if the vehicle had to end, for example because another one has its name
         """
         self._watchdog.start()
+        notify("READY=1")
         try:
             self.loop.run(duration_s)
         finally:
+            notify("STOPPING=1")
             self._ended.set()
         if self.failure:
             raise self.failure
@@ -125,6 +128,8 @@ class LiveVehicle:
                 stuck = not stuck
                 doing = self.loop.busy_with or "nothing"
                 self.loop.on_report(f"the control loop hangs in {doing}" if stuck else "the control loop runs again")
+            if not stuck:
+                notify("WATCHDOG=1")
 
 
 class _Console:
