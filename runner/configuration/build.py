@@ -23,6 +23,7 @@ from runner.core.model import (
     KnobTarget,
     LatencyLimit,
     Media,
+    MetricsPorts,
     Mode,
     ModelError,
     PageSettings,
@@ -91,7 +92,7 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not all(map(self.fine, ("media", "control", "page", "log", "latency", "keys", "insecure"))):
+        if not all(map(self.fine, ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics"))):
             return None
         media = self.part(("media",), _media)
         if media is None:
@@ -128,6 +129,7 @@ class Builder:
             expires_s=float(document["control"]["expires_s"]),
             keys=keys,
             insecure=document.get("insecure", False),
+            metrics=MetricsPorts(**document.get("metrics", {})),
         )
 
     def finished(self, built: T | None) -> T:

@@ -393,6 +393,14 @@ class LatencyLimit:
         return 0.0 if measured_ms is None else min(1.0, self.limit_ms / max(measured_ms + self.fixed_ms, 1e-3))
 
 
+@dataclass(frozen=True, slots=True)
+class MetricsPorts:
+    """TCP ports on 127.0.0.1 at which each side serves its metrics; None: not served."""
+
+    vehicle_port: int | None = None
+    operator_port: int | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicle:
     """Everything the runner needs to know, valid once built.
@@ -405,6 +413,7 @@ class Vehicle:
     latency    what follows from latency for the speed
     keys       directory that `tod-runner keys` made for this side; None: nothing is encrypted or authenticated
     insecure   whether that is intended where video or control leave this machine
+    metrics    where both sides serve figures for Prometheus
     """
 
     name: str
@@ -421,6 +430,7 @@ class Vehicle:
     latency: LatencyLimit = LatencyLimit()
     keys: str | None = None
     insecure: bool = False
+    metrics: MetricsPorts = MetricsPorts()
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

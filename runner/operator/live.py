@@ -24,10 +24,11 @@ from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
+from runner.metrics import Figures, metrics_of
 from runner.operator.log import DriveLog
-from runner.operator.station import Station
+from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
-from runner.records import Outcome
+from runner.records import Outcome, Sample, VehicleState
 from runner.security.exposure import viewer_keyring
 from runner.system.service import notify
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
 CONTROL_FIRST_S, LOOK_S = 1.0, 0.01  # how long the streams wait for the vehicle, and how often they look for it
+STUCK_S = 2.0  # a side that samples nothing for this long hangs
 END_S = 1.0  # how long the last sample may take
 
 
@@ -66,6 +68,7 @@ class LiveOperator:
         self._online_at: float | None = None  # time.monotonic
         self._requests = deque(requests)
         self._failure: RunError | None = None
+        self._sampled = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
 
@@ -117,6 +120,11 @@ class LiveOperator:
             self._side.stop()
         self._log.close()
 
+    def problem(self) -> str | None:
+        """Why this side does not work; None: it does."""
+        silent = time.monotonic() - self._sampled
+        return f"nothing was sampled for {silent:.1f} s" if silent > STUCK_S else None
+
     def _run(self) -> None:
         """In its own thread, so that a stopped terminal (Ctrl-S) does not block it."""
         side = self._side
@@ -153,6 +161,7 @@ class LiveOperator:
 
     def _sample(self, side: OperatorSide) -> None:
         self.station.take(side.sample(self.station.sending()))
+        self._sampled = time.monotonic()
         notify("WATCHDOG=1")
         while self._requests and self._driven_s() >= self._requests[0].at_s:
             request = self._requests.popleft()
@@ -170,6 +179,19 @@ class LiveOperator:
                 return -1.0
             self._online_at = now
         return now - self._online_at
+
+
+class _Measured(Listener):
+    """Passes news on to the metrics."""
+
+    def __init__(self, metrics: Figures) -> None:
+        self._metrics = metrics
+
+    def on_state(self, state: VehicleState | None) -> None:
+        self._metrics.show_online(state is not None)
+
+    def on_sample(self, sample: Sample) -> None:
+        self._metrics.take(sample)
 
 
 @contextmanager
@@ -209,7 +231,11 @@ def live_operator(
         )
 
     operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)
+    metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port)
+    station.listeners.append(_Measured(metrics))
     try:
+        metrics.serve(operator.problem)
         yield operator
     finally:
         operator.stop()
+        metrics.close()

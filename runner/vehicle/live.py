@@ -25,6 +25,7 @@ from runner.core.model import Progress, Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
+from runner.metrics import metrics_of
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
@@ -123,13 +124,18 @@ class LiveVehicle:
         """Report a loop that hangs, for example in a rule that never returns, and its recovery."""
         stuck = False
         while not self._ended.wait(WATCH_S):
-            silent = time.monotonic() - self.loop.beat
-            if (silent > STUCK_S) != stuck:
+            problem = self.problem()
+            if (problem is not None) != stuck:
                 stuck = not stuck
-                doing = self.loop.busy_with or "nothing"
-                self.loop.on_report(f"the control loop hangs in {doing}" if stuck else "the control loop runs again")
+                self.loop.on_report(problem or "the control loop runs again")
             if not stuck:
                 notify("WATCHDOG=1")
+
+    def problem(self) -> str | None:
+        """Why the vehicle does not work; None: it does."""
+        if time.monotonic() - self.loop.beat <= STUCK_S:
+            return None
+        return f"the control loop hangs in {self.loop.busy_with or 'nothing'}"
 
 
 class _Console:
@@ -303,10 +309,17 @@ def live_vehicle(
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
     control = _VehicleControl(vehicle, document, report, keyring)
-    loop = ControlLoop(vehicle, side, pqos, track, drive, control.publish, report, Access(keyring, report))
+    metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port)
+
+    def publish(record: VehicleState | Telemetry | SpeedAdvice) -> bool:
+        metrics.take(record)
+        return control.publish(record)
+
+    loop = ControlLoop(vehicle, side, pqos, track, drive, publish, report, Access(keyring, report))
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
     try:
+        metrics.serve(live.problem)
         control.connect(live)
         for plan in plans:
             console.say(
@@ -315,6 +328,7 @@ def live_vehicle(
         yield live
     finally:
         live.stop()
+        metrics.close()
         control.close()
         side.stop()
         drive.close()

@@ -61,6 +61,7 @@ EXTRAS = {
     "cluster": ("distributed",),
     "mcap": ("foxglove",),
     "security": ("cryptography",),
+    "metrics": ("prometheus_client",),
 }
 
 

@@ -1,0 +1,185 @@
+"""Figures of a running side for Prometheus, and its health, over HTTP on loopback.
+
+/metrics  the newest figures, in Prometheus's text format
+/health   200 while the side works; 503 with the reason otherwise
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+from prometheus_client import CollectorRegistry, make_wsgi_app
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import ThreadingWSGIServer
+from prometheus_client.registry import Collector
+
+from runner.core.model import Endpoint
+from runner.metrics import Healthy
+from runner.records import Sample, Telemetry, VehicleState
+from runner.system.ports import check_port_free
+
+STOP_S = 1.0
+
+Figure = Callable[[Any], float | None]  # of a record, or of its entry for a camera; None: unknown, left out
+
+
+class _Figure(NamedTuple):
+    """A metric: its name without prefix, its help text, and its value."""
+
+    name: str
+    help: str
+    value: Figure
+
+
+def _ms(value: float | None) -> float | None:
+    return None if value is None else value / 1000
+
+
+# By record, those of the whole vehicle, and those of each camera. A name that ends in _total is a counter.
+FIGURES: dict[type, tuple[tuple[_Figure, ...], tuple[_Figure, ...]]] = {
+    VehicleState: (
+        (
+            _Figure("decided_kbps", "Total bitrate of all cameras", lambda s: float(s.total_kbps)),
+            _Figure(
+                "asked_kbps",
+                "Total that prediction or operator gives",
+                lambda s: None if s.asked_kbps is None else float(s.asked_kbps),
+            ),
+            _Figure("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
+        ),
+        (
+            _Figure("camera_decided_kbps", "Bitrate of the encoder", lambda c: float(c.kbps)),
+            _Figure("camera_scaling", "Scaling factor", lambda c: None if c.scaling is None else float(c.scaling)),
+            _Figure("camera_sending", "1 while the camera is to be sent", lambda c: c.sending),
+            _Figure("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
+        ),
+    ),
+    Telemetry: (
+        (
+            _Figure(
+                "predicted_kbps",
+                "Newest prediction of the bitrate",
+                lambda t: None if t.predicted_kbps is None else float(t.predicted_kbps),
+            ),
+            _Figure("refused_requests_total", "Requests refused", lambda t: t.refused),
+            _Figure("loop_errors_total", "Exceptions that the control loop survived", lambda t: t.errors),
+            _Figure("speed_factor", "Advised share of full speed", lambda t: t.speed_factor),
+        ),
+        (
+            _Figure("camera_encoded_frames_total", "Frames that the encoder has output", lambda c: c.frames),
+            _Figure("camera_encoded_bytes_total", "Bytes that the encoder has output", lambda c: c.bytes),
+            _Figure("camera_encode_seconds", "Time in the encoder", lambda c: _ms(c.encode_ms)),
+        ),
+    ),
+    Sample: (
+        (
+            _Figure("received_kbps", "Received of all cameras", lambda s: s.actual_kbps),
+            _Figure("clock_bound_seconds", "Bound of the clocks' difference", lambda s: _ms(s.clock_bound_ms)),
+            _Figure("invalid_messages_total", "Invalid messages on the control link", lambda s: s.dropped),
+        ),
+        (
+            _Figure("camera_received_kbps", "Received over the last second", lambda c: c.kbps),
+            _Figure("camera_received_fps", "Frames received over the last second", lambda c: c.fps),
+            _Figure("camera_received_frames_total", "Frames received", lambda c: c.frames),
+            _Figure("camera_lost_packets_total", "RTP packets that never arrived", lambda c: c.lost),
+            _Figure("camera_damaged_frames_total", "Frames that show lost packets", lambda c: c.damaged),
+            _Figure("camera_foreign_packets_total", "Packets of other senders, dropped", lambda c: c.foreign),
+            _Figure("camera_rebuilds_total", "Receivers that were rebuilt", lambda c: c.rebuilt),
+            _Figure("camera_latency_seconds", "Capture to decode", lambda c: _ms(c.latency_ms)),
+        ),
+    ),
+}
+
+
+class Metrics(Collector):
+    """The newest record of each kind, as metrics. Records are taken from any thread.
+
+    vehicle  its name, a label of every metric
+    """
+
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+        self._newest: dict[type, Any] = {}
+        self._online: bool | None = None
+
+    def take(self, record: Any) -> None:
+        """Keep a record, if any figure is made of it."""
+        if type(record) in FIGURES:
+            self._newest[type(record)] = record
+
+    def show_online(self, online: bool) -> None:
+        """Whether the vehicle is online, as the operator's side sees it."""
+        self._online = online
+        if not online:  # figures of a vehicle that is not heard would look as if it drove on
+            self._newest.pop(VehicleState, None)
+
+    def collect(self) -> Iterator[Metric]:
+        if self._online is not None:
+            yield self._metric("vehicle_online", "1 while the vehicle is heard", [((), float(self._online))])
+        for kind, record in list(self._newest.items()):
+            of_all, of_camera = FIGURES[kind]
+            for figure in of_all:
+                yield from self._figure(figure, {(): record}, ())
+            for figure in of_camera:
+                yield from self._figure(figure, {(name,): each for name, each in record.cameras.items()}, ("camera",))
+
+    def _figure(
+        self, figure: _Figure, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
+    ) -> Iterator[Metric]:
+        values = [(own, float(value)) for own, each in records.items() if (value := figure.value(each)) is not None]
+        if values:
+            yield self._metric(figure.name, figure.help, values, labels)
+
+    def _metric(
+        self, name: str, text: str, values: Iterable[tuple[tuple[str, ...], float]], labels: tuple[str, ...] = ()
+    ) -> Metric:
+        family = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
+        metric = family(f"tod_{name}", text, labels=["vehicle", *labels])
+        for own, value in values:
+            metric.add_metric([self._vehicle, *own], value)
+        return metric
+
+
+class _Handler(WSGIRequestHandler):
+    timeout = 5.0  # s: a client that sends nothing
+
+    def log_message(self, *_: object) -> None:
+        """Nothing: each scrape would be a line."""
+
+
+@contextmanager
+def served(metrics: Metrics, port: int, healthy: Healthy) -> Iterator[None]:
+    """Serve metrics and health on 127.0.0.1 for the duration of the block.
+
+    raises  RunError if the port is in use
+    """
+    endpoint = Endpoint("127.0.0.1", port)
+    check_port_free(endpoint)
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(metrics)
+    scrape = make_wsgi_app(registry)
+
+    def app(environ: dict[str, Any], start: Any) -> Iterable[bytes]:
+        path = environ.get("PATH_INFO")
+        if path == "/metrics":
+            text: Iterable[bytes] = scrape(environ, start)
+            return text
+        why = None if path == "/health" else "expected /metrics or /health"
+        status = "404 Not Found" if why else "200 OK"
+        if why is None and (why := healthy()):
+            status = "503 Service Unavailable"
+        start(status, [("Content-Type", "text/plain; charset=utf-8")])
+        return [f"{why or 'ok'}\n".encode()]
+
+    with make_server(endpoint.host, port, app, ThreadingWSGIServer, _Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            server.shutdown()
+            thread.join(STOP_S)

@@ -1,0 +1,48 @@
+"""Both sides' figures for Prometheus while they drive."""
+
+from __future__ import annotations
+
+import re
+import urllib.request
+
+import pytest
+import yaml
+
+from rig import CHECKOUT, ROBOT, free_port, process, until
+
+parser = pytest.importorskip("prometheus_client.parser")
+
+
+def scraped(port):
+    """Values by metric and camera, "" for one of the whole vehicle."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
+        families = parser.text_string_to_metric_families(answer.read().decode())
+        return {(each.name, each.labels.get("camera", "")): each.value for f in families for each in f.samples}
+
+
+def passes(port):
+    try:
+        return scraped(port)
+    except OSError:
+        return {}
+
+
+def test_both_sides_serve_figures_of_a_drive():
+    vehicle, operator = free_port(), free_port()
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}", f"metrics.vehicle_port={vehicle}")
+    with process("demo", *ROBOT, *ports, f"metrics.operator_port={operator}", "duration_s=600"):
+        until(lambda: passes(operator).get(("tod_camera_received_frames_total", "front"), 0) > 20, every_s=0.2)
+        seen, sent = scraped(operator), scraped(vehicle)
+    assert seen["tod_vehicle_online", ""] == 1
+    assert sent["tod_decided_kbps", ""] == sent["tod_predicted_kbps", ""] == 3000
+    for camera in ("front", "rear", "mast"):
+        assert sent["tod_camera_sending", camera] == 1
+        assert sent["tod_camera_encoded_frames_total", camera] >= seen["tod_camera_received_frames_total", camera] - 15
+        assert 0 < seen["tod_camera_latency_seconds", camera] < 10
+    # What alerts and dashboard mention exists.
+    texts = [path.read_text() for path in (CHECKOUT / "deploy").glob("*/*") if path.parent.name != "systemd"]
+    mentioned = {name for text in texts for name in re.findall(r"\btod_[a-z_]+", text)}
+    assert len(mentioned) > 10
+    assert mentioned <= {name for name, _ in (*seen, *sent)}
+    yaml.safe_load((CHECKOUT / "deploy" / "prometheus" / "alerts.yml").read_text())
+    yaml.safe_load((CHECKOUT / "deploy" / "prometheus" / "scrape.yml").read_text())
