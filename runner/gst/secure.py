@@ -35,7 +35,8 @@ class PeerCheck:
         if certificate is None:
             return "it has no certificate"
         if wrong := certificate.verify(None, self._authority):
-            return f"its certificate is not accepted: {', '.join(wrong.value_nicks)}"
+            reasons = [nick for nick in wrong.value_nicks if nick != "no-flags"]
+            return f"its certificate is not accepted: {', '.join(reasons)}"
         read = x509.load_der_x509_certificate(bytes(certificate.props.certificate))
         if read.serial_number in self._revoked.get():
             return "its certificate is revoked"

@@ -44,8 +44,8 @@ def _may_not():
 needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 
 
-def issue(directory, now=None, **names):
-    authority = Authority(directory, (lambda: now) if now else lambda: datetime.now(UTC))
+def issue(directory, **names):
+    authority = Authority(directory)
     with authority.opened():
         authority.issue("broker", Role.BROKER, ["127.0.0.1"])
         authority.issue(NAME, Role.VEHICLE, ["127.0.0.1"])
@@ -58,6 +58,14 @@ def issue(directory, now=None, **names):
 def keys(tmp_path):
     people = {"alice": "controller", "carol": "controller", "bob": "watcher", "pqos": "predictor", "gnss": "positioner"}
     return issue(tmp_path / "keys", **people)
+
+
+def issue_expired(keys):
+    """The directory of a watcher whose certificate has expired."""
+    authority = Authority(keys, lambda: datetime.now(UTC) - timedelta(days=400))
+    with authority.opened():
+        authority.issue("eve", Role.WATCHER, [])
+    return keys / "eve"
 
 
 def changed(keys, action, name):
@@ -171,14 +179,14 @@ def test_the_broker_refuses_intruders(keys, broker, tmp_path):
     topic = f"tod/{NAME}/request/alice"
     assert published(broker, keys / "alice", topic) == (0, "")
     others = issue(tmp_path / "others", alice="controller")
-    late = issue(tmp_path / "late", now=datetime.now(UTC) - timedelta(days=400), alice="controller")
+    expired = issue_expired(keys)
     for intruder, how in (
         (keys / "alice", {"password": ""}),
         (keys / "alice", {"password": "guessed"}),
         (keys / "alice", {"user": "bob"}),
         (keys / "alice", {"tls": False}),
         (others / "alice", {"cafile": keys / "alice" / "ca.crt"}),
-        (late / "alice", {"cafile": keys / "alice" / "ca.crt"}),
+        (expired, {}),
     ):
         assert published(broker, intruder, topic, **how)[0] != 0, (intruder, how)
     assert published(broker, keys / "alice", topic) == (0, "")
@@ -293,18 +301,29 @@ def test_pictures_come_to_who_has_keys(keys, graph):
 
 def test_rtsp_refuses_intruders(keys, tmp_path):
     others = issue(tmp_path / "others", alice="controller")
+    shutil.copy(keys / "alice" / keyring.AUTHORITY, others / "alice")  # otherwise it would itself refuse the vehicle
     wrong = tmp_path / "wrong"
     shutil.copytree(keys / "alice", wrong)
     (wrong / keyring.SECRET).write_text("guessed")
+    revoked = tmp_path / "revoked"
+    shutil.copytree(keys / "carol", revoked)
+    changed(keys, "revoke", "carol")
+    expired = issue_expired(keys)
     with sending(keys) as (plans, reports):
-        intruders = (others / "alice", wrong, keys / "pqos", None)
+        intruders = (others / "alice", wrong, revoked, expired, keys / "pqos", None)
         with ExitStack() as stack:
             all_seen = [stack.enter_context(watching(plans, holder)) for holder in intruders]
             with watching(plans, keys / "alice") as (seen, _):
                 until(lambda: min(seen().values()) > 30, every_s=0.1)
             for holder, (own, _) in zip(intruders, all_seen, strict=True):
                 assert set(own().values()) == {0}, holder
-    assert any("refused an RTSP client" in what for what in reports)
+    refusals = {what.partition("client: ")[2] for what in reports if "refused an RTSP client" in what}
+    assert refusals == {
+        "its certificate is not accepted: unknown-ca",
+        "its certificate is not accepted: expired",
+        "its certificate is revoked",
+        "pqos may not watch",
+    }
     secret = (keys / "alice" / keyring.SECRET).read_text()
     assert not any(secret in what for what in reports)
 
