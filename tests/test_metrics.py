@@ -12,7 +12,7 @@ import pytest
 from rig import free_port
 from runner.core.model import Endpoint
 from runner.errors import RunError
-from runner.metrics import metrics_of
+from runner.metrics.side import metrics_of
 from runner.records import CameraTelemetry, Telemetry
 
 pytest.importorskip("prometheus_client")

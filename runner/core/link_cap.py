@@ -78,7 +78,7 @@ class Most(NamedTuple):
     t: float
 
 
-class Limit(NamedTuple):
+class LastLimit(NamedTuple):
     """The last limit, believed or not, kbit/s; when it rose last (t), and from which one."""
 
     kbps: Kbps
@@ -87,7 +87,7 @@ class Limit(NamedTuple):
 
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
-NO_LIMIT = Limit(Fraction(0), -float("inf"), Fraction(0))
+NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class LinkCap:
     connected: float = -float("inf")
     provisional: bool = False
     losses: Losses = NONE_LOST
-    limit: Limit = NO_LIMIT
+    limit: LastLimit = NO_LIMIT
 
 
 UNCAPPED = LinkCap()
@@ -176,7 +176,7 @@ def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
     known = cap.limit
     rose = limit > known.kbps > 0
-    cap = replace(cap, limit=Limit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
+    cap = replace(cap, limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
     last = cap.overuse
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap

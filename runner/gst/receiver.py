@@ -217,8 +217,8 @@ class Receiver:
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
-        if self._login:
-            self._login.prepare(pipeline, self._client)
+        if self._login and (problem := self._login.prepare(pipeline, self._client)):
+            self._on_report(self._name, problem)
         if GObject.signal_lookup("select-stream", self._client):
             take_feedback(self._client, self._on_profile)
         if self._operator and self._client.find_property("user-agent"):

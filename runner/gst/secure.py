@@ -13,7 +13,7 @@ from cryptography.x509.oid import NameOID
 from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 
 from runner.core.roles import Role
-from runner.errors import RunError
+from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
 from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, rtsp_password, srt_passphrase
 
@@ -80,12 +80,22 @@ class StreamLogin:
         self._check = PeerCheck(keyring, on_report)
         self._last: Gio.TlsCertificate | None = None  # that was accepted
 
-    def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> None:
-        """Set up a new pipeline and its client. The files of the keyring are read again each time."""
+    def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> str | None:
+        """Set up a new pipeline and its client with the keys of now.
+
+        returns  why it cannot connect, as while new files are being copied; None if it can
+        """
+        try:
+            if client.find_property("tls-interaction"):
+                self._prepare_rtsp(client)
+            else:
+                encrypt(pipeline, srt_passphrase(self._keyring.read(MEDIA_SECRET), self._vehicle))
+        except (RunError, UserError, GLib.Error) as error:
+            return str(error)
+        return None
+
+    def _prepare_rtsp(self, client: Gst.Element) -> None:
         keyring = self._keyring
-        if not client.find_property("tls-interaction"):
-            encrypt(pipeline, srt_passphrase(keyring.read(MEDIA_SECRET), self._vehicle))
-            return
         client.set_property("tls-interaction", _Certificate(own_certificate(keyring)))
         # Nobody else's certificate is signed by this one: none is accepted without the signal.
         client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate)))

@@ -18,21 +18,21 @@ from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.registry import Collector
 
 from runner.core.model import Endpoint
-from runner.metrics import Healthy
 from runner.records import Sample, Telemetry, VehicleState
 from runner.system.ports import check_port_free
 
 STOP_S = 1.0
 
-Figure = Callable[[Any], float | None]  # of a record, or of its entry for a camera; None: unknown, left out
+Healthy = Callable[[], str | None]  # why the side does not work; None: it does
+Reading = Callable[[Any], float | None]  # of a record, or of its entry for a camera; None: unknown, left out
 
 
-class _Figure(NamedTuple):
+class _Metric(NamedTuple):
     """A metric: its name without prefix, its help text, and its value."""
 
     name: str
     help: str
-    value: Figure
+    value: Reading
 
 
 def _ms(value: float | None) -> float | None:
@@ -40,56 +40,56 @@ def _ms(value: float | None) -> float | None:
 
 
 # By record, those of the whole vehicle, and those of each camera. A name that ends in _total is a counter.
-FIGURES: dict[type, tuple[tuple[_Figure, ...], tuple[_Figure, ...]]] = {
+FIGURES: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
         (
-            _Figure("decided_kbps", "Total bitrate of all cameras", lambda s: float(s.total_kbps)),
-            _Figure(
+            _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: float(s.total_kbps)),
+            _Metric(
                 "asked_kbps",
                 "Total that prediction or operator gives",
                 lambda s: None if s.asked_kbps is None else float(s.asked_kbps),
             ),
-            _Figure("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
+            _Metric("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
         ),
         (
-            _Figure("camera_decided_kbps", "Bitrate of the encoder", lambda c: float(c.kbps)),
-            _Figure("camera_scaling", "Scaling factor", lambda c: None if c.scaling is None else float(c.scaling)),
-            _Figure("camera_sending", "1 while the camera is to be sent", lambda c: c.sending),
-            _Figure("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
+            _Metric("camera_decided_kbps", "Bitrate of the encoder", lambda c: float(c.kbps)),
+            _Metric("camera_scaling", "Scaling factor", lambda c: None if c.scaling is None else float(c.scaling)),
+            _Metric("camera_sending", "1 while the camera is to be sent", lambda c: c.sending),
+            _Metric("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
         ),
     ),
     Telemetry: (
         (
-            _Figure(
+            _Metric(
                 "predicted_kbps",
                 "Newest prediction of the bitrate",
                 lambda t: None if t.predicted_kbps is None else float(t.predicted_kbps),
             ),
-            _Figure("refused_requests_total", "Requests refused", lambda t: t.refused),
-            _Figure("loop_errors_total", "Exceptions that the control loop survived", lambda t: t.errors),
-            _Figure("speed_factor", "Advised share of full speed", lambda t: t.speed_factor),
+            _Metric("refused_requests_total", "Requests refused", lambda t: t.refused),
+            _Metric("loop_errors_total", "Exceptions that the control loop survived", lambda t: t.errors),
+            _Metric("speed_factor", "Advised share of full speed", lambda t: t.speed_factor),
         ),
         (
-            _Figure("camera_encoded_frames_total", "Frames that the encoder has output", lambda c: c.frames),
-            _Figure("camera_encoded_bytes_total", "Bytes that the encoder has output", lambda c: c.bytes),
-            _Figure("camera_encode_seconds", "Time in the encoder", lambda c: _ms(c.encode_ms)),
+            _Metric("camera_encoded_frames_total", "Frames that the encoder has output", lambda c: c.frames),
+            _Metric("camera_encoded_bytes_total", "Bytes that the encoder has output", lambda c: c.bytes),
+            _Metric("camera_encode_seconds", "Time in the encoder", lambda c: _ms(c.encode_ms)),
         ),
     ),
     Sample: (
         (
-            _Figure("received_kbps", "Received of all cameras", lambda s: s.actual_kbps),
-            _Figure("clock_bound_seconds", "Bound of the clocks' difference", lambda s: _ms(s.clock_bound_ms)),
-            _Figure("invalid_messages_total", "Invalid messages on the control link", lambda s: s.dropped),
+            _Metric("received_kbps", "Received of all cameras", lambda s: s.actual_kbps),
+            _Metric("clock_bound_seconds", "Bound of the clocks' difference", lambda s: _ms(s.clock_bound_ms)),
+            _Metric("invalid_messages_total", "Invalid messages on the control link", lambda s: s.dropped),
         ),
         (
-            _Figure("camera_received_kbps", "Received over the last second", lambda c: c.kbps),
-            _Figure("camera_received_fps", "Frames received over the last second", lambda c: c.fps),
-            _Figure("camera_received_frames_total", "Frames received", lambda c: c.frames),
-            _Figure("camera_lost_packets_total", "RTP packets that never arrived", lambda c: c.lost),
-            _Figure("camera_damaged_frames_total", "Frames that show lost packets", lambda c: c.damaged),
-            _Figure("camera_foreign_packets_total", "Packets of other senders, dropped", lambda c: c.foreign),
-            _Figure("camera_rebuilds_total", "Receivers that were rebuilt", lambda c: c.rebuilt),
-            _Figure("camera_latency_seconds", "Capture to decode", lambda c: _ms(c.latency_ms)),
+            _Metric("camera_received_kbps", "Received over the last second", lambda c: c.kbps),
+            _Metric("camera_received_fps", "Frames received over the last second", lambda c: c.fps),
+            _Metric("camera_received_frames_total", "Frames received", lambda c: c.frames),
+            _Metric("camera_lost_packets_total", "RTP packets that never arrived", lambda c: c.lost),
+            _Metric("camera_damaged_frames_total", "Frames that show lost packets", lambda c: c.damaged),
+            _Metric("camera_foreign_packets_total", "Packets of other senders, dropped", lambda c: c.foreign),
+            _Metric("camera_rebuilds_total", "Receivers that were rebuilt", lambda c: c.rebuilt),
+            _Metric("camera_latency_seconds", "Capture to decode", lambda c: _ms(c.latency_ms)),
         ),
     ),
 }
@@ -119,22 +119,22 @@ class Metrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         if self._online is not None:
-            yield self._metric("vehicle_online", "1 while the vehicle is heard", [((), float(self._online))])
+            yield self._family("vehicle_online", "1 while the vehicle is heard", [((), float(self._online))])
         for kind, record in list(self._newest.items()):
             of_all, of_camera = FIGURES[kind]
-            for figure in of_all:
-                yield from self._figure(figure, {(): record}, ())
-            for figure in of_camera:
-                yield from self._figure(figure, {(name,): each for name, each in record.cameras.items()}, ("camera",))
+            for wanted in of_all:
+                yield from self._values(wanted, {(): record}, ())
+            for wanted in of_camera:
+                yield from self._values(wanted, {(name,): each for name, each in record.cameras.items()}, ("camera",))
 
-    def _figure(
-        self, figure: _Figure, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
+    def _values(
+        self, wanted: _Metric, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
     ) -> Iterator[Metric]:
-        values = [(own, float(value)) for own, each in records.items() if (value := figure.value(each)) is not None]
+        values = [(own, float(value)) for own, each in records.items() if (value := wanted.value(each)) is not None]
         if values:
-            yield self._metric(figure.name, figure.help, values, labels)
+            yield self._family(wanted.name, wanted.help, values, labels)
 
-    def _metric(
+    def _family(
         self, name: str, text: str, values: Iterable[tuple[tuple[str, ...], float]], labels: tuple[str, ...] = ()
     ) -> Metric:
         family = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily

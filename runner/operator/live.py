@@ -24,7 +24,7 @@ from runner.core.link_cap import REPORT_S
 from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
-from runner.metrics import Figures, metrics_of
+from runner.metrics.side import SideMetrics, metrics_of
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
@@ -184,7 +184,7 @@ class LiveOperator:
 class _Measured(Listener):
     """Passes news on to the metrics."""
 
-    def __init__(self, metrics: Figures) -> None:
+    def __init__(self, metrics: SideMetrics) -> None:
         self._metrics = metrics
 
     def on_state(self, state: VehicleState | None) -> None:

@@ -25,7 +25,7 @@ from runner.core.model import Progress, Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.graph import rtsp_url
-from runner.metrics import metrics_of
+from runner.metrics.side import metrics_of
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (

@@ -45,8 +45,9 @@ def soak(seed: int, scale: float) -> list[str]:
         "MQTT to the operator": to_operator,
     }
     with running() as (system, operator):
-        for kind in kinds.values():  # the baseline includes all that is loaded and cached on first use
-            kind(system, dice, 100)
+        # The baseline includes all that is loaded and cached on first use, and the arenas of many threads.
+        for kind in kinds.values():
+            kind(system, dice, max(100, count // 5))
         time.sleep(SETTLE_S / 2)
         before = _sizes(system)
         for name, kind in kinds.items():
