@@ -367,7 +367,8 @@ def test_a_demo_with_keys_streams(keys, tmp_path):
 # --- what others on the network can read ------------------------------------------------------------------------------
 
 LEGIBLE = (b"delivery_robot", b"front", b"alice", b"operator_connected", b'"event"', b'"cameras"', b"RTSP/1.0", b"x264")
-START_CODES = tuple(b"\0\0\0\1" + bytes([kind]) for kind in (0x67, 0x68, 0x65, 0x41, 0x06))
+# Start code and the first bytes of parameter sets and IDR pictures; shorter ones occur in the headers of SRT.
+START_CODES = tuple(b"\0\0\0\1" + unit for unit in (b"\x67\x42", b"\x67\x4d", b"\x67\x64", b"\x65\x88"))
 
 
 @contextmanager
