@@ -43,17 +43,17 @@ def _ms(value: float | None) -> float | None:
 FIGURES: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
         (
-            _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: float(s.total_kbps)),
+            _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: s.total_kbps),
             _Metric(
                 "asked_kbps",
                 "Total that prediction or operator gives",
-                lambda s: None if s.asked_kbps is None else float(s.asked_kbps),
+                lambda s: s.asked_kbps,
             ),
             _Metric("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
         ),
         (
-            _Metric("camera_decided_kbps", "Bitrate of the encoder", lambda c: float(c.kbps)),
-            _Metric("camera_scaling", "Scaling factor", lambda c: None if c.scaling is None else float(c.scaling)),
+            _Metric("camera_decided_kbps", "Bitrate of the encoder", lambda c: c.kbps),
+            _Metric("camera_scaling", "Scaling factor", lambda c: c.scaling),
             _Metric("camera_sending", "1 while the camera is to be sent", lambda c: c.sending),
             _Metric("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
         ),
@@ -63,7 +63,7 @@ FIGURES: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
             _Metric(
                 "predicted_kbps",
                 "Newest prediction of the bitrate",
-                lambda t: None if t.predicted_kbps is None else float(t.predicted_kbps),
+                lambda t: t.predicted_kbps,
             ),
             _Metric("refused_requests_total", "Requests refused", lambda t: t.refused),
             _Metric("loop_errors_total", "Exceptions that the control loop survived", lambda t: t.errors),

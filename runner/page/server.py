@@ -86,6 +86,7 @@ class PageServer(Listener):
         self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
         self._keyring = keyring
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
+        self._names = keyring.holder.hosts if keyring else ("127.0.0.1", "localhost")
         self._refusals = 0
         check_port_free(vehicle.page.endpoint)
         self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
@@ -105,7 +106,7 @@ class PageServer(Listener):
         host, port = self._address
         if self._keyring is None:
             return f"http://{host}:{port}/"
-        return f"https://{next(iter(self._keyring.holder.hosts), host)}:{port}/"
+        return f"https://{next(iter(self._names), host)}:{port}/"
 
     def start(self) -> None:
         self._thread.start()
@@ -188,8 +189,7 @@ class PageServer(Listener):
         No other site in the same browser may read or send anything, whatever name it gives this server (DNS rebinding).
         """
         sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
-        names = self._keyring.holder.hosts if self._keyring else ("127.0.0.1", "localhost")
-        allowed = {f"{name}:{sockname[1]}" for name in names}
+        allowed = {f"{name}:{sockname[1]}" for name in self._names}
         scheme, origin = "https" if self._login else "http", request.headers.get("Origin")
         foreign = origin is not None and origin not in {f"{scheme}://{name}" for name in allowed}
         if request.headers.get("Host") not in allowed or foreign or (request.method == "POST" and origin is None):

@@ -19,6 +19,8 @@ from typing import Any
 
 import pytest
 
+from runner.errors import RunError
+from runner.link.netns import _check_allowed
 from runner.operator.station import Listener
 from runner.records import Note, Sample, VehicleState, state_to_json, to_json
 
@@ -105,6 +107,18 @@ time_t time(time_t *at) {
 }
 """
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+
+
+def _no_namespaces() -> str:
+    """Why this process cannot make network namespaces; "" if it can."""
+    try:
+        _check_allowed()
+    except RunError as error:
+        return str(error)
+    return "" if shutil.which("ip") else "iproute2 is not installed"
+
+
+needs_root = pytest.mark.skipif(bool(_no_namespaces()), reason=_no_namespaces())
 
 
 def clock_ahead(directory: Path, seconds: float, verb: str = "vehicle", fast_ppm: int = 0) -> dict[str, str]:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from contextlib import contextmanager
 
-import pytest
-
-from rig import free_port, process, until
+from rig import free_port, needs_root, process, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
-from runner.errors import RunError
 from runner.link import limited_link
 from runner.link.limit import Limit, Reverse
-from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
@@ -25,17 +20,6 @@ COMMON = ("source=test", "fps_max=15", "pqos=constant", "pqos.kbps=1000", "modes
 RTSP = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast")
 OTHERS = ("front_left", "front_right", "front_center", "top_front", "top_left", "top_right", "top_rear")
 SRT = ("vehicle=tum_q7", "graph=h264_srt", *(f"~cameras.{name}" for name in OTHERS))
-
-
-def _may_not():
-    try:
-        _check_allowed()
-    except RunError as error:
-        return str(error)
-    return "" if shutil.which("ip") else "iproute2 is not installed"
-
-
-needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -14,14 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from rig import CHECKOUT, NOISE, free_port, process, streaming, until, watching
+from rig import CHECKOUT, NOISE, free_port, needs_root, process, streaming, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
 from runner.link.limit import Rates, Reverse, TcpFlows
-from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
@@ -29,15 +27,6 @@ ROBOT = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "fps_max=1
 SETTLE_S, MEASURE_S = 2.0, 4.0
 
 
-def _may_not() -> str:
-    try:
-        _check_allowed()
-    except RunError as error:
-        return str(error)
-    return "" if shutil.which("ip") else "iproute2 is not installed"
-
-
-needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 KINDS = [pytest.param("netns", marks=needs_root), "relay"]
 WIDE = Limit(lambda t: 5000, queue_ms=200, delay_ms=0)
 

@@ -13,14 +13,12 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from rig import free_port, process, until
+from rig import free_port, needs_root, process, until
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
-from runner.errors import RunError
 from runner.link import Limit, limited_link
-from runner.link.netns import _check_allowed
 from runner.mqtt.broker import private_broker
 from runner.operator.live import live_operator
 from runner.records import Sample
@@ -31,17 +29,6 @@ from runner.security.keyring import Keyring
 CAMERAS = ("front", "rear")
 WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "~cameras.mast", "page.serve=false", "pqos=constant")
 NAME = "delivery_robot"
-
-
-def _may_not():
-    try:
-        _check_allowed()
-    except RunError as error:
-        return str(error)
-    return "" if shutil.which("ip") else "iproute2 is not installed"
-
-
-needs_root = pytest.mark.skipif(bool(_may_not()), reason=_may_not())
 
 
 def issue(directory, **names):
