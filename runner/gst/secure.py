@@ -151,7 +151,8 @@ class ViewerCheck:
 
     def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
         """The holder of a client's certificate; None if it is not accepted, any more."""
-        tls = client.get_connection().get_tls()
+        connection = client.get_connection()  # None once it is closed
+        tls = connection.get_tls() if connection else None
         holder = self._check.holder(tls.get_peer_certificate() if tls else None)
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
@@ -326,7 +327,8 @@ class CameraServer:
         """Answer with the correct URL: with a query the library would find the camera here, but not in PLAY."""
         uri = context.uri
         _, message = GstRtsp.rtsp_message_new_response(MOVED, GstRtsp.rtsp_status_as_text(MOVED), context.request)
-        message.add_header(GstRtsp.RTSPHeaderField.LOCATION, f"rtsp://{uri.host}:{uri.port}/{_path(context)}")
+        own = rtsp_url(replace(self._media, host=uri.host, port=uri.port), _path(context))
+        message.add_header(GstRtsp.RTSPHeaderField.LOCATION, own)
         message.add_header(GstRtsp.RTSPHeaderField.CONNECTION, "close")
         client.send_message(None, message)
         connection = self._connection(client)
