@@ -30,13 +30,17 @@ class PeerCheck:
         self._authority = Gio.TlsCertificate.new_from_file(str(keyring.authority))
         self._revoked = keyring.watched_revoked(on_report)
 
-    def holder(self, certificate: Gio.TlsCertificate | None) -> Holder | str:
-        """Whose certificate it is, or why it is not accepted."""
+    def verify(self, certificate: Gio.TlsCertificate | None) -> Holder | str:
+        """Whose certificate a new connection presents, or why it is not accepted."""
         if certificate is None:
             return "it has no certificate"
         if wrong := certificate.verify(None, self._authority):
             reasons = [nick for nick in wrong.value_nicks if nick != "no-flags"]
             return f"its certificate is not accepted: {', '.join(reasons)}"
+        return self.holder(certificate)
+
+    def holder(self, certificate: Gio.TlsCertificate) -> Holder | str:
+        """Whose certificate an open connection has, or why it must end; no longer whether it is in its term."""
         read = x509.load_der_x509_certificate(bytes(certificate.props.certificate))
         if read.serial_number in self._revoked.get():
             return "its certificate is revoked"
@@ -104,11 +108,11 @@ class StreamLogin:
         client.connect("accept-certificate", self._accept)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
-        self._last = certificate if self._check.holder(certificate) == self._expected else None
+        self._last = certificate if self._check.verify(certificate) == self._expected else None
         return self._last is not None
 
     def is_withdrawn(self) -> bool:
-        """Whether the certificate that the vehicle uses is not accepted any more."""
+        """Whether the certificate that the vehicle uses has been revoked."""
         return self._last is not None and isinstance(self._check.holder(self._last), str)
 
 
@@ -150,14 +154,15 @@ class ViewerCheck:
         self._known = people
 
     def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
-        """The holder of a client's certificate; None if it is not accepted, any more."""
+        """The holder of a client's certificate; None if it may not watch any more."""
         connection = client.get_connection()  # None once it is closed
         tls = connection.get_tls() if connection else None
-        holder = self._check.holder(tls.get_peer_certificate() if tls else None)
+        certificate = tls.get_peer_certificate() if tls else None
+        holder = self._check.holder(certificate) if certificate else None
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 
     def _accept(self, _auth: object, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
-        holder = self._check.holder(certificate)
+        holder = self._check.verify(certificate)
         if isinstance(holder, Holder):
             if holder.name in self._known:
                 return True

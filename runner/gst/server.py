@@ -34,6 +34,7 @@ OnReport = Callable[[str, str], None]  # camera, what happened to it
 
 OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it continues to open for a later request
 HELD_S = 5.0  # how long an open camera waits for a later request
+CLOSE_S = 2.0  # how long connections may take to end when the server stops
 GONE_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
@@ -148,10 +149,19 @@ class CameraServer:
         threading.Thread(target=self._expire_sessions, name="rtsp-sessions", daemon=True).start()
 
     def stop(self) -> None:
+        """Accept no more clients, and end every connection in its own thread.
+
+        `client_filter` would close them from this thread. In the middle of a request, the library (1.22) then reads
+        without end from a stream that no longer exists.
+        """
         self._stopped.set()
         GLib.source_remove(self._watch)
-        self._server.client_filter(lambda *_: GstRtspServer.RTSPFilterResult.REMOVE)
         GLib.source_remove(self._attached)
+        with self._changed:
+            for connection in self._connections.values():
+                connection.close()
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._connections, CLOSE_S)
 
     # --- cameras ------------------------------------------------------------------------------------------------------
 
@@ -241,7 +251,7 @@ class CameraServer:
                     threading.Thread(target=self._open, args=(camera, camera.opening), daemon=True).start()
                 opening = camera.opening
                 left = max(0.0, end - time.monotonic())
-                self._changed.wait_for(lambda o=opening: camera.is_open or o.over, left)  # type: ignore[misc]
+                self._changed.wait_for(lambda o=opening: self._is_settled(camera, o), left)  # type: ignore[misc]
                 media = camera.media if camera.is_open else None
             if media is not None and media.prepare(None):
                 with self._changed:
@@ -249,9 +259,13 @@ class CameraServer:
                 if opening:
                     opening.held.set()
                 return True
-            if (opening and opening.failed) or time.monotonic() >= end:
+            if (opening and opening.failed) or self._stopped.is_set() or time.monotonic() >= end:
                 return False
             # Otherwise its last viewer has just left, and it is ending.
+
+    def _is_settled(self, camera: _Camera, opening: _Opening | None) -> bool:
+        """Whether waiting for a camera to open makes no difference any more."""
+        return camera.is_open or opening is None or opening.over or self._stopped.is_set()
 
     def _release(self, wanted: Callable[[float, GstRtspServer.RTSPClient], bool]) -> None:
         """Release the holds that `wanted` selects by their start and client."""
@@ -286,6 +300,8 @@ class CameraServer:
             return
         with self._changed:
             self._connections[client] = connection
+            if self._stopped.is_set():
+                connection.close()
         client.connect("closed", self._on_closed)
         client.connect("new-session", self._on_session)
         for method in METHODS:
@@ -303,6 +319,7 @@ class CameraServer:
             if connection:
                 self._note_left(connection.cameras)
                 connection.forget()
+                self._changed.notify_all()
 
     def _on_session(self, _client: object, session: GstRtspServer.RTSPSession) -> None:
         session.set_timeout(self._media.session_timeout_s)

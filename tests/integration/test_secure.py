@@ -55,9 +55,9 @@ def issue_expired(keys):
     return keys / "eve"
 
 
-def changed(keys, action, name):
+def changed(keys, action, name, now=lambda: datetime.now(UTC)):
     """Rotate or revoke, as the verb does."""
-    authority = Authority(keys)
+    authority = Authority(keys, now)
     with authority.opened():
         getattr(authority, action)(name)
 
@@ -214,6 +214,22 @@ def test_a_vehicle_whose_keys_are_withdrawn_is_seen_no_more(keys):
         assert seen() == before
 
 
+def test_what_is_connected_stays_connected_when_certificates_expire(keys):
+    """Of both sides, while they stream; nobody new is admitted."""
+    ends = datetime.now(UTC) + timedelta(seconds=8)
+    for name in (NAME, "alice"):
+        changed(keys, "rotate", name, lambda: ends - timedelta(days=365))
+    with sending(keys) as (plans, _), watching(plans, keys / "alice") as (seen, messages):
+        until(lambda: min(seen().values()) > 10, every_s=0.1)
+        time.sleep(max(0.0, (ends - datetime.now(UTC)).total_seconds()) + 1)
+        before = seen()
+        until(lambda: min(seen().values()) > max(before.values()) + 20, every_s=0.1)
+        assert not messages, messages
+        with watching(plans, keys / "bob") as (late, refusals):
+            until(lambda: refusals)
+            assert not any(late().values())
+
+
 def test_rotated_keys_take_effect_without_a_restart(keys):
     """Of everybody, while the vehicle streams."""
     with driving(keys) as (broker, common), operating(keys, common, "alice") as alice:
@@ -353,6 +369,7 @@ def test_a_demo_with_keys_streams(keys, tmp_path):
 
 # --- what others on the network can read ------------------------------------------------------------------------------
 
+ETH_P_ALL = 0x0003
 LEGIBLE = (b"delivery_robot", b"front", b"alice", b"operator_connected", b'"event"', b'"cameras"', b"RTSP/1.0", b"x264")
 # Start code and the first bytes of parameter sets and IDR pictures; shorter ones occur in the headers of SRT.
 START_CODES = tuple(b"\0\0\0\1" + unit for unit in (b"\x67\x42", b"\x67\x4d", b"\x67\x64", b"\x65\x88"))
@@ -364,9 +381,9 @@ def captured(address):
     shown = json.loads(subprocess.check_output(["ip", "-j", "addr"], text=True))
     devices = {each["local"]: device["ifname"] for device in shown for each in device["addr_info"] if "local" in each}
     packets = []
-    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003)) as tap:
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as tap:  # with a protocol it would hear all devices
         tap.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8_000_000)
-        tap.bind((devices[address], 0))
+        tap.bind((devices[address], ETH_P_ALL))
         yield packets
         tap.setblocking(False)
         with suppress(BlockingIOError):

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 
@@ -445,3 +445,26 @@ def test_rtp_and_rtcp_sockets_listen_on_the_servers_address_only():
         lines = subprocess.run(["ss", "-Hlun"], capture_output=True, text=True, check=True).stdout.splitlines()
         for port in (viewer.server_port, viewer.server_port + 1):
             assert [line.split()[3] for line in lines if f":{port} " in line] == [f"127.0.0.1:{port}"]
+
+
+def test_a_server_that_stops_amid_requests_leaves_no_thread_that_reads_on(capfd):
+    """The library's thread of a connection reads without end if another thread closes it in the middle of a request."""
+
+    def ask(address):
+        with suppress(OSError), socket.create_connection(address) as tcp:
+            while True:
+                tcp.sendall(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\nUser-Agent: " + 3000 * b"x" + b"\r\n\r\n")
+                tcp.recv(65_536)
+
+    for _ in range(5):
+        with streaming() as (_, vehicle, _, _):
+            address = (vehicle.media.host, vehicle.media.port)
+            clients = [threading.Thread(target=ask, args=(address,), daemon=True) for _ in range(6)]
+            for client in clients:
+                client.start()
+            time.sleep(0.3)
+        for client in clients:
+            client.join(5)
+            assert not client.is_alive()
+        time.sleep(0.1)
+        assert "CRITICAL" not in capfd.readouterr().err[:1000]
