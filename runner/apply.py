@@ -17,6 +17,7 @@ from runner.graph import Plan, launch
 from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
+from runner.gst.credentials import log_in
 from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
@@ -96,6 +97,8 @@ def _source_problem(plan: Plan) -> str | None:
     """GStreamer's error when the source is opened; None if it opens. Devices are opened on the way to READY."""
     pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
     try:
+        if problem := log_in(pipeline, plan):
+            return problem
         if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
             return None
         message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
@@ -283,6 +286,8 @@ class VehicleSide:
         if plan.frozen_s is not None:
             source = WatchedSource(plan, lambda what: self._on_report(name, what))
             source.take_place(pipeline, plan)
+        elif problem := log_in(pipeline, plan):
+            self._on_report(name, problem)
         if self._video:
             VideoFile(self._video, name, "vehicle", captured_at, self._on_report).follow(pipeline)
         return CameraPipeline(

@@ -13,6 +13,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import (
     PLACEHOLDER,
     Camera,
+    Capture,
     Element,
     Graph,
     Media,
@@ -30,6 +31,10 @@ _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
     "key_interval_s": ("key_interval_frames", lambda seconds, fps: seconds * fps),
     "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
 }
+# Without colorimetry each decoder takes that of the picture's size: colours would change where a picture is scaled.
+_PICTURE = "pixel-aspect-ratio=1/1,colorimetry=bt709"
+# Caps of what a camera delivers that is not raw. A raw format has its own name.
+_ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
 # disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
@@ -316,12 +321,11 @@ def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> N
             raise ModelError(f"recording.elements[{index}].name", repr(element.name), rule)
 
 
-def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[str, Value]:
-    """The values of the placeholders of a camera's source and graph."""
+def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[str, Value | None]:
+    """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
-    square = "pixel-aspect-ratio=1/1"
-    values: dict[str, Value] = {
+    values: dict[str, Value | None] = {
         **camera.source.settings,
         **camera.graph.settings,
         **camera.mount,
@@ -329,7 +333,9 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "width": width,
         "height": height,
         "framerate": rate,
-        "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{square}",
+        "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{_PICTURE}",
+        "capture_caps": _capture_caps(camera.capture),
+        "controls": _controls(camera.capture),
         "host": media.host,
         "url": rtsp_url(media, camera.name),
         "port": int(camera.graph.settings["first_port"]) + index,
@@ -338,14 +344,30 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
     return values if clip is None else values | {"clip": clip}
 
 
-def _filled(element: Element, values: Mapping[str, Value], where: str) -> Element:
-    properties = {
-        key: _fill_value(value, values, f"{where}.properties.{key}") for key, value in element.properties.items()
-    }
-    return replace(element, properties=properties)
+def _capture_caps(capture: Capture) -> str | None:
+    """Caps of what a V4L2 camera is to deliver; None: anything."""
+    if capture.format is None:
+        return None
+    caps = [_ENCODED.get(capture.format, "video/x-raw")]
+    caps += [f"format={capture.format}"] if capture.format not in (*_ENCODED, "raw") else []
+    caps += [f"width={capture.width}"] if capture.width else []
+    caps += [f"height={capture.height}"] if capture.height else []
+    caps += [f"framerate={capture.fps.numerator}/{capture.fps.denominator}"] if capture.fps else []
+    return ",".join(caps)
 
 
-def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
+def _controls(capture: Capture) -> str | None:
+    """V4L2 controls as the serialized structure that v4l2src takes."""
+    given = [f"{name}={value}" for name, value in capture.controls.items()]
+    return ",".join(["controls", *given]) if given else None
+
+
+def _filled(element: Element, values: Mapping[str, Value | None], where: str) -> Element:
+    filled = {key: _fill_value(value, values, f"{where}.properties.{key}") for key, value in element.properties.items()}
+    return replace(element, properties={key: value for key, value in filled.items() if value is not None})
+
+
+def _fill_value(value: Value, values: Mapping[str, Value | None], where: str) -> Value | None:
     if not isinstance(value, str):
         return value
     for name in PLACEHOLDER.findall(value):
@@ -354,7 +376,12 @@ def _fill_value(value: Value, values: Mapping[str, Value], where: str) -> Value:
     whole = PLACEHOLDER.fullmatch(value)
     if whole:
         return values[whole[1]]  # keeps its type
-    return PLACEHOLDER.sub(lambda match: text(values[match[1]]), value)
+    parts: dict[str, Value] = {}
+    for name in PLACEHOLDER.findall(value):
+        if (part := values[name]) is None:
+            raise ModelError(where, repr(value), f"{{{name}}} must stand alone: it may be empty")
+        parts[name] = part
+    return PLACEHOLDER.sub(lambda match: text(parts[match[1]]), value)
 
 
 def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:

@@ -11,6 +11,11 @@ _USER = re.compile(r"(?<=://)[^/?#\s]*@")  # userinfo of RFC 3986, section 3.2.1
 _NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']+")  # in a query; property of rtspsrc
 
 
+def has_password(address: str) -> bool:
+    """Whether an address holds a user name or a password."""
+    return bool(_USER.search(address) or _NAMED.search(address))
+
+
 def redacted(value: T) -> T:
     """A text, or a document containing texts, with `user:password@` removed from addresses."""
     found: Any = value

@@ -21,7 +21,7 @@ GRAPHS = sorted(path.stem for path in (CONF / "graph").glob("*.yaml"))
 
 SOURCE = (
     "videotestsrc name=source is-live=true pattern=smpte ! capsfilter name=raw "
-    "caps=video/x-raw,format=I420,width=1920,height=1040,framerate=40/1,pixel-aspect-ratio=1/1"
+    "caps=video/x-raw,format=I420,width=1920,height=1040,framerate=40/1,pixel-aspect-ratio=1/1,colorimetry=bt709"
 )
 ENCODER = (
     "x264enc name=encoder tune=zerolatency speed-preset=superfast intra-refresh=true key-int-max=60 "
@@ -30,7 +30,8 @@ ENCODER = (
 PAY = "identity name=sent ! rtph264pay name=pay0 pt=96 mtu=1200 config-interval=-1"
 DECODE = (
     "rtph264depay name=depay ! capsfilter name=units caps=video/x-h264,stream-format=byte-stream,alignment=au "
-    "! identity name=received ! avdec_h264 name=decoder max-threads=1 ! "
+    "! identity name=received ! capssetter name=colors caps=video/x-h264,colorimetry=bt709 "
+    "! avdec_h264 name=decoder max-threads=1 ! "
     "fakesink name=sink sync=false async=false enable-last-sample=false"
 )
 KNOBS: dict[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 1920, 1040), "size": (480, 260), "bitrate": 545}

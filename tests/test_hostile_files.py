@@ -195,7 +195,9 @@ ADDRESS = "rtsp://bob:s3cr%23t@10.0.0.1/x?user=bob&password=s3cret2"
 
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_the_password_of_a_camera_is_not_printed(tod: Command, form: str) -> None:
-    result = tod("print", f"format={form}", "source=rtsp", f"'source.address=\"{ADDRESS}\"'".strip("'"))
+    """In an element's properties: as `address` it is refused."""
+    own = ("source.address=rtsp://10.0.0.1/x", f'source.elements.0.properties.location="{ADDRESS}"')
+    result = tod("print", f"format={form}", "source=rtsp", *own)
     assert result.status == 0
     assert "s3cr" not in result.out and "rtsp://10.0.0.1/x" in result.out
     assert "passwords of addresses are left out" in result.err

@@ -1,4 +1,4 @@
-"""A view that cannot be rendered is a mistake in the configuration, reported before anything starts."""
+"""Sources of frames in the configuration: what is asked of cameras, and mistakes, reported before anything starts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import pytest
 
 from runner.configuration.config import configuration
 from runner.errors import ConfigError
+from runner.graph import Plan
+from runner.plans import compile_plans
 
 LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
 
@@ -25,3 +27,66 @@ def test_a_camera_that_the_drive_cannot_show(override: str, line: str) -> None:
         configuration(["source=synthetic", override]).vehicle()
     assert str(raised.value) == f"{line}\n1 problem, nothing was started"
     configuration(["source=test", override]).vehicle()  # other sources accept it
+
+
+DEVICES = [f"cameras.{name}.device=/dev/video{n}" for n, name in enumerate(("front", "rear", "mast"))]
+
+
+def plans(*overrides: str) -> dict[str, Plan]:
+    vehicle = configuration(["vehicle=delivery_robot", "source=v4l2", *DEVICES, *overrides]).vehicle()
+    return {plan.camera.name: plan for plan in compile_plans(vehicle)}
+
+
+def asked(plan: Plan) -> tuple[object, object]:
+    """Controls and caps of the plan's camera."""
+    source, capture, *_ = plan.source
+    return source.properties.get("extra-controls"), capture.properties.get("caps")
+
+
+def test_a_camera_is_asked_for_nothing_unless_the_configuration_does() -> None:
+    assert {asked(plan) for plan in plans().values()} == {(None, None)}
+
+
+@pytest.mark.parametrize(
+    ("capture", "caps"),
+    [
+        ("format: mjpeg, width: 1280, height: 720, fps: 30", "image/jpeg,width=1280,height=720,framerate=30/1"),
+        ("format: h264, fps: 12.5", "video/x-h264,framerate=25/2"),
+        ("format: h265", "video/x-h265"),
+        ("format: raw, width: 640, height: 480", "video/x-raw,width=640,height=480"),
+        ("format: YUY2", "video/x-raw,format=YUY2"),
+    ],
+)
+def test_formats(capture: str, caps: str) -> None:
+    assert asked(plans(f"+cameras.front.capture={{{capture}}}")["front"]) == (None, caps)
+
+
+def test_what_a_mount_states_replaces_what_the_source_states_key_by_key() -> None:
+    common = "source.capture={format: mjpeg, width: 1280, height: 720, controls: {gain: 3, auto_exposure: 1}}"
+    found = plans(common, "+cameras.rear.capture={width: 640, height: 480, controls: {gain: 0}}")
+    assert asked(found["front"]) == ("controls,gain=3,auto_exposure=1", "image/jpeg,width=1280,height=720")
+    assert asked(found["rear"]) == ("controls,gain=0,auto_exposure=1", "image/jpeg,width=640,height=480")
+
+
+@pytest.mark.parametrize(
+    ("override", "problem"),
+    [
+        ("+cameras.front.capture={width: 640}", "cameras.front.capture.format: null: must be given where width is"),
+        (
+            "+cameras.front.capture={format: mjpeg, controls: {gain: high}}",
+            "cameras.front.capture.controls.gain: 'high': must be a whole number",
+        ),
+    ],
+)
+def test_what_cannot_be_asked(override: str, problem: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        plans(override)
+    assert str(raised.value).startswith(f"command line: {problem}")
+
+
+@pytest.mark.parametrize("address", ["rtsp://me:secret@10.0.0.1/x", "rtsp://10.0.0.1/x?user=me&password=secret"])
+def test_an_address_with_a_password_is_refused_and_not_shown(address: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        plans("source=rtsp", f'source.address="{address}"')
+    assert "must not hold user or password: write user:password into a file, and name that" in str(raised.value)
+    assert "secret" not in str(raised.value)

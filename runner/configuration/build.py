@@ -17,6 +17,7 @@ from runner.configuration.rule_lists import call_rule, check_order
 from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
+    Capture,
     Element,
     Endpoint,
     Graph,
@@ -41,6 +42,7 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
+from runner.redact import has_password, redacted
 from runner.system.files import file_problem
 
 if TYPE_CHECKING:
@@ -240,6 +242,8 @@ class Builder:
                 native=(native["width_px"], native["height_px"]) if native else None,
                 crop=_crop(native, data["width_px"], data["height_px"]) if native else None,
                 mount=_given(data, MOUNT_KEYS),
+                capture=_capture(source, data),
+                credentials=data.get("credentials", source.credentials),
                 place=Place(**place) if place else None,
                 pose=Pose(**pose) if pose else None,
                 **options,
@@ -288,6 +292,9 @@ class Builder:
             given = camera.mount.get(key, source.settings.get(key))
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
+            elif key == "address" and has_password(str(given)):
+                rule = "must not hold user or password: write user:password into a file, and name that as credentials"
+                self._report(where, ModelError(key, repr(redacted(given)), rule))
             elif key == "clip" and not Path(str(given)).is_file():
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
@@ -339,6 +346,19 @@ def _media(data: Mapping[str, Any]) -> Media:
     return Media(**{**data, "rtp_ports": (first, last)})
 
 
+def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
+    """What a source asks of its cameras, with the camera's own wishes in their place."""
+    own = data.get("capture") or {}
+    asked = {**source.capture, **own}
+    controls = {**source.capture.get("controls", {}), **own.get("controls", {})}
+    for key in ("width", "height", "fps"):
+        if key in asked and "format" not in asked:
+            raise ModelError("capture.format", "null", f"must be given where {key} is")
+    fps = asked.get("fps")
+    size = _given(asked, ("format", "width", "height"))
+    return Capture(**size, fps=None if fps is None else exact(fps), controls=controls)
+
+
 def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
     return RateQualityModel(
         scaling=tuple(map(exact, data["scaling"])),
@@ -379,7 +399,8 @@ def _source(data: Mapping[str, Any]) -> Source:
     return Source(
         elements=_elements(data["elements"]),
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
-        **_given(data, ("loop", "frozen_s", "repeated_s")),
+        capture=data.get("capture") or {},
+        **_given(data, ("loop", "frozen_s", "repeated_s", "credentials")),
         render=render["drive"] if render else "",
         render_s=render["seconds"] if render else 0,
         stand_in=_elements(data.get("stand_in")),

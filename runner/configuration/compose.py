@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 # keys of a mount
-OF_THE_PLACE = ("place", "pose", "weight", "floor_kbps", "shed", "device", "address", "clip", "graph", "source")
+OF_THE_PLACE = (
+    *("place", "pose", "weight", "floor_kbps", "shed", "graph", "source"),
+    *("device", "address", "clip", "capture", "credentials"),
+)
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
 # Groups that Hydra composes only for applications that it starts itself: a tenth of the time.
 HYDRAS_OWN = ("output", "launcher", "sweeper", "help", "hydra_help", "hydra_logging", "job_logging", "env")

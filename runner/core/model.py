@@ -211,6 +211,8 @@ class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
     settings    values for placeholders from the file itself: clip, device, address
+    capture     what its cameras are to deliver unless they state otherwise, see `Capture`
+    credentials file with user name and password, for cameras that name none
     loop        restart at the end without a gap (a clip)
     frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
                 None: it is not monitored
@@ -222,6 +224,8 @@ class Source:
 
     elements: tuple[Element, ...]
     settings: Mapping[str, Value] = field(default_factory=dict)
+    capture: Mapping[str, Any] = field(default_factory=dict)
+    credentials: str | None = None
     loop: bool = False
     frozen_s: float | None = None
     repeated_s: float | None = None
@@ -234,6 +238,24 @@ class Source:
         """Names of the placeholders in its elements."""
         values = (value for element in self.elements for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """What a V4L2 camera is to deliver; None leaves the choice to the camera.
+
+    format    mjpeg, h264, h265, raw, or the name of a raw format in GStreamer such as YUY2
+    width     px, of the camera's own picture
+    height    px
+    fps       Hz
+    controls  V4L2 controls by name, set when the device is opened, as `v4l2-ctl --list-ctrls` shows them
+    """
+
+    format: str | None = None
+    width: int | None = None
+    height: int | None = None
+    fps: Fraction | None = None
+    controls: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,6 +310,8 @@ class Camera:
     shed            where all floors together exceed the total, cameras with the lowest number are given up first;
                     None: never
     mount           device, address, clip: values of the placeholders of these names
+    capture         what its device is to deliver
+    credentials     file with user name and password of its address; None: it asks for none
     """
 
     name: str
@@ -303,6 +327,8 @@ class Camera:
     native: tuple[int, int] | None = None
     crop: Roi | None = None
     mount: Mapping[str, Value] = field(default_factory=dict)
+    capture: Capture = field(default_factory=Capture)
+    credentials: str | None = None
     place: Place | None = None
     pose: Pose | None = None
     fov_deg: float = 90.0

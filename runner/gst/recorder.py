@@ -10,6 +10,7 @@ from gi.repository import GLib, Gst
 
 from runner.graph import Plan
 from runner.gst.clocks import unix_time
+from runner.gst.credentials import log_in
 from runner.gst.pipeline import counted
 from runner.gst.source import fixed_rate, loop_clip
 
@@ -81,6 +82,7 @@ class Recorder:
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
             element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
+        problem = log_in(self._pipeline, self._plan)
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)
         bus = self._pipeline.get_bus()
@@ -89,6 +91,9 @@ class Recorder:
         bus.connect("message::eos", self._on_eos)
         self._moved = (0, time.monotonic())
         self._watching = GLib.timeout_add(CHECK_MS, self._watch)
+        if problem:
+            self._close(Stage.FAILED, problem)
+            return
         self._pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
 
     def sample(self) -> Recorded:

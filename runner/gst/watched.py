@@ -10,6 +10,7 @@ from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, set_state_aside
+from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.source import fixed_rate
 
@@ -34,7 +35,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def __init__(self, plan: Plan, on_report: Callable[[str], None]) -> None:
         super().__init__(name="watched-source")
         assert plan.frozen_s is not None
-        self._frozen_s = plan.frozen_s
+        self._plan, self._frozen_s = plan, plan.frozen_s
         self._launch, self._last = launch(plan.source), plan.source[-1].name
         self._on_report = on_report
         self.outage = Outage(on_report)
@@ -140,6 +141,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _fill(self) -> Gst.Bin:
         child = Gst.parse_bin_from_description(self._launch, ghost_unlinked_pads=False)
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
+        if problem := log_in(child, self._plan):
+            self._on_report(problem)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
         self.add(child)

@@ -17,7 +17,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
-import stat
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -29,7 +28,7 @@ import msgspec
 
 from runner.core.roles import Role
 from runner.errors import UserError
-from runner.system.files import read_file
+from runner.system.files import exposure, read_file
 
 AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "own.secret", "own.json"
 REVOKED, PEOPLE = "crl.pem", "people.json"
@@ -223,9 +222,7 @@ class Keyring:
     def _problem(self, name: str) -> str | None:
         path = self.directory / name
         try:
-            mode = path.stat().st_mode
+            exposed = exposure(path)
         except OSError as error:
             return (error.strerror or str(error)).lower()
-        if name not in PUBLIC and mode & (stat.S_IRWXG | stat.S_IRWXO):
-            return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
-        return None
+        return None if name in PUBLIC else exposed

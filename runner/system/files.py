@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
@@ -80,6 +81,17 @@ def read_file(path: Path, most_bytes: int) -> bytes:
     if len(content) > most_bytes:
         raise ValueError(f"must be at most {most_bytes // 1000} kB long")
     return content
+
+
+def exposure(path: Path) -> str | None:
+    """What is wrong with the mode of a file that only its owner may read; None: nothing.
+
+    raises  OSError
+    """
+    mode = path.stat().st_mode
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
+    return None
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -1,8 +1,8 @@
 """usage: tod-runner doctor [VERB] [OVERRIDE ...]
 
 What this machine lacks for a verb with this configuration, and how to get it: Python packages, GStreamer and its
-bindings, elements, broker, free ports, cores. The default verb is `demo`, which needs everything that both sides need.
-Ends with status 1 if something is missing.
+bindings, elements, broker, free ports, cameras and the USB bandwidth they share, cores. The default verb is `demo`,
+which needs everything that both sides need. Ends with status 1 if something is missing.
 
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
@@ -22,6 +23,7 @@ from runner.errors import MissingBindings, RunError, UserError
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
 from runner.system.ports import check_port_free
+from runner.system.usb import UsbCamera, buses
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
 CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
@@ -82,6 +84,8 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     if verb == "demo":
         yield _broker()
     yield from _ports(verb, vehicle)
+    if verb in ("vehicle", "demo", "record"):
+        yield from _devices(vehicle)
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
 
@@ -144,6 +148,25 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
             yield Diagnosis(False, f"{key}: {error}")
         else:
             yield Diagnosis(True, f"{key}: {endpoint.host}:{endpoint.port} is free")
+
+
+def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
+    """V4L2 cameras, and the bandwidth of the USB buses that they share."""
+    cameras = []
+    for camera in vehicle.cameras.values():
+        device = camera.mount.get("device", camera.source.settings.get("device"))
+        if "device" in camera.source.needs and device is not None:
+            path = Path(str(device))
+            there = path.is_char_device()
+            yield Diagnosis(there, f"camera {camera.name}: {path}{'' if there else ' is no device file'}")
+            cameras.append(UsbCamera(camera.name, path, camera.capture, camera.fps))
+    for bus in buses(cameras):
+        need = f"about {bus.mbps:.0f} of {bus.budget_mbps:.0f} Mbit/s"
+        what = f"USB bus {bus.number} at {bus.speed_mbps} Mbit/s: {', '.join(bus.cameras)} need {need}"
+        if bus.unknown:
+            what += f", without {', '.join(bus.unknown)}, whose capture does not state format and size"
+        fits = bus.mbps <= bus.budget_mbps
+        yield Diagnosis(fits, what if fits else f"{what}: choose mjpeg, fewer fps, or another bus")
 
 
 def _cores(vehicle: Vehicle) -> Diagnosis:

@@ -362,7 +362,7 @@ def watching(plan: Any, *, pictures: bool = False) -> Iterator[Client]:
 IP_CAMERA = """
 import sys
 from runner.gst import GLib
-from gi.repository import GstRtspServer
+from gi.repository import GstRtsp, GstRtspServer
 server = GstRtspServer.RTSPServer()
 server.set_address("127.0.0.1")
 server.set_service(sys.argv[1])
@@ -372,6 +372,15 @@ factory.set_launch(
     "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 ! rtph264pay name=pay0 pt=96 config-interval=-1 )"
 )
 factory.set_shared(True)
+if user := sys.argv[2]:
+    auth, token, permissions = GstRtspServer.RTSPAuth(), GstRtspServer.RTSPToken(), GstRtspServer.RTSPPermissions()
+    auth.set_supported_methods(GstRtsp.RTSPAuthMethod.DIGEST)
+    token.set_string(GstRtspServer.RTSP_TOKEN_MEDIA_FACTORY_ROLE, "user")
+    auth.add_digest(user, sys.argv[3], token)
+    for name in (GstRtspServer.RTSP_PERM_MEDIA_FACTORY_ACCESS, GstRtspServer.RTSP_PERM_MEDIA_FACTORY_CONSTRUCT):
+        permissions.add_permission_for_role("user", name, True)
+    factory.set_permissions(permissions)
+    server.set_auth(auth)
 server.get_mount_points().add_factory("/stream", factory)
 server.attach(None)
 print("serves", flush=True)
@@ -380,9 +389,12 @@ GLib.MainLoop().run()
 
 
 @contextmanager
-def ip_camera(port: int) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """An IP camera in its own process. Yields its address and the process, which may be stopped or killed."""
-    command = [sys.executable, "-c", IP_CAMERA, str(port)]
+def ip_camera(port: int, user: str = "", password: str = "") -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """An IP camera in its own process. Yields its address and the process, which may be stopped or killed.
+
+    user  who may watch it; "": everybody
+    """
+    command = [sys.executable, "-c", IP_CAMERA, str(port), user, password]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=CHECKOUT) as child:
         try:

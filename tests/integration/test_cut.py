@@ -19,7 +19,8 @@ COMMON = ("source=test", "fps_max=15", "pqos=constant", "pqos.kbps=1000", "modes
 # Each vehicle with one camera.
 RTSP = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast")
 OTHERS = ("front_left", "front_right", "front_center", "top_front", "top_left", "top_right", "top_rear")
-SRT = ("vehicle=tum_q7", "graph=h264_srt", *(f"~cameras.{name}" for name in OTHERS))
+SMALL = ("cameras.rear_center.width_px=480", "cameras.rear_center.height_px=260")
+SRT = ("vehicle=tum_q7", "graph=h264_srt", *SMALL, *(f"~cameras.{name}" for name in OTHERS))
 
 
 @contextmanager

@@ -251,7 +251,7 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]},"
         " requests: [{at_s: 3, request: {event: camera_switched, camera: mast, 'on': false}}]}\n"
     )
-    ports = ("page.serve=false", f"media.port={free_port()}", f"control.port={free_port()}")
+    ports = ("page.serve=false", "fps_max=10", f"media.port={free_port()}", f"control.port={free_port()}")
     words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
     done = run("demo", *words)
     assert done.returncode == 0, done.stderr

@@ -51,15 +51,16 @@ def sides(*overrides, log="log.video=false"):
 
 @pytest.mark.alone
 def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
-    kill_and_restart_the_vehicle(chromium, frozen_ms=1500, banner_ms=10_000)
+    """Each picture is marked before the banner names the cause."""
+    kill_and_restart_the_vehicle(chromium, banner_ms=10_000)
 
 
 @pytest.mark.soak
 def test_a_killed_vehicle_is_marked_within_150_ms_and_named_within_a_second(chromium):
-    kill_and_restart_the_vehicle(chromium, frozen_ms=150, banner_ms=1000)
+    kill_and_restart_the_vehicle(chromium, banner_ms=1000, frozen_ms=150)
 
 
-def kill_and_restart_the_vehicle(chromium, frozen_ms, banner_ms):
+def kill_and_restart_the_vehicle(chromium, banner_ms, frozen_ms=None):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as first:
             all_live(page)
@@ -67,13 +68,14 @@ def kill_and_restart_the_vehicle(chromium, frozen_ms, banner_ms):
             first.kill()
             killed = time.time() * 1000
             page.wait_for_selector("#banner:not([hidden])", timeout=banner_ms)
+            named_ms = time.time() * 1000 - killed
             shot(page, "vehicle-gone")
         log = page.evaluate("tod.measure()")["status_log"]
         for camera in ("front", "rear", "mast"):
             at = next(
                 ms for ms, name, status in log if name == camera and ms > killed - 100 and status in ("frozen", "lost")
             )
-            assert at - killed < frozen_ms, f"{camera}: {at - killed} ms"
+            assert at - killed < (frozen_ms or named_ms), f"{camera}: {at - killed} ms"
         with vehicle():
             state_when(page, lambda now: True)
             online = time.monotonic()

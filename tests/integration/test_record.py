@@ -118,7 +118,7 @@ def test_every_encoder_is_lossless_and_keeps_the_times(tmp_path, conf, recording
 
 
 def source_caps() -> str:
-    return "video/x-raw,format=I420,width=848,height=480,framerate=30/1,pixel-aspect-ratio=1/1"
+    return "video/x-raw,format=I420,width=848,height=480,framerate=30/1,pixel-aspect-ratio=1/1,colorimetry=bt709"
 
 
 def test_the_length_is_kept_to_the_frame_and_described(tmp_path):

@@ -20,6 +20,9 @@ const SETTLE_MS = 2000; // after a restart the decoder may take this long for th
 const REFUSED_MS = 5000; // between two questions whether the browser decodes a stream now
 const LATE_HOLD_MS = 500; // how long one late picture is indicated
 const STAGES = 1200;
+// Not every encoder states what the vehicle pins (ITU-R BT.709); browsers would take BT.601 for small pictures.
+/** @type {VideoColorSpaceInit} */
+const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRange: false };
 
 /** @typedef {import("./picture.js").Picture} Picture */
 /** @typedef {{picture: Picture, meta: any}} Shown */
@@ -133,7 +136,7 @@ export class Stream {
     });
     this.decoder = decoder;
     this.codec = codec;
-    decoder.configure({ codec, optimizeForLatency: true });
+    decoder.configure({ codec, optimizeForLatency: true, colorSpace: BT709 });
   }
 
   /** Why the browser does not decode this stream, "" if it can. Browsers name the error differently. */

@@ -1,0 +1,142 @@
+"""What cameras deliver: colors, capture times, logins. For V4L2 cameras others stand in, before the same elements."""
+
+from __future__ import annotations
+
+import pytest
+
+from rig import CHECKOUT, free_port, ip_camera, process, streaming, until, watching
+from runner.configuration.config import configuration
+from runner.core.commands import Command
+from runner.core.model import Element
+from runner.graph import launch
+from runner.plans import compile_plans
+
+CAMERA = "front_left"
+COLOR = (200, 80, 40)  # red, green, blue
+V4L2 = ("source=v4l2", f"cameras.{CAMERA}.device=/dev/video0", "cameras.front_left.fps=15")
+
+
+def turn(side, **values):
+    side.turn([Command(CAMERA, knob, value) for knob, value in values.items()])
+
+
+def colored(*between):
+    """A source of one color, as a camera that delivers it by these elements."""
+    argb = int.from_bytes(bytes((255, *COLOR)))
+    pattern = f"{{is-live: true, pattern: solid-color, foreground-color: {argb}}}"
+    raw = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
+    elements = [f"{{name: source, element: videotestsrc, properties: {pattern}}}", *between, raw]
+    return ("source=test", f"source.elements=[{', '.join(elements)}]")
+
+
+MJPEG = [
+    "{name: rgb, element: capsfilter, properties: {caps: 'video/x-raw,format=RGB'}}",
+    "{name: full, element: videoconvert}",
+    "{name: small, element: capsfilter, properties: {caps: 'video/x-raw,width=640,height=360,colorimetry=1:4:0:0'}}",
+    "{name: camera, element: jpegenc}",
+    *(
+        f"{{name: {element}, element: {element}}}"
+        for element in ("decodebin", "videoconvert", "videoscale", "videorate")
+    ),
+]
+
+
+@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
+@pytest.mark.parametrize("between", [[], MJPEG], ids=["raw", "MJPEG"])
+def test_colors_are_right_at_every_size(graph, between):
+    """Without colorimetry decoders take BT.601 for small pictures and BT.709 for large ones."""
+    with (
+        streaming(*colored(*between), f"graph={graph}", "cameras.front_left.fps=15") as (side, _, (plan,), _),
+        watching(plan, pictures=True) as client,
+    ):
+        for size in ((480, 260), (1920, 1040)):
+            turn(side, sending=True, size=size, bitrate=4000)
+            until(lambda size=size: client.sizes[-1:] == [size])
+            until(lambda size=size: is_right(client.picture(), size), seconds=20)
+
+
+def is_right(picture, size):
+    """Once it has the new size, and the encoder has refined it."""
+    if picture.shape[:2] != size[::-1]:
+        return False
+    center = picture[size[1] // 2, size[0] // 2]
+    return all(abs(int(seen) - true) <= 6 for seen, true in zip(center, COLOR, strict=True))
+
+
+@pytest.mark.parametrize("fps", [15, 30])
+def test_frames_of_a_v4l2_camera_keep_their_capture_times(fps):
+    """Also those of a camera that runs at twice the rate, of which each second one is dropped."""
+    from runner.gst import Gst
+
+    (plan,) = (p for p in compile_plans(configuration([*V4L2]).vehicle()) if p.camera.name == CAMERA)
+    caps = f"video/x-raw,format=I420,width=1920,height=1040,framerate={fps}/1"
+    stand_in = Element("source", "appsrc", {"format": "time", "is-live": True, "caps": caps})
+    pipeline = Gst.parse_launch(f"{launch((stand_in, *plan.source[1:]))} ! appsink name=sink sync=false")
+    source, sink = map(pipeline.get_by_name, ("source", "sink"))
+    pipeline.set_state(Gst.State.PLAYING)
+    captured = [Gst.SECOND + round((k / fps + 0.0007 * (k * 7 % 5)) * Gst.SECOND) for k in range(40)]
+    for time in captured:
+        frame = Gst.Buffer.new_allocate(None, 1920 * 1040 * 3 // 2, None)
+        frame.pts = time
+        source.emit("push-buffer", frame)
+    source.emit("end-of-stream")
+    seen = []
+    while sample := sink.emit("try-pull-sample", 5 * Gst.SECOND):
+        seen.append(sample.get_buffer().pts)
+    pipeline.set_state(Gst.State.NULL)
+    assert set(seen) <= set(captured)
+    assert len(seen) >= 40 * 15 // fps - 2
+
+
+@pytest.fixture
+def credentials(tmp_path):
+    file = tmp_path / "rear camera"
+    file.write_text("viewer:se:same7\n")
+    file.chmod(0o600)
+    return file
+
+
+def rear(address, *words):
+    return ("vehicle=delivery_robot", "source=rtsp", "fps_max=15", f'source.address="{address}"', *words)
+
+
+def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
+    with ip_camera(free_port(), "viewer", "se:same7") as (address, _):
+        words = rear(address, f'source.credentials="{credentials}"')
+        with streaming(*words, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
+            knobs = {"sending": True, "size": (424, 240), "bitrate": 500}
+            side.turn([Command("rear", knob, value) for knob, value in knobs.items()])
+            until(lambda: len(client.sizes) > 10)
+            assert "same7" not in plan.pipeline
+            assert reported == ["rear: pipeline built"]
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "why"),
+    [
+        ("viewer:wrong", 0o600, "Unauthorized"),
+        ("viewer:se:same7", 0o640, "credentials FILE: others may read it (mode 640); chmod 600"),
+        ("viewer", 0o600, "credentials FILE: must hold one line user:password"),
+        (None, 0o600, "credentials FILE: no such file"),
+    ],
+)
+def test_what_is_wrong_with_credentials_is_reported(credentials, text, mode, why):
+    credentials.unlink()
+    if text:
+        credentials.write_text(text)
+        credentials.chmod(mode)
+    with ip_camera(free_port(), "viewer", "se:same7") as (address, _):
+        words = rear(address, f'source.credentials="{credentials}"')
+        with streaming(*words, cameras=("rear",)) as (_, _, (plan,), reported), watching(plan):
+            until(lambda: any(why.replace("FILE", str(credentials)) in line for line in reported))
+            assert not any("same7" in line for line in reported)
+
+
+def test_a_vehicle_whose_credentials_are_missing_does_not_start(tmp_path):
+    words = rear("rtsp://127.0.0.1:1/x", f'source.credentials="{tmp_path}/none"', f"media.port={free_port()}")
+    with process("vehicle", *words, cwd=CHECKOUT) as vehicle:
+        output, _ = vehicle.communicate(timeout=60)
+    assert vehicle.returncode == 1
+    assert output.splitlines() == [
+        f"camera {name}: credentials {tmp_path}/none: no such file" for name in ("front", "rear", "mast")
+    ]
