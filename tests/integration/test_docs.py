@@ -6,6 +6,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -47,14 +48,18 @@ STANDS_FOR = {
 
 
 def commands(document: Path) -> list[str]:
-    """The command lines of a document: in blocks without a language."""
-    found, fence = [], None
+    """The command lines of a document, without their comments."""
+    return [line.partition("  #")[0].strip() for line in block_lines(document) if line.startswith(PROGRAMS)]
+
+
+def block_lines(document: Path) -> Iterator[str]:
+    """The lines of a document's blocks without a language."""
+    fence = None
     for line in document.read_text().splitlines():
         if line.startswith("```"):
             fence = line if fence is None else None
-        elif fence == "```" and line.startswith(PROGRAMS):
-            found.append(line.partition("  #")[0].strip())
-    return found
+        elif fence == "```":
+            yield line
 
 
 # A command of two documents is run for the first.
@@ -63,6 +68,12 @@ COMMANDS = {line: document for document in reversed(DOCUMENTS) for line in comma
 
 def test_commands_are_found() -> None:
     assert len(COMMANDS) > 40
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_a_command_begins_its_line(document: Path) -> None:
+    wrapped = [line for line in block_lines(document) if "tod-runner " in line and not line.startswith(PROGRAMS)]
+    assert wrapped == []
 
 
 @pytest.fixture(scope="module")
