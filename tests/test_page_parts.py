@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import inspect
 import json
 import math
 import socket
@@ -20,6 +22,10 @@ from runner.page.server import PageServer
 from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, PageViewer
 from runner.records import CameraSample, Position, Sample
 
+UPGRADE = (
+    "Connection: Upgrade\r\nUpgrade: websocket\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg=="
+)
 FULL = b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n"
 
 
@@ -45,7 +51,8 @@ def served():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    page = PageServer(vehicle(f"page.port={port}"), SimpleNamespace(state={}, note=print))
+    station = SimpleNamespace(state=None, note=print, answer_s=1.0)
+    page = PageServer(vehicle(f"page.port={port}"), station)
     page.start()
     try:
         yield port
@@ -82,6 +89,18 @@ def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
             assert line.recv(12) == b"HTTP/1.1 200"
     assert answer[:12] in (b"HTTP/1.1 403", b"HTTP/1.1 400")
     assert caplog.text == ""
+
+
+def test_no_viewer_is_waited_for_once_the_page_has_stopped():
+    """Python 3.11 may crash when it ends while a handler still waits."""
+    hello = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:PORT\r\n{UPGRADE}\r\n\r\n"
+    with socket.socket() as line:
+        with served() as port:
+            line.connect(("127.0.0.1", port))
+            line.sendall(hello.replace("PORT", str(port)).encode())
+            assert line.recv(12) == b"HTTP/1.1 101"
+        waiting = [it.__qualname__ for it in gc.get_objects() if inspect.iscoroutine(it) and it.cr_frame]
+    assert waiting == []
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():

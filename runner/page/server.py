@@ -99,7 +99,8 @@ class PageServer(Listener):
         self._control = Control()
         self._silent: set[RequestHandler] = set()  # new connections without a complete request
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
+        self._stopped = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     @property
     def url(self) -> str:
@@ -115,21 +116,31 @@ class PageServer(Listener):
     def stop(self) -> None:
         with suppress(TimeoutError):  # a connection that does not close ends with the process
             asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(STOP_S)
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._in_page(self._stopped.set)
         self._thread.join(STOP_S)
 
     def on_state(self, state: VehicleState | None) -> None:
-        self._loop.call_soon_threadsafe(self._tell, "state", state_to_json(state))
+        self._in_page(self._tell, "state", state_to_json(state))
 
     def on_sample(self, sample: Sample) -> None:
-        self._loop.call_soon_threadsafe(self._add_sample, sample)
+        self._in_page(self._add_sample, sample)
 
     def on_note(self, note: Note) -> None:
-        self._loop.call_soon_threadsafe(self._add_note, {"time": note.t, "text": note.text})
+        self._in_page(self._add_note, {"time": note.t, "text": note.text})
 
     def show(self, camera: str, unit: AccessUnit) -> None:
         """A newly received access unit."""
-        self._loop.call_soon_threadsafe(self._show, self._index[camera], unit)
+        self._in_page(self._show, self._index[camera], unit)
+
+    def _in_page(self, callback: Callable[..., object], *values: object) -> None:
+        """Call it in the page's thread, unless the page has stopped."""
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(callback, *values)
+
+    def _run(self) -> None:
+        """Serve until stopped, then cancel what still waits: Python 3.11 may crash on it when the process ends."""
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._stopped.wait())
 
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
@@ -333,7 +344,7 @@ class PageServer(Listener):
             viewer.tell("reply", {"id": identity, "result": result, "reason": reason})
 
         def on_reply(outcome: Outcome) -> None:
-            self._loop.call_soon_threadsafe(answer, outcome.result, outcome.reason)
+            self._in_page(answer, outcome.result, outcome.reason)
 
         problem = self._problem(viewer.token, identity, document.get("event"))
         if problem:

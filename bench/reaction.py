@@ -1,0 +1,109 @@
+"""How soon the encoders follow a link whose rate halves, by transport.
+
+  sudo python bench/reaction.py OUT                    6 minutes; one transport: --only SRT
+
+Three cameras, predictions of 4 Mbit/s that never change, 20 ms each way. The link carries 4.4 Mbit/s, and every 12 s
+half of that for 4 s. A row for each transport: time from each fall until the total is at most the new rate, the longest
+queue that the fall left, and packets lost. OUT keeps the drives; what is there is not driven again. Run it on an
+otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from uplinks import driven, row
+
+from runner.drive.read import Drive, read_drive
+from runner.drive.series import series
+from runner.drive.statistics import statistics
+from runner.records import DecisionMade, LinkSample
+from runner.system.files import write_whole
+
+WIDE_KBPS, NARROW_KBPS = 4400, 2200
+WIDE_S, NARROW_S = 8, 4
+ONE_WAY_MS = 20
+LIMIT_MS = 2 * ONE_WAY_MS + 250  # at 40 Hz; one frame interval more at lower rates
+TRANSPORTS = {
+    "RTSP/UDP": ("graph=h264_rtsp",),
+    "RTSP/TCP": ("graph=h264_rtsp", "+graph.receiver.0.properties.protocols=tcp"),
+    "SRT": ("graph=h264_srt",),
+}
+DRIVE = (
+    *("vehicle=delivery_robot", "pqos=constant", "pqos.kbps=4000"),
+    *("link=netns", "link.share=1", "link.queue_ms=300", f"link.delay_ms={ONE_WAY_MS}"),
+    f"link.reverse={{kbps: 20000, queue_ms: 300, delay_ms: {ONE_WAY_MS}}}",
+)
+
+
+class Reaction(NamedTuple):
+    """To one fall: s until the total is at most the new rate (inf: never), and the longest queue until then, ms."""
+
+    seconds: float
+    queue_ms: float
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("output", type=Path)
+    options.add_argument("--falls", type=int, default=10)
+    options.add_argument("--fps", type=int, default=40)
+    options.add_argument("--only", nargs="*", choices=TRANSPORTS, default=[*TRANSPORTS])
+    asked = options.parse_args()
+    asked.output.mkdir(parents=True, exist_ok=True)
+    trace = asked.output.resolve() / "halves.csv"
+    rows = (
+        (0, WIDE_KBPS),
+        (WIDE_S - NARROW_S, WIDE_KBPS),
+        (WIDE_S, NARROW_KBPS),
+    )  # the last as long as its neighbour
+    write_whole(trace, "\n".join(["t_s,kbps", *(f"{t},{kbps}" for t, kbps in rows)]).encode())
+    fps = [f"cameras.{name}.fps={asked.fps}" for name in ("front", "rear", "mast")]
+    seconds = asked.falls * (WIDE_S + NARROW_S)
+    limit = LIMIT_MS + (0 if asked.fps >= 40 else 1000 / asked.fps)
+    print(row("transport", f"median ms (at most {limit:.0f})", "p95", "longest", "longest queue ms, median", "lost"))
+    print(row(*["---"] * 6), flush=True)
+    for name in asked.only:
+        path = asked.output / name.replace("/", "_").lower()
+        driven(path, [*DRIVE, *TRANSPORTS[name], *fps, f"link.file={trace}", f"duration_s={seconds}"])
+        drive = read_drive(path)
+        found = reactions(drive)
+        ms = [1000 * reaction.seconds for reaction in found]
+        lost = statistics(series(drive, "")).lost
+        waits = median(reaction.queue_ms for reaction in found)
+        longest = f"{max(ms):.0f}"
+        print(row(name, f"{median(ms):.0f}", f"{np.percentile(ms, 95):.0f}", longest, f"{waits:.0f}", str(lost)))
+
+
+def reactions(drive: Drive) -> list[Reaction]:
+    """To each fall of the link."""
+    samples = list(drive.sides["link"].of(LinkSample))
+    decisions = list(drive.sides["vehicle"].of(DecisionMade))
+    end = decisions[-1].t - NARROW_S
+    falls = [after.t for before, after in pairwise(samples) if after.kbps < before.kbps and after.t < end]
+    return [_reaction(fall, decisions, samples) for fall in map(_as_planned, falls)]
+
+
+def _as_planned(t: float) -> float:
+    """When the trace falls: the log shows it up to 0.1 s later."""
+    period = WIDE_S + NARROW_S
+    return period * (t // period) + WIDE_S
+
+
+def _reaction(fall: float, decisions: list[DecisionMade], samples: list[LinkSample]) -> Reaction:
+    until = fall + NARROW_S
+    in_force = [line.total_kbps for line in decisions if line.t <= fall][-1]
+    if in_force <= NARROW_KBPS:
+        raise SystemExit(f"the total was {in_force} kbit/s before the link fell at {fall:g} s: nothing to react to")
+    low = (line.t for line in decisions if fall < line.t < until and line.total_kbps <= NARROW_KBPS)
+    seconds = next(low, np.inf) - fall
+    return Reaction(seconds, max(sample.queue_ms for sample in samples if fall <= sample.t < until))
+
+
+if __name__ == "__main__":
+    main()
