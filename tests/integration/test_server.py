@@ -233,32 +233,27 @@ def test_every_url_of_a_camera_leads_to_its_one_pipeline():
         vehicle.turn(sending=True)
 
 
+FFMPEG = "ffmpeg -v error -rtsp_transport {} -i {{url}} -frames:v 5 -f null -"
+
+
 @pytest.mark.parametrize(
-    "words",
+    ("line", "has_played"),
     [
-        ["ffmpeg", "-v", "error", "-rtsp_transport", "tcp", "-i", "{url}", "-frames:v", "5", "-f", "null", "-"],
-        ["ffmpeg", "-v", "error", "-rtsp_transport", "udp", "-i", "{url}", "-frames:v", "5", "-f", "null", "-"],
-        [
-            "gst-launch-1.0",
-            "-q",
-            "rtspsrc",
-            "location={url}",
-            "!",
-            "rtph264depay",
-            "!",
-            "identity",
-            "eos-after=5",
-            "!",
-            "fakesink",
-        ],
+        (FFMPEG.format("tcp"), lambda done: done.returncode == 0),
+        (FFMPEG.format("udp"), lambda done: done.returncode == 0),
+        # After its end rtspsrc (1.22) may fail to send PAUSE on a connection that is open: 2 of 104 times when busy.
+        (
+            "gst-launch-1.0 -m rtspsrc location={url} ! rtph264depay ! identity eos-after=5 ! fakesink",
+            lambda done: "(eos)" in done.stdout,
+        ),
     ],
     ids=["ffmpeg over TCP", "ffmpeg over UDP", "rtspsrc"],
 )
-def test_players_follow_to_the_url_that_is_right(words):
+def test_players_follow_to_the_url_that_is_right(line, has_played):
     with serving() as vehicle, watched(vehicle):
-        words = [word.format(url=f"{vehicle.url()}?x=1") for word in words]
+        words = line.format(url=f"{vehicle.url()}?x=1").split()
         done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
+        assert has_played(done), done.stderr
         assert vehicle.pipelines() == 1
 
 
