@@ -73,7 +73,7 @@ def decoded(path, whole=True):
     whole  nothing was lost in transit: ffmpeg must accept the file and print nothing to standard error
     """
     raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000"]
-    raw += ["-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
+    raw += ["-noautoscale", "-f", "rawvideo", "-y", "/dev/null"]
     command = ["ffmpeg", "-v", "error", "-xerror", "-i", path, *raw]
     if whole:
         checked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
