@@ -9,7 +9,7 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -154,7 +154,8 @@ def started(image: Image, network: str, place: Path, keys: Path, words: Sequence
         yield Container(image, process, pid, place / "output", place / "log")
     finally:
         for left in processes_in(image.root):  # the kernel ends none with its parent after a change of user
-            os.kill(left, signal.SIGKILL)
+            with suppress(ProcessLookupError):
+                os.kill(left, signal.SIGKILL)
         process.kill()
         process.wait()
         until(lambda: not list(processes_in(image.root)), LIMIT_S)
