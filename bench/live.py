@@ -24,6 +24,7 @@ from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.core.model import Vehicle
 from runner.gst import Gst, knobs
+from runner.gst.caps import structure
 from runner.operator.meter import middle, percentile
 from runner.plans import compile_plans, render_missing
 
@@ -159,7 +160,7 @@ def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
         return Gst.PadProbeReturn.OK
 
     def on_frame(pad: Any, _info: Any) -> Any:
-        picture = pad.get_current_caps().get_structure(0)
+        picture = structure(pad.get_current_caps())
         width, height = picture.get_int("width")[1], picture.get_int("height")[1]
         samples.append((time.time(), width, height, sizes[-1]))
         return Gst.PadProbeReturn.OK

@@ -19,6 +19,7 @@ from typing import NamedTuple
 from runner.configuration.config import configuration
 from runner.graph import launch
 from runner.gst import Gst
+from runner.gst.caps import structure
 
 FRAMES = 60
 RUNS = 3
@@ -60,7 +61,7 @@ def decode(clip: Path, raw: Path) -> tuple[int, int]:
     )
     pipeline.set_state(Gst.State.PLAYING)
     pipeline.get_bus().timed_pop_filtered(Gst.CLOCK_TIME_NONE, Gst.MessageType.EOS | Gst.MessageType.ERROR)
-    caps = pipeline.get_by_name("size").get_static_pad("src").get_current_caps().get_structure(0)
+    caps = structure(pipeline.get_by_name("size").get_static_pad("src").get_current_caps())
     pipeline.set_state(Gst.State.NULL)
     return caps.get_int("width")[1], caps.get_int("height")[1]
 

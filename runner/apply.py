@@ -71,11 +71,11 @@ STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
 def check_machine(plans: Sequence[Plan]) -> None:
-    """Check that every plugin is installed and every source opens: files, devices.
+    """Check that every plugin of the vehicle's side is installed and every source opens: files, devices.
 
     raises  RunError with the remedy, for all cameras at once
     """
-    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan))
+    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, ("vehicle",)))
     if missing:
         raise RunError("\n".join(missing))
     refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _source_problem(plan))]
@@ -152,7 +152,7 @@ class _Glib:
         self._thread.join(timeout=5)
 
 
-def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
+def _kept(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
     """The plans to build: each with a file, if video is kept.
 
     raises  RunError with the packages to install
@@ -160,7 +160,7 @@ def _kept(plans: Sequence[Plan], video: VideoFiles | None) -> Sequence[Plan]:
     if video is None:
         return plans
     plans = [replace(plan, video=True) for plan in plans]
-    if missing := dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan)):
+    if missing := dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, (side,))):
         raise RunError("\n".join(missing))
     return plans
 
@@ -186,7 +186,7 @@ class VehicleSide:
     ) -> None:
         self._on_report, self._video = on_report, video
         passphrase = keyring.passphrase if keyring else None
-        plans = _kept(plans, video)
+        plans = _kept(plans, video, "vehicle")
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
@@ -333,7 +333,7 @@ class OperatorSide:
         keyring: Keyring | None = None,
         vehicle: str = "",
     ) -> None:
-        plans = _kept(plans, video)
+        plans = _kept(plans, video, "operator")
         self._glib = _Glib()
         self._gathered = gathered = Gathered(on_report)
         login: StreamLogin | None = None

@@ -207,13 +207,15 @@ def decode(clip: Path) -> tuple[Any, list[int]]:
     gi.require_version("Gst", "1.0")
     from gi.repository import Gst
 
+    from runner.gst.caps import structure
+
     Gst.init(None)
     line = f"filesrc location={clip} ! qtdemux ! h264parse ! avdec_h264 ! appsink name=sink sync=false"
     pipeline, times, caps = Gst.parse_launch(line), [], None
     pipeline.set_state(Gst.State.PLAYING)
     while sample := pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND):
         times.append(sample.get_buffer().pts)
-        caps = sample.get_caps().get_structure(0).copy()
+        caps = structure(sample.get_caps())
     pipeline.set_state(Gst.State.NULL)
     return caps, times
 

@@ -11,6 +11,7 @@ from gi.repository import Gst
 from runner.core.commands import KnobValue
 from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
+from runner.gst.caps import structure
 
 ANOTHER_RATIO = (60001, 60000)  # of 16 bits each; below 30000 px no player rounds it to another pixel
 
@@ -68,7 +69,7 @@ class KnobPanel:
                 return
             for name, _, _ in self._assignments(knob, self.applied[knob]):
                 caps = self._by_name[name].get_property("caps").copy()
-                _, above, below = caps.get_structure(0).get_fraction("pixel-aspect-ratio")
+                _, above, below = structure(caps).get_fraction("pixel-aspect-ratio")
                 caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if above != below else ANOTHER_RATIO)))
                 self._by_name[name].set_property("caps", caps)
 

@@ -14,6 +14,7 @@ from fractions import Fraction
 from gi.repository import GLib, Gst
 
 from runner.errors import RunError
+from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
 from runner.gst.pipeline import counted
 from runner.lanes import FRAMES, LaneSet
@@ -127,7 +128,7 @@ def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFram
 
 
 def _check_form(run: _Run, caps: Gst.Caps) -> None:
-    picture = caps.get_structure(0)
+    picture = structure(caps)
     form = f"{picture.get_int('width')[1]}x{picture.get_int('height')[1]}"
     if run.form and form != run.form:
         run.failed = run.failed or RunError(f"the size changes from {run.form} to {form} within the sequence")

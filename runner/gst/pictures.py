@@ -11,6 +11,7 @@ from gi.repository import Gst, GstVideo
 from numpy.typing import NDArray
 
 from runner.errors import RunError
+from runner.gst.caps import structure
 from runner.system.files import file_problem
 
 LumaPlane = NDArray[np.uint8]  # height x width
@@ -20,7 +21,7 @@ SILENT = 100  # consecutive waits without a picture, EOS or error before the fil
 
 def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
     """A copy of the first plane of a picture with one byte per sample."""
-    picture = caps.get_structure(0)
+    picture = structure(caps)
     width, height = picture.get_int("width")[1], picture.get_int("height")[1]
     meta: Any = GstVideo.buffer_get_video_meta(buffer)
     stride, offset = (meta.stride[0], meta.offset[0]) if meta else (-(-width // 4) * 4, 0)

@@ -12,6 +12,7 @@ from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import KEPT, NTP_EPOCH_S, RTP_HZ, MediaClock
+from runner.gst.caps import structure
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -266,7 +267,7 @@ class Receiver:
     def _count(self) -> Reception:
         before = self._before
         caps = self._sink.get_static_pad("sink").get_current_caps()
-        picture = caps.get_structure(0) if caps else None
+        picture = structure(caps) if caps else None
         return Reception(
             frames=self._frames,
             bytes=self._bytes,
@@ -331,7 +332,7 @@ class Receiver:
 
     def _on_sample(self, sink: Gst.Element) -> Gst.FlowReturn:
         sample = sink.emit("pull-sample")
-        picture, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
+        picture, buffer = structure(sample.get_caps()), sample.get_buffer()
         width, height = picture.get_int("width")[1], picture.get_int("height")[1]
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]

@@ -9,6 +9,7 @@ from enum import Enum
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.pipeline import counted
@@ -132,7 +133,7 @@ class Recorder:
         # The counter is read last: a frame that passes meanwhile must not appear to be missing.
         end, frames = self._end or (self._out.query_position(Gst.Format.TIME)[1], counted(self._counter)[0])
         seconds = max(0, end - self._first) / Gst.SECOND
-        picture = self._out.get_current_caps().get_structure(0)
+        picture = structure(self._out.get_current_caps())
         return Recorded(
             frames=frames,
             seconds=seconds,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 
@@ -28,9 +28,10 @@ HARDWARE = {"vah264enc": "va", "nvh264enc": "nvcodec"}  # plugin by element that
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
 
 
-def missing_plugins(plan: Plan) -> list[str]:
-    """One sentence for each known element that streaming needs and this machine lacks."""
-    return _missing((*plan.source, *plan.vehicle, *plan.operator, *plan.video_elements))
+def missing_plugins(plan: Plan, sides: Sequence[str] = ("vehicle", "operator")) -> list[str]:
+    """One sentence for each known element that streaming needs on these sides and this machine lacks."""
+    needed = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}
+    return _missing((*(element for side in sides for element in needed[side]), *plan.video_elements))
 
 
 def missing_recorders(plan: Plan) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from gi.repository import Gst
 
+from runner.gst.caps import structure
 from runner.gst.outage import Outage
 
 SLICES, SLICE_BYTES = 16, 8192  # of a picture that are compared: the noise of a sensor is everywhere
@@ -53,7 +54,7 @@ class RepeatedPicture:
 
 def _is_readable(caps: Gst.Caps) -> bool:
     in_memory = caps.get_features(0).contains(Gst.CAPS_FEATURE_MEMORY_SYSTEM_MEMORY)
-    return bool(in_memory and caps.get_structure(0).get_name() == "video/x-raw")
+    return bool(in_memory and structure(caps).get_name() == "video/x-raw")
 
 
 def _digest(picture: Gst.Buffer) -> int:

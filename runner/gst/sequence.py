@@ -9,6 +9,7 @@ from pathlib import Path
 from gi.repository import GLib, Gst, GstPbutils
 
 from runner.errors import UserError
+from runner.gst.caps import structure
 from runner.system.files import file_problem
 
 TIMEOUT_S = 20
@@ -60,5 +61,5 @@ def discover(path: Path, where: str) -> Form:
         height=stream.get_height(),
         fps=Fraction(stream.get_framerate_num(), stream.get_framerate_denom()),
         codec=str(GstPbutils.pb_utils_get_codec_description(caps)),
-        lossless=caps.get_structure(0).get_name() in LOSSLESS,
+        lossless=structure(caps).get_name() in LOSSLESS,
     )

@@ -50,6 +50,9 @@ OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
 )
 
+# From 1.24 on a factory returns its media locked. The same change of the library added this method.
+CONSTRUCTS_LOCKED = hasattr(GstRtspServer.RTSPMedia, "can_be_shared")
+
 
 class _Stage(Enum):
     """State of a camera's pipeline."""
@@ -282,6 +285,8 @@ class CameraServer:
                 self._changed.wait_for(lambda: camera.stage is not _Stage.ENDING, GONE_S)
             thread = self._threads.get_thread(GstRtspServer.RTSPThreadType.MEDIA, GstRtspServer.RTSPContext())
             media = camera.factory.construct(camera.url)
+            if media is not None and CONSTRUCTS_LOCKED:
+                media.unlock()
             opening.failed = media is None or not media.prepare(thread)
             if media is not None and not opening.failed:
                 opening.held.wait(HELD_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 
 from gi.repository import GLib, Gst
@@ -10,6 +11,11 @@ from runner.graph import Plan
 
 CHECK_MS = 1000
 BEHIND_S = 0.3  # a longer lag of a clip is written off, not caught up
+
+# Not by PyGObject: from GStreamer 1.26 on the reference that its own object holds makes a query immutable.
+_set_latency = ctypes.CDLL("libgstreamer-1.0.so.0").gst_query_set_latency
+_set_latency.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_uint64, ctypes.c_uint64)  # query, live, min, max
+_set_latency.restype = None
 
 
 def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
@@ -123,10 +129,9 @@ def _report_no_latency(pad: Gst.Pad) -> None:
     """A frame of a clip counts as captured when it is released: decoding ahead of time is not latency."""
 
     def on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        query = info.get_query()
-        if query.type != Gst.QueryType.LATENCY:
+        if info.get_query().type != Gst.QueryType.LATENCY:
             return Gst.PadProbeReturn.OK
-        query.set_latency(True, 0, Gst.CLOCK_TIME_NONE)
+        _set_latency(info.data, True, 0, Gst.CLOCK_TIME_NONE)
         return Gst.PadProbeReturn.HANDLED
 
     pad.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, on_query)

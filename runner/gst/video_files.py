@@ -150,12 +150,11 @@ def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     Otherwise an encoder would choose the format that the file prefers, and the sink of the stream would hold packets
     back until the slowest branch is ready.
     """
-    query = info.get_query()
-    if query.type == Gst.QueryType.CAPS:
+    asked = info.get_query().type
+    if asked == Gst.QueryType.CAPS:
         return Gst.PadProbeReturn.DROP  # without an answer the element assumes no limit
-    if query.type == Gst.QueryType.LATENCY:
-        query.set_latency(False, 0, Gst.CLOCK_TIME_NONE)
-        return Gst.PadProbeReturn.HANDLED
+    if asked == Gst.QueryType.LATENCY:
+        return Gst.PadProbeReturn.HANDLED  # answered unchanged: no latency
     return Gst.PadProbeReturn.OK
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.errors import RunError
+from runner.gst.caps import structure
 from runner.gst.stream_times import RestoredTimes, stream_times
 from runner.system.files import file_problem
 
@@ -58,7 +59,7 @@ def read_video(path: Path) -> Iterator[Unit]:
 
 def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     """The demuxer has found the stream: insert the parser for its codec before the sink. Not called per frame."""
-    codec = pad.get_current_caps().get_structure(0).get_name().removeprefix("video/x-")
+    codec = structure(pad.get_current_caps()).get_name().removeprefix("video/x-")
     if codec not in _PARSED or out.get_static_pad("sink").is_linked():
         return  # the waiting consumer gets no units
     parse = Gst.parse_bin_from_description(_PARSED[codec], True)
@@ -84,7 +85,7 @@ def _pulled(pipeline: Gst.Pipeline, path: Path, times: RestoredTimes) -> Iterato
             continue
         silent, buffer = 0, sample.get_buffer()
         if not codec:
-            codec, first = sample.get_caps().get_structure(0).get_name().removeprefix("video/x-"), buffer.pts
+            codec, first = structure(sample.get_caps()).get_name().removeprefix("video/x-"), buffer.pts
         if buffer.pts == Gst.CLOCK_TIME_NONE:
             continue  # a unit whose beginning is damaged
         demuxed_ns = buffer.pts - first

@@ -80,7 +80,7 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         bindings = list(_bindings())
         yield from bindings
         if all(finding.fine for finding in bindings):
-            yield from _elements(vehicle)
+            yield from _elements(verb, vehicle)
     if verb == "demo":
         yield _broker()
     yield from _ports(verb, vehicle)
@@ -97,6 +97,11 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield "page"
     if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
         yield "synthetic"
+    if verb in ("vehicle", "operator", "latency", "demo"):
+        yield from ["security"] if vehicle.keys is not None else []
+    ports = {"vehicle": vehicle.metrics.vehicle_port, "operator": vehicle.metrics.operator_port}
+    if any(port is not None and verb in (side, "demo") for side, port in ports.items()):
+        yield "metrics"
     if verb == "model":
         study = document["study"]
         yield from ["vmaf"] if "vmaf" in study["metric"] else []
@@ -113,13 +118,22 @@ def _bindings() -> Iterator[Diagnosis]:
         yield from (Diagnosis(True, f"typelib {name}") for name in apply.TYPELIBS)
 
 
-def _elements(vehicle: Vehicle) -> Iterator[Diagnosis]:
+def _elements(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
+    """GStreamer's elements: of one side for its own verb, otherwise all."""
     from runner.apply import missing_plugins, missing_recorders
 
-    plans = compile_plans(vehicle)
-    lines = [line for plan in plans for line in (plan.source, plan.vehicle, plan.operator, plan.recorder)]
+    lines, missing = [], dict[str, None]()
+    for plan in compile_plans(vehicle):
+        if verb == "operator":
+            lines += [plan.operator]
+            missing |= dict.fromkeys(missing_plugins(plan, ("operator",)))
+        elif verb == "vehicle":
+            lines += [plan.source, plan.vehicle]
+            missing |= dict.fromkeys(missing_plugins(plan, ("vehicle",)))
+        else:
+            lines += [plan.source, plan.vehicle, plan.operator, plan.recorder]
+            missing |= dict.fromkeys((*missing_plugins(plan), *missing_recorders(plan)))
     names = {element.factory for line in lines for element in line}
-    missing = dict.fromkeys(s for plan in plans for s in (*missing_plugins(plan), *missing_recorders(plan)))
     yield from (Diagnosis(False, sentence) for sentence in missing)
     if not missing:
         yield Diagnosis(True, f"{len(names)} GStreamer elements")

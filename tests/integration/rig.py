@@ -303,8 +303,9 @@ class Client:
 
     def __init__(self, plan: Any, *, pictures: bool = False) -> None:
         from runner.gst import Gst
+        from runner.gst.caps import structure
 
-        self._gst = Gst
+        self._gst, self._structure = Gst, structure
         line = plan.receiver
         if pictures:
             head, _, _ = line.rpartition(" ! ")
@@ -320,7 +321,7 @@ class Client:
         self.pipeline.set_state(Gst.State.PLAYING)
 
     def _on_frame(self, pad: Any, _info: Any) -> Any:
-        picture = pad.get_current_caps().get_structure(0)
+        picture = self._structure(pad.get_current_caps())
         self.sizes.append((picture.get_int("width")[1], picture.get_int("height")[1]))
         self.times.append(time.monotonic())
         return self._gst.PadProbeReturn.OK
@@ -335,7 +336,7 @@ class Client:
         import numpy as np
 
         sample = self._sink.emit("try-pull-sample", 5 * self._gst.SECOND)
-        caps = sample.get_caps().get_structure(0)
+        caps = self._structure(sample.get_caps())
         width, height = caps.get_int("width")[1], caps.get_int("height")[1]
         data = sample.get_buffer().extract_dup(0, sample.get_buffer().get_size())
         stride = len(data) // height

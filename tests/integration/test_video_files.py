@@ -20,6 +20,7 @@ from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import ConfigError
 from runner.gst import Gst, video_files
+from runner.gst.caps import structure
 from runner.gst.clocks import captured_at
 from runner.plans import compile_plans
 
@@ -72,7 +73,7 @@ def decoded(path, whole=True):
     whole  nothing was lost in transit: ffmpeg must accept the file and print nothing to standard error
     """
     raw = ["-fps_mode", "passthrough", "-enc_time_base", "1:90000"]
-    raw += ["-autoscale", "0", "-f", "rawvideo", "-y", "/dev/null"]
+    raw += ["-noautoscale", "-f", "rawvideo", "-y", "/dev/null"]
     command = ["ffmpeg", "-v", "error", "-xerror", "-i", path, *raw]
     if whole:
         checked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
@@ -184,7 +185,7 @@ def test_the_file_does_not_affect_the_stream(sides):
             caps = until(lambda: pipeline.get_by_name("sent").get_static_pad("src").get_current_caps())
             query = Gst.Query.new_latency()
             assert pipeline.query(query)
-            form = caps.get_structure(0)
+            form = structure(caps)
             return form.get_string("stream-format"), form.get_string("alignment"), tuple(query.parse_latency())
         finally:
             pipeline.set_state(Gst.State.NULL)

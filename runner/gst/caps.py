@@ -1,0 +1,16 @@
+"""Caps, read the same with any version of GStreamer's Python bindings."""
+
+from gi.repository import Gst
+
+
+def structure(caps: Gst.Caps) -> Gst.Structure:
+    """A copy of the first structure of caps.
+
+    Until 1.24 `get_structure` returns the structure itself, whose memory belongs to the caps. From 1.26 on gst-python
+    wraps it in a context manager that keeps the caps alive.
+    """
+    found = caps.get_structure(0)
+    if isinstance(found, Gst.Structure):
+        return found.copy()
+    with found as own:
+        return own.copy()
