@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
+DIALLED_S = 1.0  # the same where the vehicle dials: it calls again, and a listener holds on to its first caller
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -117,6 +118,7 @@ class Receiver:
         self._damage, self._damaged = Damage(self._codec), 0
         self._frames = self._bytes = 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
+        self._stall_s = STALL_S if plan.serves else DIALLED_S
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
@@ -156,9 +158,9 @@ class Receiver:
             self._silent = now
         if received.frames != self._moved[0] or self.should_send is False:
             self._moved = (received.frames, now)
-        elif self.should_send and now - self._moved[1] > STALL_S and now - self._silent > GRACE_S:
+        elif self.should_send and now - self._moved[1] > self._stall_s and now - self._silent > GRACE_S:
             self._moved = (received.frames, now)
-            self._supervised.restart(f"no frame for {STALL_S:g} s")
+            self._supervised.restart(f"no frame for {self._stall_s:g} s")
         else:
             return received
         if not self._inspects:  # only one frame in many: no Python runs for the others

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import select
 import socket
@@ -106,7 +107,7 @@ class ControlLink:
         """
         if not self._listening.is_set():
             return True
-        if self._login and self._login.has_changed():
+        if self._has_moved() or (self._login and self._login.has_changed()):
             self._drop_connection()
             return True
         if not behind and _is_one_of(SUPERSEDED, topic) and self.is_behind():
@@ -133,6 +134,22 @@ class ControlLink:
             return not poll.poll(0)
         except (OSError, TypeError, ValueError):  # the connection has just been lost
             return False
+
+    def _has_moved(self) -> bool:
+        """Whether this machine has given up the address that the connection uses, as a modem that roams does.
+
+        Its packets go nowhere then, which TCP would notice after STALLED_S only.
+        """
+        sock = self._client.socket()
+        try:
+            own, _, *scope = sock.getsockname()  # type: ignore[union-attr]  # None is an AttributeError
+            with socket.socket(sock.family, socket.SOCK_DGRAM) as probe:  # type: ignore[union-attr]
+                probe.bind((own, 0, *scope))
+                return False
+        except AttributeError:  # the connection has just been lost
+            return False
+        except OSError as error:
+            return error.errno == errno.EADDRNOTAVAIL
 
     def _drop_connection(self) -> None:
         """The loop then connects again."""
