@@ -90,7 +90,7 @@ class Site:
         ssh.write_text(f'#!/bin/sh\ntest "$1" = vehicle && shift && exec {inside} sh -c "$*"\n')
         ssh.chmod(0o700)
         self._environment = f"RSYNC_RSH={ssh}"
-        self._public: dict[str, str] = {}
+        self.other: dict[str, str] = {}  # what stands in files in place of the document's text
 
     def shell(self, where: str, text: str) -> str:
         """What a command line printed on one machine."""
@@ -102,15 +102,15 @@ class Site:
 
     def write(self, file: File) -> None:
         text = file.text
-        for whose, public in self._public.items():
-            text = text.replace(f"{whose.upper()}S_PUBLIC_KEY", public)
+        for written, other in self.other.items():
+            text = text.replace(written, other)
         self.machines[file.where].run(f"install -m 600 /dev/stdin {file.path}", text)
 
     def follow(self, line: Line) -> None:
         for where in self.machines if line.where == "both" else (line.where,):
             output = self.shell(where, line.text)
             if line.text.endswith("wg pubkey"):
-                self._public[where] = output.strip()
+                self.other[f"{where.upper()}S_PUBLIC_KEY"] = output.strip()
 
     def prepare(self, heading: str) -> dict[str, list[str]]:
         """Follow a recipe until both sides can be started; returns the words of each, shortened."""
@@ -143,12 +143,12 @@ class Site:
 
 
 @contextmanager
-def watched(site: Site, heading: str) -> Iterator[Watch]:
-    """A drive by a recipe, once pictures of both cameras and answers have come."""
-    words = site.prepare(heading)
-    watch = Watch(site.machines["operator"], site.homes["operator"], words["operator"])
+def watched(site: Site, heading: str, *words: str) -> Iterator[Watch]:
+    """A drive by a recipe, once pictures of both cameras and answers have come. words: further ones of both sides"""
+    starts = site.prepare(heading)
+    watch = Watch(site.machines["operator"], site.homes["operator"], [*starts["operator"], *words])
     try:
-        with site.driving(words["vehicle"]):
+        with site.driving([*starts["vehicle"], *words]):
             until(lambda: len(watch.times) == 3 and min(map(len, watch.times.values())) > 20, every_s=0.1)
             yield watch
     finally:
