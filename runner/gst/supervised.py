@@ -17,7 +17,7 @@ from runner.gst.pipeline import Build, CameraPipeline, encrypt
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to end, whose port it needs
 STOPPING_MS = 20  # how often it looks
-WATCH_MS = 250
+WATCH_MS = 250  # how often a caller's acknowledgements are counted
 UNANSWERED_S = 1.5  # packets that nobody acknowledges for so long go nowhere; SRT itself takes 5 s to see it
 PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for this long
 

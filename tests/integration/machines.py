@@ -20,7 +20,7 @@ from rig import CHECKOUT, WAIT_S
 from runner.link.netns import _inside
 from runner.system import children
 
-AWAY_S = 0.4  # between two pictures, or two answers, of ten a second
+AWAY_S = 1.0  # without a picture, or an answer, of more than ten a second; a busy machine is late by less
 # What a machine changes in these directories only it sees, and it is gone with it.
 OWN = "mount -t tmpfs own /run; for own in etc var; do mkdir -p /run/own/$own /run/own/work.$own; " + (
     "mount -t overlay own -o lowerdir=/$own,upperdir=/run/own/$own,workdir=/run/own/work.$own /$own; done; "
