@@ -117,16 +117,14 @@ class _Acknowledged:
     def __init__(self, element: Gst.Element) -> None:
         self._element = element
         self._watched = element.find_property("stats") is not None
-        self._before = (0, 0)  # packets sent, acknowledgements received
-        self._since = time.monotonic()  # the last acknowledgement, or the last time nothing was sent
+        self._answers = self._answered = 0  # acknowledgements, and packets that had been sent when the last one came
+        self._since = time.monotonic()  # the last acknowledgement, or the last time there was nothing to acknowledge
 
     def is_missing(self, now: float) -> bool:
-        """Whether packets go out and none was acknowledged for UNANSWERED_S; a few times a second."""
-        counts = self._counts()
-        sent, answered = (new != old for new, old in zip(counts, self._before, strict=True))
-        self._before = counts
-        if answered or not sent:
-            self._since = now
+        """Whether packets went out and none was acknowledged for UNANSWERED_S; a few times a second."""
+        sent, answers = self._counts()
+        if answers != self._answers or sent <= self._answered:
+            self._answers, self._answered, self._since = answers, sent, now
         return now - self._since > UNANSWERED_S
 
     def _counts(self) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
-STALLED_S = 2  # a connection without progress for this long is dropped
+STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
@@ -259,6 +259,6 @@ def _settle(_client: object, _data: object, sock: Any) -> None:
     if isinstance(sock, socket.socket):
         # Without this, small messages are held back for 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STALLED_S))
         # A socket that is behind is writable again when half of this is left.
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * UNSENT_BYTES)

@@ -107,6 +107,8 @@ class Mobile:
         operator.run(f"ip addr add {OPERATOR}/24 dev eth0")
         if translated:
             carrier.run("nft -f -", TRANSLATING)
+            # Once forgotten, a TCP connection is not answered any more, not even by a reset.
+            carrier.run("sysctl -qw net.netfilter.nf_conntrack_tcp_loose=0")
         else:
             operator.run("ip route add 100.64.0.0/24 via 198.51.100.1")
         self._address = 1
