@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
+DIALLED_S = 1.0  # the same where the vehicle dials: it calls again, and a listener holds on to its first caller
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -118,6 +119,8 @@ class Receiver:
         self._damage, self._damaged = Damage(self._codec), 0
         self._frames = self._bytes = 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
+        self._is_dialled = not plan.serves
+        self._stall_s = DIALLED_S if self._is_dialled else STALL_S
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counts of earlier pipelines
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
@@ -127,6 +130,7 @@ class Receiver:
         self._built = self._inspects = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
         self._silent = time.monotonic()  # when the camera was last not expected to send
+        self._was_sending = False  # expected to, as of the last sample
         self.should_send: bool | None = None  # None: unknown while the vehicle is offline
 
     def start(self) -> None:
@@ -153,19 +157,30 @@ class Receiver:
         now = time.monotonic()
         if self._login and self._login.is_withdrawn():
             self._supervised.restart("the vehicle's keys are not accepted any more")
-        if not self.should_send:
+        expected = self._was_sending = self._is_expected()
+        if not expected:
             self._silent = now
         if received.frames != self._moved[0] or self.should_send is False:
             self._moved = (received.frames, now)
-        elif self.should_send and now - self._moved[1] > STALL_S and now - self._silent > GRACE_S:
+        elif expected and now - self._moved[1] > self._stall_s and now - self._silent > GRACE_S:
             self._moved = (received.frames, now)
-            self._supervised.restart(f"no frame for {STALL_S:g} s")
+            self._supervised.restart(f"no frame for {self._stall_s:g} s")
         else:
             return received
         if not self._inspects:  # only one frame in many: no Python runs for the others
             self._inspects = True
             self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         return received
+
+    def _is_expected(self) -> bool:
+        """Whether frames should come.
+
+        While the vehicle is offline that is unknown. A caller may be gone together with its control link, though, and has
+        to find a listener that holds on to no other one: a stream that flowed is expected until it is built anew.
+        """
+        if self.should_send is None and self._is_dialled:
+            return self._was_sending and self._begun
+        return bool(self.should_send)
 
     @property
     def newest(self) -> Arrival | None:

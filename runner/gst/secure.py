@@ -102,7 +102,7 @@ class StreamLogin:
         keyring = self._keyring
         client.set_property("tls-interaction", _Certificate(own_certificate(keyring)))
         # Nobody else's certificate is signed by this one: none is accepted without the signal.
-        client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate)))
+        client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate.absolute())))
         client.set_property("user-id", keyring.holder.name)
         client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
         client.connect("accept-certificate", self._accept)

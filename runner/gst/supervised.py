@@ -16,6 +16,9 @@ from runner.gst.pipeline import Build, CameraPipeline, encrypt
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to end, whose port it needs
+STOPPING_MS = 20  # how often it looks
+WATCH_MS = 250  # how often a caller's acknowledgements are counted
+UNANSWERED_S = 1.5  # packets that nobody acknowledges for so long go nowhere; SRT itself takes 5 s to see it
 PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for this long
 
 
@@ -38,7 +41,7 @@ class SupervisedPipeline:
         self._change: threading.Thread | None = None  # the last state change of the last pipeline
         self._retry = 0
         self._attempt = 0
-        self._begun = time.monotonic()  # the last attempt
+        self._begun = self._ended = time.monotonic()  # of the last attempt, its start and its end
         self._lost = self._begun  # since when nothing has worked
         self._works = self._worked = False  # this pipeline, any pipeline
         self._outage = Outage(on_report)
@@ -71,7 +74,7 @@ class SupervisedPipeline:
         """Tear down now, rebuild soon."""
         if self._retry:
             return
-        now = time.monotonic()
+        now = self._ended = time.monotonic()
         if self._works:
             self.rebuilt += 1
             self._lost = now
@@ -81,8 +84,8 @@ class SupervisedPipeline:
         self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._again)
 
     def _again(self) -> bool:
-        if self._change and self._change.is_alive() and time.monotonic() - self._begun < RETRY_S + STOPPED_S:
-            self._retry = GLib.timeout_add(100, self._again)
+        if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
+            self._retry = GLib.timeout_add(STOPPING_MS, self._again)
             return False
         self._retry = 0
         self.start()
@@ -104,6 +107,33 @@ class SupervisedPipeline:
         return False
 
 
+class _Acknowledged:
+    """Whether what a caller sends is acknowledged, by the statistics of an SRT element; any other is not watched.
+
+    When the vehicle's address changes, or what a NAT has mapped it to, the peer drops the packets of a connection that
+    SRT (1.5) takes for alive until sixteen timers of 0.3 s have expired, whatever `peeridletimeo` says.
+    """
+
+    def __init__(self, element: Gst.Element) -> None:
+        self._element = element
+        self._watched = element.find_property("stats") is not None
+        self._answers = self._answered = 0  # acknowledgements, and packets that had been sent when the last one came
+        self._since = time.monotonic()  # the last acknowledgement, or the last time there was nothing to acknowledge
+
+    def is_missing(self, now: float) -> bool:
+        """Whether packets went out and none was acknowledged for UNANSWERED_S; a few times a second."""
+        sent, answers = self._counts()
+        if answers != self._answers or sent <= self._answered:
+            self._answers, self._answered, self._since = answers, sent, now
+        return now - self._since > UNANSWERED_S
+
+    def _counts(self) -> tuple[int, int]:
+        stats = self._element.get_property("stats") if self._watched else None
+        if stats is None or not stats.has_field("packet-ack-received"):  # it has no connection yet
+            return 0, 0
+        return stats.get_value("packets-sent"), stats.get_value("packet-ack-received")
+
+
 class CameraCaller:
     """One camera's supervised pipeline on the vehicle.
 
@@ -121,13 +151,22 @@ class CameraCaller:
 
     def start(self) -> None:
         self._supervised.start()
+        self._watch = GLib.timeout_add(WATCH_MS, self._look)
 
     def stop(self) -> None:
+        GLib.source_remove(self._watch)
         self.pipeline = None
         self._supervised.stop()
+
+    def _look(self) -> bool:
+        if self._acknowledged.is_missing(time.monotonic()):
+            self._supervised.restart(f"nothing was acknowledged for {UNANSWERED_S:g} s")
+        return True
 
     def _on_built(self, pipeline: Any) -> Gst.Pad:
         if self._passphrase:
             encrypt(pipeline, self._passphrase)
         self.pipeline = self._build(pipeline, self._plan)
-        return pipeline.get_by_name(self._plan.vehicle[-1].name).get_static_pad("sink")
+        caller = pipeline.get_by_name(self._plan.vehicle[-1].name)
+        self._acknowledged = _Acknowledged(caller)
+        return caller.get_static_pad("sink")

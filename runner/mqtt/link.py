@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import select
 import socket
@@ -23,7 +24,7 @@ from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
-STALLED_S = 2  # a connection without progress for this long is dropped
+STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
@@ -106,7 +107,7 @@ class ControlLink:
         """
         if not self._listening.is_set():
             return True
-        if self._login and self._login.has_changed():
+        if self._has_moved() or (self._login and self._login.has_changed()):
             self._drop_connection()
             return True
         if not behind and _is_one_of(SUPERSEDED, topic) and self.is_behind():
@@ -133,6 +134,22 @@ class ControlLink:
             return not poll.poll(0)
         except (OSError, TypeError, ValueError):  # the connection has just been lost
             return False
+
+    def _has_moved(self) -> bool:
+        """Whether this machine has given up the address that the connection uses, as a modem that roams does.
+
+        Its packets go nowhere then, which TCP would notice after STALLED_S only.
+        """
+        sock = self._client.socket()
+        try:
+            own, _, *scope = sock.getsockname()  # type: ignore[union-attr]  # None is an AttributeError
+            with socket.socket(sock.family, socket.SOCK_DGRAM) as probe:  # type: ignore[union-attr]
+                probe.bind((own, 0, *scope))
+                return False
+        except AttributeError:  # the connection has just been lost
+            return False
+        except OSError as error:
+            return error.errno == errno.EADDRNOTAVAIL
 
     def _drop_connection(self) -> None:
         """The loop then connects again."""
@@ -242,6 +259,6 @@ def _settle(_client: object, _data: object, sock: Any) -> None:
     if isinstance(sock, socket.socket):
         # Without this, small messages are held back for 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * STALLED_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STALLED_S))
         # A socket that is behind is writable again when half of this is left.
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * UNSENT_BYTES)

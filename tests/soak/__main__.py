@@ -1,5 +1,5 @@
 """Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports of any kind, clocks that drift apart.
+new sizes, garbage, reports of any kind, clocks that drift apart, addresses that change.
 
     make soak                           everything, about an hour on two cores
     SOAK=0.1 make soak                  a tenth of it
@@ -25,6 +25,7 @@ import kills
 import openings
 import readers
 import reports
+import roaming
 import signals
 import sizes
 import stalls
@@ -41,6 +42,7 @@ PARTS: dict[str, Part] = {
     "hostile": hostile.soak,
     "reports": reports.soak,
     "clocks": clocks.soak,
+    "roaming": roaming.soak,
 }
 
 

@@ -1,0 +1,174 @@
+"""Machines with a network of their own: namespaces of the kernel, with addresses, cables, translation of addresses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from bisect import bisect
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from math import inf
+from pathlib import Path
+
+from rig import CHECKOUT, WAIT_S
+from runner.link.netns import _inside
+from runner.system import children
+
+AWAY_S = 1.0  # without a picture, or an answer, of more than ten a second; a busy machine is late by less
+# What a machine changes in these directories only it sees, and it is gone with it.
+OWN = "mount -t tmpfs own /run; for own in etc var; do mkdir -p /run/own/$own /run/own/work.$own; " + (
+    "mount -t overlay own -o lowerdir=/$own,upperdir=/run/own/$own,workdir=/run/own/work.$own /$own; done; "
+)
+VEHICLE, CARRIER, OPERATOR = "100.64.0.{}", "100.64.0.1", "198.51.100.10"  # RFC 6598 and RFC 5737
+TRANSLATING = """\
+table ip nat {
+  chain postrouting {
+    type nat hook postrouting priority srcnat;
+    oifname out0 meta l4proto { tcp, udp } masquerade to :20000-60000 fully-random
+  }
+}
+"""
+
+
+class Machine:
+    """A network namespace and a mount namespace, which the kernel removes with the last process in them.
+
+    command  prefix of a command line that is to run there, in the checkout
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        enter = ("unshare", "--net", "--mount", "sh", "-ec", f"{OWN} echo; exec sleep infinity")
+        self._holder = subprocess.Popen(children.bound(enter), stdout=subprocess.PIPE, text=True)
+        assert self._holder.stdout
+        assert self._holder.stdout.readline() == "\n"
+        pid = self._holder.pid
+        self.namespace = f"/proc/{pid}/ns/net"
+        self._enter = ("nsenter", f"--target={pid}", "--net", "--mount")
+        self.command = self.inside(CHECKOUT)
+        self.run("ip link set dev lo up")
+
+    def inside(self, directory: Path) -> Sequence[str]:
+        """The prefix of a command line that is to run in a directory there; it finds `tod-runner`."""
+        path = f"PATH={Path(sys.executable).parent}:{os.environ['PATH']}:/usr/sbin:/sbin"
+        return (*self._enter, "env", "-C", str(directory), path)
+
+    def run(self, words: str, given: str | None = None) -> str:
+        """Standard output of a command. given: its standard input"""
+        command = [*self.command, *words.split()]
+        done = subprocess.run(command, capture_output=True, text=True, input=given, timeout=WAIT_S, check=False)
+        assert done.returncode == 0, f"{self.name}: {words}: {done.stderr}"
+        return done.stdout
+
+    def end(self) -> None:
+        for pid in _inside(os.stat(self.namespace).st_ino):
+            os.kill(pid, signal.SIGKILL)
+        self._holder.wait()
+
+
+@contextmanager
+def machines(*names: str) -> Iterator[list[Machine]]:
+    with ExitStack() as stack:
+        made = []
+        for name in names:
+            made.append(Machine(name))
+            stack.callback(made[-1].end)
+        yield made
+
+
+def cable(one: Machine, device: str, other: Machine, other_device: str) -> None:
+    """Connect two machines by devices without addresses."""
+    peer = f"peer name {other_device} netns {other.namespace}"
+    command = f"ip link add {device} netns {one.namespace} type veth {peer}"
+    subprocess.run(command.split(), check=True, timeout=WAIT_S)
+    for machine, name in ((one, device), (other, other_device)):
+        machine.run(f"ip link set dev {name} up")
+
+
+class Mobile:
+    """A vehicle in a carrier's network, and an operator elsewhere.
+
+    translated  whether the carrier hides the vehicle behind its own address (NAT); otherwise it routes
+    """
+
+    def __init__(self, vehicle: Machine, carrier: Machine, operator: Machine, translated: bool) -> None:
+        self.vehicle, self.carrier, self.operator = vehicle, carrier, operator
+        cable(vehicle, "wan0", carrier, "in0")
+        cable(carrier, "out0", operator, "eth0")
+        carrier.run(f"ip addr add {CARRIER}/24 dev in0")
+        carrier.run("ip addr add 198.51.100.1/24 dev out0")
+        carrier.run("sysctl -qw net.ipv4.ip_forward=1")
+        operator.run(f"ip addr add {OPERATOR}/24 dev eth0")
+        if translated:
+            carrier.run("nft -f -", TRANSLATING)
+            # Once forgotten, a TCP connection is not answered any more, not even by a reset.
+            carrier.run("sysctl -qw net.netfilter.nf_conntrack_tcp_loose=0")
+        else:
+            operator.run("ip route add 100.64.0.0/24 via 198.51.100.1")
+        self._address = 1
+        self.move()
+
+    def move(self) -> None:
+        """Give the vehicle an address that it did not have."""
+        self._address += 1
+        leave = f"addr del {VEHICLE.format(self._address - 1)}/24 dev wan0\n" if self._address > 2 else ""
+        own = f"addr add {VEHICLE.format(self._address)}/24 dev wan0\n"
+        self.vehicle.run("ip -batch -", f"{leave}{own}route add default via {CARRIER}\n")
+
+    def rebind(self) -> None:
+        """Let the carrier forget every connection; each gets a new port of its address with its next packet."""
+        self.carrier.run("conntrack -F")
+
+
+@contextmanager
+def mobile(translated: bool) -> Iterator[Mobile]:
+    with machines("vehicle", "carrier", "operator") as made:
+        yield Mobile(*made, translated)
+
+
+class Watch:
+    """What `remote_operator.py` sees: times of the monotonic clock of each picture of a camera, and of `control`."""
+
+    def __init__(self, operator: Machine, directory: Path, words: Sequence[str]) -> None:
+        script = Path(__file__).with_name("remote_operator.py")
+        self.times: dict[str, list[float]] = {}
+        self.notes: list[str] = []
+        self._process = subprocess.Popen(
+            [*operator.inside(directory), sys.executable, str(script), *words],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=children.environment(),
+        )
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        for line in self._process.stdout:
+            told = json.loads(line)
+            if note := told.get("note"):
+                self.notes.append(f"{told['t']:.2f} {note}")
+            else:
+                self.times.setdefault(told["what"], []).append(told["t"])
+
+    def back(self, since: float) -> dict[str, float]:
+        """By camera, and for `control`: how long after a moment it was back for good, s; inf: it is not.
+
+        That is the next picture or answer that no gap of AWAY_S follows.
+        """
+        now, found = time.monotonic(), {}
+        for what, times in self.times.items():
+            moments = [*times[bisect(times, since) - 1 :], now]
+            gaps = [(a, b) for a, b in pairwise(moments) if b - a > AWAY_S]
+            last = gaps[-1][1] if gaps else moments[1]
+            found[what] = inf if last == now else last - since
+        return found
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.wait()
