@@ -8,6 +8,7 @@ prediction says; latencies are right to within their bound, or unknown; no proce
 from __future__ import annotations
 
 import json
+import random
 import tempfile
 import threading
 import time
@@ -31,9 +32,11 @@ from runner.security.authority import VALID, Authority
 
 BACK_S, LONG_BACK_S, LONG_S = 3.0, 5.0, 20.0  # after the end of the cause, and after one that lasted so long
 MISSED = 3  # frames of a camera that the cause does not concern
+STALE_S = 1.5  # control.expires_s and the round trip
 FPS = 15
 QUIET_S = 4.0  # before and after a fault, to count frames
 WAIT_S = 20.0
+SETTINGS = 10
 STEP_S = 5.0  # by which clocks are set, forwards and backwards
 QUICKEST_MS, SLOWEST_MS = 1.0, 1000.0  # that a picture can take here, on a busy machine
 PREDICTED = tuple(range(3000, 1500, -100))  # kbit/s, each for a second, again and again
@@ -119,12 +122,12 @@ class Paths(threading.Thread):
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    """A tenth of it cuts the link once for each time; all of it repeats everything."""
+    """Each fault once, at a scale of 1 three times."""
     problems: list[str] = []
     rounds = max(1, round(3 * scale))
     mark = uuid.uuid4().hex
     with tempfile.TemporaryDirectory(prefix="tod-soak-outages-") as directory, ExitStack() as stack:
-        drive = stack.enter_context(_drive(Path(directory), mark))
+        drive = stack.enter_context(_drive(Path(directory), mark, random.Random(seed)))
         print(f"{'fault':40}" + "".join(f"{name:>10}" for name in ("control", *CAMERAS, *CAMERAS)))
         for _ in range(rounds):
             for fault in drive.faults():
@@ -132,7 +135,6 @@ def soak(seed: int, scale: float) -> list[str]:
                 print(row, flush=True)
                 problems += row.problems
         problems += drive.system.tracebacks()
-        problems += drive.wrong_reports()
         problems += _ends(drive.system, mark)
     return problems
 
@@ -151,10 +153,16 @@ class _Drive:
     """A drive with keys over a link that can be cut."""
 
     def __init__(
-        self, system: System, operator: Operator, paths: Paths, passing: list[bool], clocks: dict[str, Path]
+        self,
+        dice: random.Random,
+        system: System,
+        operator: Operator,
+        paths: Paths,
+        passing: list[bool],
+        clocks: dict[str, Path],
     ) -> None:
-        self.system, self._operator, self._paths = system, operator, paths
-        self._passing, self._clocks = passing, clocks
+        self._dice, self.system, self._operator, self._paths = dice, system, operator, paths
+        self._passing, self._clocks, self._asked_at = passing, clocks, 0.0
 
     def faults(self) -> Iterator[Fault]:
         for cut_s in (0.2, 2.0, LONG_S):
@@ -163,6 +171,7 @@ class _Drive:
             for ahead_s in (STEP_S, 0.0):
                 what = f"{side}'s clock set {'forwards' if ahead_s else 'back'} by {STEP_S:g} s"
                 yield Fault(what, lambda s=side, a=ahead_s: set_clock(self._clocks[s], a))  # type: ignore[misc]
+            yield Fault(f"{side}'s clock set {SETTINGS} times", lambda s=side: self._set_often(s))  # type: ignore[misc]
         yield Fault("broker restarted", self._restart_broker)
         yield Fault("all keys replaced, broker restarted", self._replace_keys, cuts=True)
         self._replace_keys(timedelta(seconds=EXPIRE_S))
@@ -176,8 +185,8 @@ class _Drive:
         time.sleep(QUIET_S)
         begin, at = time.monotonic(), self.system.operator_log.stat().st_size
         stale = f"stale{begin}"
-        if fault.lasts_s >= 2:  # longer than a request may wait
-            threading.Timer(0.1, lambda: self._operator.send(stale, event="weights_set", weights={"rear": 1})).start()
+        if fault.cuts:
+            threading.Timer(fault.lasts_s / 10, self._ask_late, (stale,)).start()
         fault.cause()
         end = time.monotonic()
         limit_s = LONG_BACK_S if fault.lasts_s >= LONG_S else BACK_S
@@ -195,10 +204,21 @@ class _Drive:
         missed = {name: self._paths.missed(name, begin, all_back) for name in CAMERAS}
         if not fault.cuts:
             problems += [f"{name} missed {n:.1f} frames, limit {MISSED}" for name, n in missed.items() if n > MISSED]
-        if self._operator.replies.get(stale, {}).get("result") == "applied":
-            problems.append("a request of before the outage was applied after it")
-        problems += self._wrong_latencies(at)
+        problems += self._late(stale)
+        problems += self._wrong_latencies(at, SLOWEST_MS + 1000 * fault.lasts_s)
         return Row(fault, back, missed, [f"{fault.name}: {problem}" for problem in problems])
+
+    def _ask_late(self, identity: str) -> None:
+        """A request that waits for the end of the cause on its way."""
+        self._asked_at = self._operator.as_of()
+        self._operator.send(identity, event="weights_set", weights={"rear": 1})
+
+    def _late(self, identity: str) -> list[str]:
+        """Whether such a request was applied though it had waited for too long."""
+        reply = self._operator.replies.get(identity)
+        if reply is None or reply["result"] != "applied" or reply["t"] - self._asked_at < STALE_S:
+            return []
+        return [f"a request was applied {reply['t'] - self._asked_at:.1f} s after it was made"]
 
     # --- causes -------------------------------------------------------------------------------------------------------
 
@@ -206,6 +226,13 @@ class _Drive:
         self._passing.append(False)
         time.sleep(seconds)
         self._passing.append(True)
+
+    def _set_often(self, side: str) -> None:
+        """At random moments: latencies must be right whatever comes between two comparisons of the clocks."""
+        for _ in range(SETTINGS):
+            time.sleep(self._dice.uniform(0.3, 1.2))
+            set_clock(self._clocks[side], self._dice.choice((-STEP_S, 0.0, STEP_S)))
+        set_clock(self._clocks[side], 0.0)
 
     def _restart_broker(self) -> None:
         self.system.processes["broker"].kill()
@@ -245,7 +272,7 @@ class _Drive:
             and all(camera["sending"] and camera["applied"].get("bitrate") == camera["kbps"] for camera in cameras)
         )
 
-    def _wrong_latencies(self, since: int) -> list[str]:
+    def _wrong_latencies(self, since: int, slowest_ms: float) -> list[str]:
         """Latencies that the operator was shown since an offset of its log, and that no picture had."""
         with self.system.operator_log.open("rb") as file:
             file.seek(since)
@@ -255,22 +282,19 @@ class _Drive:
             f"{name} {camera['latency_ms']:.1f} ± {sample['clock_bound_ms']} ms"
             for sample in samples
             for name, camera in sample["cameras"].items()
-            if camera["latency_ms"] is not None and not is_possible(camera["latency_ms"], sample["clock_bound_ms"])
+            if camera["latency_ms"] is not None
+            and not is_possible(camera["latency_ms"], sample["clock_bound_ms"], slowest_ms)
         ]
         return [f"{len(wrong)} latencies are wrong, as {wrong[0]}"] if wrong else []
 
-    def wrong_reports(self) -> list[str]:
-        """Latencies that were reported to the vehicle, and that no picture had."""
-        return []
 
-
-def is_possible(latency_ms: float, bound_ms: float | None) -> bool:
+def is_possible(latency_ms: float, bound_ms: float | None, slowest_ms: float) -> bool:
     """Whether a picture can have had a latency, stated with a bound."""
-    return bound_ms is not None and latency_ms + bound_ms >= QUICKEST_MS and latency_ms - bound_ms <= SLOWEST_MS
+    return bound_ms is not None and latency_ms + bound_ms >= QUICKEST_MS and latency_ms - bound_ms <= slowest_ms
 
 
 @contextmanager
-def _drive(directory: Path, mark: str) -> Iterator[_Drive]:
+def _drive(directory: Path, mark: str, dice: random.Random) -> Iterator[_Drive]:
     passing = [True]
 
     def kbps(t: float) -> float:
@@ -292,6 +316,6 @@ def _drive(directory: Path, mark: str) -> Iterator[_Drive]:
             paths = Paths(system, operator)
             paths.start()
             try:
-                yield _Drive(system, operator, paths, passing, clocks)
+                yield _Drive(dice, system, operator, paths, passing, clocks)
             finally:
                 paths.stop()
