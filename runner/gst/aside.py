@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 from gi.repository import Gst
 
+from runner.system.memory import give_back
+
 HUNG_S = 5.0  # a state change that takes longer counts as hung
 HUNG = f"did not stop within {HUNG_S:g} s, and was abandoned"
 
@@ -35,6 +37,8 @@ def set_state_aside(
         if after:
             after.join()
         element.set_state(state)
+        if state == Gst.State.NULL:
+            give_back()
         watchdog.cancel()
         with _lock:
             _workers.discard(worker)

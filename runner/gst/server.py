@@ -24,6 +24,7 @@ from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
+from runner.system.memory import give_back
 from runner.system.ports import check_port_free
 
 if TYPE_CHECKING:
@@ -224,6 +225,7 @@ class CameraServer:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
+        give_back()
         self._on_report(camera.name, "pipeline stopped")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:

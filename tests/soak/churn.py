@@ -35,7 +35,8 @@ PER = 1000  # operations
 WAIT_S = 60.0
 FAILS = 12  # frames after which a source or a sender of this part fails
 RESIZE_S = 0.09  # between two sizes: longer than a frame, so that each is sent
-BREAK_S = 1.0  # mean time between two connections that break
+RECONNECT_S = 0.15  # between two viewers: those that leave without a word are dropped after some seconds
+BREAK_S = 0.4  # mean time between two connections that break
 # front's source fails, and rear's pipeline behind its encoder, as soon as each works again.
 SOURCE = f"""\
 frozen_s: 0.5
@@ -160,7 +161,9 @@ def _resized(operator: Operator, dice: random.Random) -> Iterator[int]:
 
 def _reconnected(system: System, dice: random.Random, problems: list[str]) -> Iterator[int]:
     """One viewer after the other, beside those of the operator."""
+    began = time.monotonic()
     for number in count(1):
+        time.sleep(max(0.0, began + RECONNECT_S * number - time.monotonic()))
         camera, udp = dice.choice(CAMERAS), dice.random() < 0.5
         with system.viewer(camera) as viewer:
             if (codes := viewer.open(udp=udp)) != [200, 200, 200]:
