@@ -2,7 +2,7 @@
 new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, and thousands of changes that must
 leave nothing behind.
 
-    make soak                           everything, about an hour on two cores
+    make soak                           everything, about an hour and a half on two cores
     SOAK=0.1 make soak                  a tenth of it
     SOAK_SEED=7 make soak               the same random choices again; the seed is printed
     make soak PARTS="stalls hostile"    some parts only
