@@ -6,14 +6,14 @@ import time
 
 from gi.repository import Gst
 
-from runner.system.kernel_clock import ahead_of
-
 
 def unix_time(clock: Gst.Clock, base_time: int, running: int) -> float:
     """A running time of a pipeline, as s since 1970.
 
     clock, base_time, running  the pipeline's clock; ns by it
     """
+    from runner.system.kernel_clock import ahead_of
+
     return float((ahead_of(clock.get_time) + base_time + running) / Gst.SECOND)
 
 

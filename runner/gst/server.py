@@ -20,11 +20,11 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
+from runner.gst.aside import give_back
 from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
-from runner.system.memory import give_back
 from runner.system.ports import check_port_free
 
 if TYPE_CHECKING:
