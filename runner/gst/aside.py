@@ -1,4 +1,4 @@
-"""State changes that may never return, kept off the thread that serves all cameras; what ended pipelines leave."""
+"""State changes that may never return, kept off the thread that serves all cameras, and memory that they free."""
 
 from __future__ import annotations
 
@@ -51,10 +51,11 @@ def set_state_aside(
 
 
 def give_back() -> None:
-    """Return the memory of an ended pipeline to the system; takes a few ms, see malloc_trim(3).
+    """Return freed memory to the system; takes a few ms, see malloc_trim(3).
 
     The GNU C library keeps up to eight arenas for each core, and a pipeline's threads free pictures in whichever they
-    were given. Each pipeline that is built anew would leave some MB behind. Other C libraries have no such function.
+    were given. Pipelines built anew, and encoders of new sizes, would leave some MB behind. Other C libraries have no
+    such function.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim:

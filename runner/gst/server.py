@@ -43,6 +43,7 @@ WATCH_MS = 200
 BLOCKED_S = 0.4  # a camera that sends nothing for that long, and three frame intervals, although it should
 LEFT_S = 10.0  # how long a camera that a viewer has left is looked after
 SESSIONS_EVERY_S = 1.0
+GIVE_BACK_S = 10.0  # between two times that memory of ended pipelines, and of encoders of other sizes, is given back
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
 OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.OK,
@@ -225,7 +226,6 @@ class CameraServer:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
-        give_back()
         self._on_report(camera.name, "pipeline stopped")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
@@ -489,8 +489,11 @@ class CameraServer:
 
         In a separate thread, since the end of the last session tears the pipeline down.
         """
-        pool = self._server.get_session_pool()
+        pool, given_back = self._server.get_session_pool(), time.monotonic()
         while not self._stopped.wait(SESSIONS_EVERY_S):
+            if time.monotonic() - given_back > GIVE_BACK_S:
+                give_back()
+                given_back = time.monotonic()
             self._keep_silent()
             pool.cleanup()
             # A DESCRIBE that is refused after all does not release its hold.

@@ -11,6 +11,7 @@ import tempfile
 import time
 import uuid
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import keyed
@@ -91,10 +92,9 @@ def _demos(dice: random.Random, count: int) -> list[str]:
             )
             at_s = dice.uniform(2, 5)
             time.sleep(at_s)
-            pid = demo.pid if victim == "demo" else _part(mark, demo.pid, victim)
-            if pid:
-                with suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
+            pid = demo.pid if victim == "demo" else until(partial(_part, mark, demo.pid, victim), 10 * START_S)
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
             began = time.monotonic()
             while (left := _left(mark, demo)) and time.monotonic() - began < END_S:
                 time.sleep(0.05)
@@ -112,7 +112,7 @@ def _demos(dice: random.Random, count: int) -> list[str]:
             text = output.read()
         if left:
             problems.append(f"{victim} killed: left {'; '.join(left.values())}")
-        elif pid and victim != "demo" and status in (0, None):
+        elif victim != "demo" and status in (0, None):
             problems.append(f"{victim} killed: status {status}")
         if "Traceback" in text:
             problems.append(f"{victim} killed: traceback {text[-500:]}")
