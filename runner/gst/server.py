@@ -37,6 +37,10 @@ OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it 
 HELD_S = 5.0  # how long an open camera waits for a later request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 GONE_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
+BACKLOG = 128  # connections that wait to be accepted; beyond the library's 5, a viewer's would be tried again after 1 s
+# Handshakes of TLS wait in a pool of ten threads, to which GLib adds slowly. Of clients that have made no request yet,
+# those are dropped that have been connected for so long; earlier if there are more of them than CROWD.
+FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
@@ -134,6 +138,7 @@ class CameraServer:
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
         self._server.set_service(str(media.port))
+        self._server.set_backlog(BACKLOG)
         self._threads = GstRtspServer.RTSPThreadPool()
         self._threads.set_max_threads(-1)  # one per client
         self._server.set_thread_pool(self._threads)
@@ -459,6 +464,7 @@ class CameraServer:
             self._unblock(name, now)
         if self._viewers:
             self._refresh_keys()
+            self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
             if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
                 self._close(connection, "its keys are not accepted any more")
@@ -467,6 +473,13 @@ class CameraServer:
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
         return True
+
+    def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
+        """Close those whose client makes no request, so that others find a thread for their handshake."""
+        silent = [each for connection in connections if (each := (connection.keeps_waiting(now), connection))[0] > 0]
+        for waits_s, connection in silent:
+            if waits_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
+                connection.close()
 
     def _refresh_keys(self) -> None:
         """New files may come one by one."""

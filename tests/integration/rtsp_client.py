@@ -7,6 +7,7 @@ import socket
 import ssl
 import threading
 import time
+from contextlib import suppress
 from hashlib import md5
 from itertools import pairwise
 from pathlib import Path
@@ -48,6 +49,14 @@ def tls(keys: Path) -> ssl.SSLContext:
     context.check_hostname = False
     context.load_cert_chain(ring.certificate, ring.key)
     return context
+
+
+def client_hello(keys: Path) -> bytes:
+    """The first message of a TLS client (RFC 8446, section 4.1.2)."""
+    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+    with suppress(ssl.SSLWantReadError):
+        tls(keys).wrap_bio(incoming, outgoing).do_handshake()
+    return outgoing.read()
 
 
 class RtspClient:

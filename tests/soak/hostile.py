@@ -14,7 +14,6 @@ import json
 import os
 import random
 import socket
-import ssl
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -26,7 +25,7 @@ import aiohttp
 import keyed
 from system import CAMERAS, System, Watched, running
 
-from rtsp_client import Digest, tls
+from rtsp_client import Digest, client_hello, tls
 
 COUNT = 10_000  # of each kind
 GROWTH_MB = 60.0
@@ -185,7 +184,7 @@ def rtsp(system: System, dice: random.Random, count: int) -> None:
 def handshakes(system: System, dice: random.Random, count: int) -> None:
     """Clients of RTSP server and broker that say nothing, garbage, or what begins a handshake, whole or broken."""
     assert system.keys
-    hello, silent = _hello(system.keys / keyed.WATCHER), deque[tuple[int, socket.socket]]()
+    hello, silent = client_hello(system.keys / keyed.WATCHER), deque[tuple[int, socket.socket]]()
     for _ in range(count):
         with suppress(OSError):
             port = dice.choice((system.media, system.broker.port))
@@ -204,14 +203,6 @@ def handshakes(system: System, dice: random.Random, count: int) -> None:
         with closing(sock):
             if port == system.media:
                 assert _closed(sock, began + SILENT_S), f"a client was silent for {SILENT_S:g} s and is connected"
-
-
-def _hello(own: Path) -> bytes:
-    """The first message of a TLS client (RFC 8446, section 4.1.2)."""
-    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-    with suppress(ssl.SSLWantReadError):
-        tls(own).wrap_bio(incoming, outgoing).do_handshake()
-    return outgoing.read()
 
 
 def _closed(sock: socket.socket, until: float) -> bool:
