@@ -27,14 +27,15 @@ from system import CAMERAS, System, running
 from rig import Operator, free_port, until
 
 RESIZES, RECONNECTS, REBUILDS = 10_000, 1000, 1000
-WARM = 0.2  # share of the operations before the line is fitted: caches, arenas and pools fill up
+# Operations before these: caches, arenas and pools fill up, and viewers that left without a word are dropped.
+WARM = {"resizes": 2000, "reconnects": 150, "rebuilds": 100}
 EVERY_S = 0.5
 BLOCKS = 20  # samples are averaged in so many blocks: those that follow each other are not independent
 CONFIDENT = 2.1  # standard errors: 95 % for the line through so many means
 PER = 1000  # operations
 WAIT_S = 60.0
 FAILS = 12  # frames after which a source or a sender of this part fails
-RESIZE_S = 0.09  # between two sizes: longer than a frame, so that each is sent
+RESIZE_S = 0.08  # between two sizes: longer than a frame, so that each is sent
 RECONNECT_S = 0.15  # between two viewers: those that leave without a word are dropped after some seconds
 BREAK_S = 0.4  # mean time between two connections that break
 # front's source fails, and rear's pipeline behind its encoder, as soon as each works again.
@@ -103,10 +104,11 @@ def soak(seed: int, scale: float) -> list[str]:
 
 
 def _measured(system: System, what: str, most: int, operations: Iterator[int]) -> list[str]:
-    """Problems while so many operations are done.
+    """Problems while so many operations are done, after the warm-up.
 
     operations  yields how many are done so far
     """
+    warm = WARM[what]
     held: dict[tuple[str, Kind], list[tuple[int, float]]] = {}
     began, due = time.monotonic(), 0.0
     for done in operations:
@@ -116,12 +118,12 @@ def _measured(system: System, what: str, most: int, operations: Iterator[int]) -
                 assert child.poll() is None, f"{name} ended"
                 for kind in KINDS:
                     held.setdefault((name, kind), []).append((done, kind.read(child.pid)))
-        if done >= most:
+        if done >= warm + most:
             break
-    print(f"  {most} {what} in {time.monotonic() - began:.0f} s; growth per {PER}:", flush=True)
+    print(f"  {warm + most} {what} in {time.monotonic() - began:.0f} s; growth per {PER}:", flush=True)
     problems = []
     for name in system.processes:
-        slopes = {kind: slope([s for s in held[name, kind] if s[0] >= WARM * most]) for kind in KINDS}
+        slopes = {kind: slope([s for s in held[name, kind] if s[0] >= warm]) for kind in KINDS}
         last = {kind: held[name, kind][-1][1] for kind in KINDS}
         words = (f"{last[kind]:8.1f} {kind.name} {s.value:+.2f} ± {s.error:.2f}" for kind, s in slopes.items())
         print(f"    {name:9}{''.join(words)}", flush=True)

@@ -32,7 +32,7 @@ GROWTH_MB = 60.0
 POOL = 4 + min(32, (os.cpu_count() or 1) + 4)  # threads
 SETTLE_S = 40.0  # sessions and half-finished requests expire
 SILENT, SILENT_S = 100, 15.0  # connections that say nothing at a time, and until the RTSP server has closed them
-ADMITTED_S = 2.0  # a viewer that comes meanwhile
+ADMITTED_S = 4.0  # a viewer that comes meanwhile
 
 
 class Size(NamedTuple):
