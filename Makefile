@@ -2,7 +2,7 @@
 # make test   install what is missing, then everything that CI runs
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
-# make soak   long repeats of what a drive must survive, an hour; SOAK=0.1 make soak is a tenth of it
+# make soak   long repeats of what a drive must survive, an hour and a half; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot  two drives over a recorded uplink: the picture of the README
 # make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
 VENV := .venv

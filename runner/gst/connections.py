@@ -31,7 +31,7 @@ class RtspConnection:
     viewer       its address and its operator
     cameras      what it watches, with the library's transport once it is set up
     interleaved  whether this connection also carries video
-    last_request monotonic time of its last complete request, s
+    last_request monotonic time of its last complete request, s; that of its start before the first
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
@@ -44,12 +44,16 @@ class RtspConnection:
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.interleaved = False
-        self.last_request = self._writable = time.monotonic()
+        self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = 0
         self._written: deque[tuple[float, int]] = deque()  # when, bytes ever written by then
 
     def __str__(self) -> str:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
+
+    def keeps_waiting(self, now: float) -> float:
+        """How long it has not made its first request, s: over TLS, perhaps in the middle of a handshake."""
+        return now - self.viewer.since if self.last_request == self._began else 0.0
 
     def identify(self, operator: str | None) -> None:
         self.viewer = self.viewer._replace(operator=operator or "")

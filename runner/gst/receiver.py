@@ -44,6 +44,7 @@ class Reception:
     width, height  px of the decoded picture, 0 before the first
     latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
                 first, and where it is not recent
+    latency_at  when that was, s by the monotonic clock
     buffer_ms   how long a picture waits for packets that are sent again; None: they are not, or the transport does it
     waited_ms   how long a sampled frame was in the jitter buffer; None: unknown, as without RTP
     decode_ms   from a sampled access unit to its picture; None: unknown
@@ -61,6 +62,7 @@ class Reception:
     width: int = 0
     height: int = 0
     latency_ms: float | None = None
+    latency_at: float | None = None
     buffer_ms: int | None = None
     waited_ms: float | None = None
     decode_ms: float | None = None
@@ -283,6 +285,7 @@ class Receiver:
         before = self._before
         caps = self._sink.get_static_pad("sink").get_current_caps()
         picture = structure(caps) if caps else None
+        latency_at, latency_ms = self._latency.reading() or (None, None)
         return Reception(
             frames=self._frames,
             bytes=self._bytes,
@@ -292,7 +295,8 @@ class Receiver:
             lost=before.lost + sum(buffer.lost for buffer in self._buffers),
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
-            latency_ms=self._latency.get(),
+            latency_ms=latency_ms,
+            latency_at=latency_at,
             decode_ms=self._decode.get(),
             rebuilt=self._supervised.rebuilt,
         )

@@ -20,6 +20,7 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
+from runner.gst.aside import give_back
 from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
@@ -36,12 +37,17 @@ OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it 
 HELD_S = 5.0  # how long an open camera waits for a later request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 GONE_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
+BACKLOG = 128  # connections that wait to be accepted; beyond the library's 5, a viewer's would be tried again after 1 s
+# Handshakes of TLS wait in a pool of ten threads, to which GLib adds slowly. Of clients that have made no request yet,
+# those are dropped that have been connected for so long; earlier if there are more of them than CROWD.
+FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
 BLOCKED_S = 0.4  # a camera that sends nothing for that long, and three frame intervals, although it should
 LEFT_S = 10.0  # how long a camera that a viewer has left is looked after
 SESSIONS_EVERY_S = 1.0
+GIVE_BACK_S = 10.0  # between two times that memory of ended pipelines, and of encoders of other sizes, is given back
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
 OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.OK,
@@ -135,6 +141,7 @@ class CameraServer:
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
         self._server.set_service(str(media.port))
+        self._server.set_backlog(BACKLOG)
         self._threads = GstRtspServer.RTSPThreadPool()
         self._threads.set_max_threads(-1)  # one per client
         self._server.set_thread_pool(self._threads)
@@ -462,6 +469,7 @@ class CameraServer:
             self._unblock(name, now)
         if self._viewers:
             self._refresh_keys()
+            self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
             if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
                 self._close(connection, "its keys are not accepted any more")
@@ -470,6 +478,13 @@ class CameraServer:
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
         return True
+
+    def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
+        """Close those whose client makes no request, so that others find a thread for their handshake."""
+        silent = [each for connection in connections if (each := (connection.keeps_waiting(now), connection))[0] > 0]
+        for waits_s, connection in silent:
+            if waits_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
+                connection.close()
 
     def _refresh_keys(self) -> None:
         """New files may come one by one."""
@@ -492,8 +507,11 @@ class CameraServer:
 
         In a separate thread, since the end of the last session tears the pipeline down.
         """
-        pool = self._server.get_session_pool()
+        pool, given_back = self._server.get_session_pool(), time.monotonic()
         while not self._stopped.wait(SESSIONS_EVERY_S):
+            if time.monotonic() - given_back > GIVE_BACK_S:
+                give_back()
+                given_back = time.monotonic()
             self._keep_silent()
             pool.cleanup()
             # A DESCRIBE that is refused after all does not release its hold.

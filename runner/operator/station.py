@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -46,13 +46,14 @@ from runner.records import (
     to_json,
 )
 from runner.security.keyring import Keyring
-from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange, latency
-from runner.system.kernel_clock import clock_error_s
+from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, ClockDifference, Exchange, latency
+from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S
 
 SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
 CLOCK_S = 0.2  # between two comparisons of the clocks
+READINGS = 8  # latencies of a camera that may still turn out to be right
 MOST_VEHICLES = 100  # whose names are remembered
 UNHEARD_S = 10.0  # for so long it may still hear this side: an outage of one direction must not end its streams
 FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
@@ -120,6 +121,11 @@ class Station:
         self._clocks = ClockComparison()
         self._clock_asked: deque[float] = deque(maxlen=round(KEPT_S / CLOCK_S))  # `sent` of reports without an answer
         self._clock_due = 0.0  # time.monotonic of the next
+        # By camera, latencies by both clocks, and when each was read: right once a later exchange shows that no clock
+        # was set meanwhile.
+        self._readings: dict[str, deque[tuple[float, float]]] = {name: deque(maxlen=READINGS) for name in self.meters}
+        self._wall_ahead_s = 0.0  # of the monotonic clock, at the newest exchange
+        self._set_back = float("-inf")  # when a capture time went back: the vehicle's clock had been set
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
         self._newest: Mapping[str, Arrival] = {}  # by camera
@@ -189,7 +195,10 @@ class Station:
     def captured_here(self, captured: float | None) -> float | None:
         """A capture time by the vehicle's clock, s since 1970, as this machine's clock shows it; None: unknown."""
         clock = self.clock  # another thread may replace it
-        return None if captured is None or clock is None else captured - clock.ahead_s
+        if captured is None or clock is None or self._was_set():
+            return None
+        here = captured - clock.ahead_s
+        return here if here <= time.time() + clock.bound_s else None  # a picture of the future: a clock has been set
 
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
@@ -208,7 +217,7 @@ class Station:
         self._look_for_vehicle(now)
         self._announce(now)  # the heartbeat
         self._compare_clocks(now)
-        samples = {name: self._with_latency(received) for name, received in samples.items()}
+        samples = {name: self._with_latency(name, received, now) for name, received in samples.items()}
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, self._camera(name))
         self.samples, self._sampled = samples, now
@@ -222,7 +231,8 @@ class Station:
 
     def report_reception(self, arrivals: Arrivals) -> None:
         """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread."""
-        now, self._newest = time.monotonic(), arrivals.newest
+        now = time.monotonic()
+        self._look_at_captures(arrivals.newest, now)
         frames = sorted((frame.arrived, name, frame) for name, some in arrivals.frames.items() for frame in some)
         if frames and self._delay_s is None:
             self._delay_s = frames[0][2].arrived - frames[0][2].captured
@@ -253,6 +263,8 @@ class Station:
         arrival and the last sampled one's to decoding; and by how much the next one is overdue.
         """
         clock, state, found = self.clock, self.state, []
+        if self._was_set():
+            return None
         wall = time.time() - now  # of the monotonic clock
         for name, camera in (state.cameras if state else {}).items():
             if not camera.sending:
@@ -284,13 +296,38 @@ class Station:
         with self._lock:
             before, self.clock = self.clock, self._clocks.difference(now)
         if self.clock is None and before is not None and self.state:
-            self.note(f"the vehicle has not stated its clock for {KEPT_S:g} s: latencies are unknown")
+            unstated = f"the vehicle has not stated its clock for {KEPT_S:g} s"
+            why = "a clock was set" if self._clocks.was_set else unstated
+            self.note(f"{why}: latencies are unknown")
 
-    def _with_latency(self, received: Any) -> StreamCounters:
+    def _with_latency(self, name: str, received: Any, now: float) -> StreamCounters:
         """Counters whose latency is by both clocks, made one by this machine's; None if their difference is unknown."""
-        latency_ms = latency(received.latency_ms, self.clock)
-        counters: StreamCounters = replace(received, latency_ms=latency_ms)
+        readings = self._readings[name]
+        if received.latency_ms is not None and (not readings or readings[-1][0] != received.latency_at):
+            readings.append((received.latency_at, received.latency_ms))
+        counters: StreamCounters = replace(received, latency_ms=self._latency_ms(readings, now))
         return counters
+
+    def _latency_ms(self, readings: Iterable[tuple[float, float]], now: float) -> float | None:
+        """The newest that is right; without the control link, which tells of clocks that were set, just the newest."""
+        silent = now - self._clocks.asked > CURRENT_S
+        recent = [(at, apart_ms) for at, apart_ms in readings if now - at <= CURRENT_S]
+        for at, apart_ms in reversed(recent):
+            latency_ms = latency(apart_ms, self.clock)
+            if latency_ms is not None and (silent or self._clocks.held(at - latency_ms / 1000, at)):
+                return latency_ms
+        return None
+
+    def _look_at_captures(self, newest: Mapping[str, Arrival], now: float) -> None:
+        """Notice a vehicle's clock that was set back before the next exchange shows it."""
+        before, self._newest = self._newest, newest
+        if any(name in before and arrival.captured < before[name].captured for name, arrival in newest.items()):
+            self._set_back = now
+
+    def _was_set(self) -> bool:
+        """Whether this machine's clock was set, or the vehicle's was set back, and no exchange has followed."""
+        set_back = self._clocks.asked < self._set_back and self._set_back > time.monotonic() - CURRENT_S
+        return set_back or abs(wall_ahead_s() - self._wall_ahead_s) > STEP_S + MOST_DRIFT * KEPT_S
 
     def _sample(self) -> Sample:
         telemetry = self._telemetry if self.state else None
@@ -364,15 +401,17 @@ class Station:
 
     def _on_clock(self, message: MqttMessage) -> None:
         returned, now, answer = time.time(), time.monotonic(), read_clock(message.payload)
+        own_set_s = wall_ahead_s()
         own_s = clock_error_s()
         errors_s = None if own_s is None or answer.error_s is None else own_s + answer.error_s
         with self._lock:
             if not message.retained and answer.sent in self._clock_asked:
                 self._clock_asked.remove(answer.sent)
-                set_s = (returned - now, answer.set_s)
+                set_s = (own_set_s, answer.set_s)
                 self._clocks.add(
                     now, Exchange(answer.sent, answer.received, answer.answered, returned, set_s, errors_s)
                 )
+                self._wall_ahead_s = own_set_s
 
     def _on_configuration(self, message: MqttMessage) -> None:
         """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""

@@ -60,9 +60,14 @@ class ClockComparison:
     exchange yields such an interval, whatever the delay in either direction, and the truth lies in all of them. An
     exchange of t seconds ago counts with its interval widened by what the clocks may have drifted apart since. Once
     either clock has been set, or slewed faster, only what comes after counts.
+
+    A clock that is set shows with the next exchange only. Until then, what has been read from it since the last one may
+    be wrong by any amount: see `held`.
     """
 
     def __init__(self) -> None:
+        self._set_at = float("-inf")  # when a clock was found to have been set
+        self._asked = float("-inf")
         self._intervals: deque[_Interval] = deque()
         self._set_s: tuple[float, float] | None = None
 
@@ -81,8 +86,24 @@ class ClockComparison:
         moved = max(abs(now - then) for now, then in zip(exchange.set_s, before, strict=True))
         if moved > allowed:
             self._intervals.clear()
+            self._set_at = at
         if moved < STEP_S:  # otherwise perhaps in the middle of this exchange
             self._intervals.append(interval)
+            self._asked = max(self._asked, at - (exchange.returned - exchange.sent))
+
+    def held(self, begin: float, end: float) -> bool:
+        """Whether no clock was set between two times, by the same clock: `difference` then holds for what was read."""
+        return self._set_at < begin and end <= self._asked
+
+    @property
+    def was_set(self) -> bool:
+        """Whether a clock was set after the newest exchange that counts."""
+        return self._set_at > self._asked
+
+    @property
+    def asked(self) -> float:
+        """When the newest exchange that counts was sent, by the same clock."""
+        return self._asked
 
     def difference(self, now: float) -> ClockDifference | None:
         """The difference at a time, by the same clock; None if nothing was exchanged for KEPT_S."""

@@ -1,13 +1,17 @@
-"""What the kernel knows about the error of its clock."""
+"""How far the wall clock is ahead of another one, and what the kernel knows about its error."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
+import time
+from collections.abc import Callable
 
 TIME_ERROR = 5  # state of a clock that is not synchronised (adjtimex(2))
 STA_NANO = 0x2000  # the offset is in ns, otherwise in us
 MICRO, NANO = 1e-6, 1e-9
+CLOSE_NS = 20_000  # two clocks read within this count as read simultaneously
+TRIES = 10
 
 
 class _Timex(ctypes.Structure):
@@ -22,6 +26,26 @@ class _Timex(ctypes.Structure):
         ("status", ctypes.c_int),
         ("reserve", ctypes.c_long * 32),
     )
+
+
+def ahead_of(read: Callable[[], int]) -> int:
+    """By how much the wall clock is ahead of another, ns.
+
+    Another thread may run between the two readings. So the wall clock is read before and after the other, several
+    times if that took long, and the closest reading counts.
+
+    read  reads the other clock, ns
+    """
+    readings: list[tuple[int, int]] = []  # duration of the reading, ns; difference at its middle
+    while len(readings) < TRIES and min(readings, default=(CLOSE_NS + 1, 0))[0] > CLOSE_NS:
+        before, there, after = time.time_ns(), read(), time.time_ns()
+        readings.append((after - before, (before + after) // 2 - there))
+    return min(readings)[1]
+
+
+def wall_ahead_s() -> float:
+    """By how much the wall clock is ahead of the monotonic clock, s: this changes when the wall clock is set."""
+    return NANO * ahead_of(time.monotonic_ns)
 
 
 def clock_error_s() -> float | None:

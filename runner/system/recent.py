@@ -21,5 +21,10 @@ class RecentValue(Generic[T]):
 
     def get(self) -> T | None:
         """The value; None if there is none, or it is older than CURRENT_S."""
+        newest = self.reading()
+        return newest[1] if newest else None
+
+    def reading(self) -> tuple[float, T] | None:
+        """When the value was set, s by the monotonic clock, and the value; None as in `get`."""
         newest = self._set  # another thread may replace it
-        return newest[1] if newest and time.monotonic() - newest[0] <= CURRENT_S else None
+        return newest if newest and time.monotonic() - newest[0] <= CURRENT_S else None

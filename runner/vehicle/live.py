@@ -42,7 +42,7 @@ from runner.plans import compile_plans, render_missing
 from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetry, VehicleState, to_json
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
-from runner.system.kernel_clock import clock_error_s
+from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import Reported, Request
@@ -250,7 +250,7 @@ class _VehicleControl:
         def state_clock() -> None:
             assert report.sent is not UNSET
             now = time.time()
-            answer = ClockAnswer(report.sent, received, now, now - time.monotonic(), clock_error_s())
+            answer = ClockAnswer(report.sent, received, now, wall_ahead_s(), clock_error_s())
             self._link.publish(asked, to_json(answer))
 
         self._live.loop.take(Reported(message.sender, report, None if report.sent is UNSET else state_clock))

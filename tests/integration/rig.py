@@ -67,10 +67,11 @@ SHIFTED = """\
 #include <dlfcn.h>
 #include <fcntl.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <sys/time.h>
 #include <time.h>
 #include <unistd.h>
-static long ahead_ns, began_ns; /* 0 in a process whose command line lacks SIDE */
+static volatile long *ahead_ns; /* shared with who sets the clock; 0 in a process whose command line lacks SIDE */
 static int (*own)(clockid_t, struct timespec *);
 static long monotonic_ns(void) {
   struct timespec now;
@@ -82,15 +83,16 @@ __attribute__((constructor)) static void look(void) {
   int file = open("/proc/self/cmdline", O_RDONLY), size = (int)read(file, line, sizeof line);
   close(file);
   for (int at = 0; at < size; at += (int)strlen(line + at) + 1)
-    if (!strcmp(line + at, SIDE)) ahead_ns = AHEAD_MS * 1000000L, began_ns = BEGAN_NS;
+    if (!strcmp(line + at, SIDE) && !ahead_ns)
+      ahead_ns = mmap(0, sizeof *ahead_ns, PROT_READ, MAP_SHARED, open(AHEAD_FILE, O_RDONLY), 0);
 }
 int clock_gettime(clockid_t id, struct timespec *t) {
   if (!own) own = dlsym(RTLD_NEXT, "clock_gettime");
   int failed = own(id, t);
-  if (failed || id != CLOCK_REALTIME) return failed;
-  long drift_ns = began_ns ? (monotonic_ns() - began_ns) / 1000 * FAST_PPM / 1000 : 0;
-  long ns = t->tv_nsec + ahead_ns + drift_ns;
-  t->tv_sec += ns / 1000000000, t->tv_nsec = ns % 1000000000;
+  if (failed || id != CLOCK_REALTIME || !ahead_ns) return failed;
+  long drift_ns = (monotonic_ns() - BEGAN_NS) / 1000 * FAST_PPM / 1000;
+  long ns = t->tv_sec * 1000000000 + t->tv_nsec + *ahead_ns + drift_ns;
+  t->tv_sec = ns / 1000000000, t->tv_nsec = ns % 1000000000;
   return 0;
 }
 int gettimeofday(struct timeval *t, void *zone) {
@@ -122,13 +124,25 @@ needs_root = pytest.mark.skipif(bool(_no_namespaces()), reason=_no_namespaces())
 
 
 def clock_ahead(directory: Path, seconds: float, verb: str = "vehicle", fast_ppm: int = 0) -> dict[str, str]:
-    """The environment in which CLOCK_REALTIME of one verb, alone or in a demo, is ahead, and too fast from now on."""
+    """The environment in which CLOCK_REALTIME of one verb, alone or in a demo, is ahead, and too fast from now on.
+
+    directory  of this clock, which `set_clock` sets while the process runs
+    """
+    directory.mkdir(exist_ok=True)
     (directory / "shifted.c").write_text(SHIFTED)
-    began = f"-DBEGAN_NS={time.monotonic_ns()}L"
-    values = (f'-DSIDE="{verb}"', f"-DAHEAD_MS={round(1000 * seconds)}", began, f"-DFAST_PPM={fast_ppm}")
+    (directory / "ahead").touch()
+    set_clock(directory, seconds)
+    began, ahead = f"-DBEGAN_NS={time.monotonic_ns()}L", f'-DAHEAD_FILE="{directory / "ahead"}"'
+    values = (f'-DSIDE="{verb}"', ahead, began, f"-DFAST_PPM={fast_ppm}")
     command = ["cc", "-shared", "-fPIC", *values, "-o", "shifted.so", "shifted.c", "-ldl"]
     subprocess.run(command, cwd=directory, check=True)
     return {"LD_PRELOAD": str(directory / "shifted.so")}
+
+
+def set_clock(directory: Path, seconds: float) -> None:
+    """Set how far ahead a clock of `clock_ahead` is, in the middle of whatever reads it."""
+    with (directory / "ahead").open("r+b") as file:
+        file.write(round(1e9 * seconds).to_bytes(8, sys.byteorder, signed=True))
 
 
 # Below the ephemeral range of Linux: a client might take one of those before a side under test has bound it.
@@ -192,13 +206,19 @@ class RecordingListener(Listener):
 
 
 class Operator:
-    """An operator's end of the control link, as a program would implement it."""
+    """An operator's end of the control link, as a program would implement it.
 
-    def __init__(self, broker: Any, vehicle: str = "delivery_robot", name: str = "") -> None:
+    keys  directory of its keys, which then name it
+    """
+
+    def __init__(self, broker: Any, vehicle: str = "delivery_robot", name: str = "", keys: Path | None = None) -> None:
         from runner.mqtt.link import ControlLink
+        from runner.mqtt.login import Login
         from runner.mqtt.messages import OPERATOR_GONE, read_state, topic
+        from runner.security.keyring import Keyring
 
-        self.name = name or f"op{free_port()}"
+        login = Login(Keyring(keys), print) if keys else None
+        self.name = login.user if login else name or f"op{free_port()}"
         self.states: queue.Queue[Any] = queue.Queue()
         self.last: Any = None  # state
         self.replies: dict[str, Any] = {}
@@ -210,7 +230,8 @@ class Operator:
             topic(vehicle, "reply", self.name): lambda m: self.replies.update({(r := json.loads(m.payload))["id"]: r}),
             topic(vehicle, "telemetry"): self._on_telemetry,
         }
-        self.link = ControlLink(broker, (self.requests, OPERATOR_GONE), listen, lambda here: None, lambda what: None)
+        will = (self.requests, OPERATOR_GONE)
+        self.link = ControlLink(broker, will, listen, lambda here: None, lambda what: None, login)
         self.link.connect()
         assert self.link.wait_connected(WAIT_S)
 

@@ -4,10 +4,59 @@ from __future__ import annotations
 
 import re
 import socket
+import ssl
 import threading
 import time
+from contextlib import suppress
+from hashlib import md5
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
+
+from runner.security.keyring import Keyring, rtsp_password
+
+
+class Digest:
+    """The password of a viewer for a vehicle, as RFC 2617 has it given: without `qop`, like GStreamer's server."""
+
+    def __init__(self, keys: Path, vehicle: str) -> None:
+        ring = Keyring(keys)
+        self._user, self._password = ring.holder.name, rtsp_password(ring.secret, vehicle)
+        self._realm = self._nonce = ""
+
+    def challenge(self, head: str) -> None:
+        """Take the challenge of an answer with status 401."""
+        self._realm, self._nonce = (re.search(rf'{key}="([^"]*)"', head)[1] for key in ("realm", "nonce"))  # type: ignore[index]
+
+    def header(self, method: str, url: str) -> dict[str, object]:
+        """The header of a request; none before the challenge."""
+        if not self._nonce:
+            return {}
+        own = _md5(f"{self._user}:{self._realm}:{self._password}")
+        response = _md5(f"{own}:{self._nonce}:{_md5(f'{method}:{url}')}")
+        fields = {"username": self._user, "realm": self._realm, "nonce": self._nonce, "uri": url, "response": response}
+        return {"Authorization": "Digest " + ", ".join(f'{name}="{value}"' for name, value in fields.items())}
+
+
+def _md5(text: str) -> str:
+    return md5(text.encode(), usedforsecurity=False).hexdigest()
+
+
+def tls(keys: Path) -> ssl.SSLContext:
+    """TLS of a holder of keys, to whatever address; the other side must have a certificate of the same authority."""
+    ring = Keyring(keys)
+    context = ssl.create_default_context(cafile=ring.authority)
+    context.check_hostname = False
+    context.load_cert_chain(ring.certificate, ring.key)
+    return context
+
+
+def client_hello(keys: Path) -> bytes:
+    """The first message of a TLS client (RFC 8446, section 4.1.2)."""
+    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+    with suppress(ssl.SSLWantReadError):
+        tls(keys).wrap_bio(incoming, outgoing).do_handshake()
+    return outgoing.read()
 
 
 class RtspClient:
@@ -17,13 +66,23 @@ class RtspClient:
     source  address to connect from
     agent   its User-Agent
     small   buffers and segments as on a slow network: those of loopback would hold many seconds of video
+    keys    directory of a viewer's keys: it speaks TLS and gives a password; what it receives stays encrypted
     """
 
     def __init__(
-        self, url: str, *, at: tuple[str, int] | None = None, source: str = "", agent: str = "", small: bool = False
+        self,
+        url: str,
+        *,
+        at: tuple[str, int] | None = None,
+        source: str = "",
+        agent: str = "",
+        small: bool = False,
+        keys: Path | None = None,
+        vehicle: str = "delivery_robot",
     ) -> None:
-        host, port = re.match(r"rtsp://([^:/]+):(\d+)", url).groups()  # type: ignore[union-attr]
+        host, port = re.match(r"rtsps?://([^:/]+):(\d+)", url).groups()  # type: ignore[union-attr]
         self.url, self._agent = url, agent
+        self._login = Digest(keys, vehicle) if keys else None
         self.tcp = socket.socket()
         self.tcp.settimeout(10)
         self.tcp.bind((source, 0))
@@ -31,6 +90,8 @@ class RtspClient:
             self.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
         self.tcp.connect(at or (host, int(port)))
+        if keys:
+            self.tcp = tls(keys).wrap_socket(self.tcp)
         self.session, self.head, self.body = "", "", ""
         self._sequence, self._buffer = 0, b""
         self.packets: list[tuple[float, int, bool]] = []
@@ -39,13 +100,29 @@ class RtspClient:
         self.delay_s = 0.0  # between two reads
 
     def ask(self, method: str, url: str = "", **headers: object) -> int:
+        """The status code of the answer; the password is given once it is asked for."""
+        code = self._asked(method, url, headers)
+        if code == 401 and self._login:
+            self._login.challenge(self.head)
+            code = self._asked(method, url, headers)
+        return code
+
+    def _asked(self, method: str, url: str, headers: dict[str, object]) -> int:
+        self._send(method, url, headers)
+        return self._answer()
+
+    def leave(self) -> None:
+        """Say TEARDOWN, without waiting for the answer: what has been sent may come before it."""
+        self._send("TEARDOWN", "", {})
+
+    def _send(self, method: str, url: str, headers: dict[str, object]) -> None:
         self._sequence += 1
+        headers = {**headers, **(self._login.header(method, url or self.url) if self._login else {})}
         headers |= {"Session": self.session} if self.session else {}
         headers |= {"User-Agent": self._agent} if self._agent else {}
         lines = [f"{method} {url or self.url} RTSP/1.0", f"CSeq: {self._sequence}"]
         lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
         self.tcp.sendall("\r\n".join([*lines, "", ""]).encode())
-        return self._answer()
 
     def open(self, *, udp: bool = False, **play: object) -> list[int]:
         """Status codes of DESCRIBE, SETUP and PLAY, up to the first failure."""
@@ -62,6 +139,9 @@ class RtspClient:
         self._thread = threading.Thread(target=self._read_udp if self._rtp else self._read_tcp, daemon=True)
         self._thread.start()
         return self
+
+    def is_reading(self) -> bool:
+        return bool(self._thread and self._thread.is_alive())
 
     @property
     def server_port(self) -> int:
@@ -107,13 +187,14 @@ class RtspClient:
         self.close()
 
     def _transport(self, udp: bool) -> str:
+        profile = "RTP/SAVP" if self._login else "RTP/AVP"
         if not udp:
-            return "RTP/AVP/TCP;unicast;interleaved=0-1"
+            return f"{profile}/TCP;unicast;interleaved=0-1"
         for _ in range(2):
             self._rtp.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             self._rtp[-1].bind((self.tcp.getsockname()[0], 0))
         ports = [sock.getsockname()[1] for sock in self._rtp]
-        return f"RTP/AVP;unicast;client_port={ports[0]}-{ports[1]}"
+        return f"{profile};unicast;client_port={ports[0]}-{ports[1]}"
 
     def _answer(self) -> int:
         while True:

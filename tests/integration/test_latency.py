@@ -7,12 +7,13 @@ import time
 from statistics import median
 
 import pytest
+from msgspec import UNSET
 
-from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, process, run, until
+from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, process, run, set_clock, until
 from runner.drive.read import read_drive
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
-from runner.records import Sample, Telemetry, to_json
+from runner.records import ReceptionReported, Sample, Telemetry, to_json
 from runner.schema import message_problem
 
 AHEAD_MS, ONE_WAY_MS = 3700, 80
@@ -132,3 +133,32 @@ def test_without_the_fixed_part_no_speed_is_advised(broker):
         operator.state(lambda state: state["online"])
         until(lambda: len(operator.telemetry) > 3)
         assert operator.telemetry[-1]["speed_factor"] is None
+
+
+@needs_compiler
+def test_latencies_are_right_or_unknown_while_the_vehicles_clock_is_set(tmp_path):
+    """By 5 s in either direction, again and again. Of every latency that is shown, or that advises the speed."""
+    clock, path = tmp_path / "clock", tmp_path / "drive"
+    env = clock_ahead(clock, 0.0)
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    with process("demo", *ROBOT, *ports, f"log={path}", "duration_s=10", env=env) as demo:
+        until(lambda: (path / "operator.jsonl").exists() or demo.poll() is not None)
+        for number in range(22):
+            time.sleep(0.43)
+            set_clock(clock, (5.0, 0.0, -5.0, 0.0)[number % 4])
+        output, _ = demo.communicate(timeout=60)
+    assert demo.returncode == 0, output
+    drive = read_drive(path)
+    samples = [sample for sample in drive.sides["operator"].of(Sample) if sample.clock_bound_ms is not None]
+    shown = [
+        (camera.latency_ms, sample.clock_bound_ms)
+        for sample in samples
+        for camera in sample.cameras.values()
+        if camera.latency_ms is not None
+    ]
+    reported = [line.report.latency_ms for line in drive.sides["vehicle"].of(ReceptionReported)]
+    advising = [(latency_ms, 0.0) for latency_ms in reported if latency_ms is not UNSET]
+    assert len(shown) > 10
+    assert len(advising) > 10
+    impossible = [each for each in (*shown, *advising) if not 1 < each[0] + each[1] < 2500 + 2 * each[1]]
+    assert impossible == []

@@ -14,6 +14,7 @@ import time
 from contextlib import contextmanager
 from functools import partial
 from itertools import dropwhile
+from pathlib import Path
 
 import pytest
 
@@ -37,16 +38,21 @@ ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=15", "modes=open_loop", "pqos=con
 
 
 @contextmanager
-def sides(*overrides, log="log.video=false"):
+def sides(*overrides, log="log.video=false", keys=None):
     """Vehicle and operator as two processes. Yields the page's address, a way to start the vehicle, the operator.
 
-    log  argument of the operator's side
+    log   argument of the operator's side
+    keys  directory with the keys of everybody; None: nothing is encrypted
     """
+    vehicle_keys, operator_keys = ([f"keys={keys / name}"] if keys else [] for name in ("delivery_robot", "alice"))
     control, media, port = (free_port() for _ in range(3))
     words = (*ROBOT, *overrides, f"control.port={control}", f"media.port={media}", f"page.port={port}")
-    with private_broker(Endpoint("127.0.0.1", control)), process("operator", *words, log) as operator:
+    with (
+        private_broker(Endpoint("127.0.0.1", control), keys and keys / "broker"),
+        process("operator", *words, *operator_keys, log) as operator,
+    ):
         until(lambda: answers(port))
-        yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words), operator
+        yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words, *vehicle_keys), operator
 
 
 @pytest.mark.alone
@@ -134,7 +140,8 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
     """`make soak` runs it for longer."""
     turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
     graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # keyframes there, refresh waves elsewhere
-    with sides("mode=single", *graphs) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
+    keys = Path(os.environ["TOD_NEW_SIZES_KEYS"]) if "TOD_NEW_SIZES_KEYS" in os.environ else None
+    with sides("mode=single", *graphs, keys=keys) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page)
         counted = measure(page)
         for turn in range(turns):

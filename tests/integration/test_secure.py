@@ -14,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from rig import free_port, needs_root, process, until
+from rtsp_client import client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -338,6 +339,25 @@ def test_an_operator_knows_its_vehicle(keys):
         while time.monotonic() < end:
             assert set(seen().values()) == {0}
             time.sleep(0.2)
+
+
+def test_clients_that_say_nothing_keep_nobody_out(keys):
+    """Neither those that only connect, nor those that stop in the middle of a handshake."""
+    with ExitStack() as stack, sending(keys) as (plans, _):
+        port = plans[0].operator[0].properties["location"].rpartition(":")[2].partition("/")[0]
+        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", int(port)))) for _ in range(60)]
+        for sock in silent[::2]:
+            sock.sendall(client_hello(keys / "bob"))
+        began = time.monotonic()
+        with watching(plans, keys / "alice") as (seen, messages):
+            until(lambda: min(seen().values()) > 5, every_s=0.1)
+            assert time.monotonic() - began < 5  # 6 s where they are not dropped
+            assert not messages, messages
+        for sock in silent:
+            sock.settimeout(10)
+            with suppress(ConnectionError):
+                while sock.recv(4096):
+                    pass
 
 
 def test_plain_rtsp_is_not_answered(keys):

@@ -108,7 +108,12 @@ def samples():
 
 
 # 40 ms from capture to decode, if the vehicle's clock is 3.7 s ahead of this machine's
-FRESH = dict.fromkeys(("front", "rear", "mast"), Reception(frames=9, latency_ms=-3660.0))
+
+
+def fresh():
+    """A picture of each camera, read just now."""
+    received = Reception(frames=9, latency_ms=-3660.0, latency_at=time.monotonic())
+    return dict.fromkeys(("front", "rear", "mast"), received)
 
 
 def test_a_new_station_announces_itself_and_is_answered(both):
@@ -167,12 +172,12 @@ def test_a_silent_vehicle_is_offline_until_its_next_message(both):
 
 def report_until(station, done):
     """Report reception repeatedly, as an operator's side does."""
-    until(lambda: [station.report_reception(Arrivals({}, {})), station.take(FRESH), done()][-1], every_s=0.04)
+    until(lambda: [station.report_reception(Arrivals({}, {})), station.take(fresh()), done()][-1], every_s=0.04)
 
 
 def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     station, vehicle, listener = both
-    station.take(FRESH)
+    station.take(fresh())
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies still unknown"
     assert station.captured_here(1000.0) is None
@@ -180,7 +185,8 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     report_until(station, lambda: station.clock)
     clock = station.clock
     assert abs(clock.ahead_s - 3.7) <= clock.bound_s
-    sample = listener.received[-1][1]
+    report_until(station, lambda: station.samples["front"].latency_ms is not None)
+    clock, sample = station.clock, listener.received[-1][1]
     for camera in sample.cameras.values():
         assert abs(camera.latency_ms - 40) <= sample.clock_bound_ms + 1
     assert abs(station.captured_here(1003.7) - 1000) <= clock.bound_s
@@ -198,7 +204,7 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
         now, captured = time.monotonic(), time.time() + 3.7 - ms / 1000
         newest.update({name: Arrival(now, captured, 1000) for name in STATE["cameras"] if name not in silent})
         station.report_reception(Arrivals({name: [arrival] for name, arrival in newest.items()}, newest))
-        station.take(FRESH)
+        station.take(fresh())
         vehicle.publish("telemetry", TELEMETRY)
         return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0
 
@@ -221,7 +227,7 @@ def test_a_clock_that_is_stated_twice_or_unasked_is_not_believed(both):
     dropped = station._link.dropped
     vehicle.publish("clock", {**answer, "sent": "yesterday"})
     until(lambda: station._link.dropped > dropped)  # the last of three, in order
-    station.take(FRESH)
+    station.take(fresh())
     assert abs(station.clock.ahead_s - before.ahead_s) < 1
 
 
@@ -230,8 +236,8 @@ def test_a_vehicle_that_stops_stating_its_clock_is_reported_once(both, monkeypat
     station, vehicle, listener = both
     report_until(station, lambda: station.clock)
     vehicle.states_clock = False
-    until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(FRESH), not station.clock][-1])
-    station.take(FRESH)
+    until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(fresh()), not station.clock][-1])
+    station.take(fresh())
     assert listener.received[-1][1].clock_bound_ms is None
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert listener.notes[1:] == ["the vehicle has not stated its clock for 10 s: latencies are unknown"]

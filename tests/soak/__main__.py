@@ -1,10 +1,12 @@
 """Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports of any kind, clocks that drift apart, addresses that change.
+new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, and
+thousands of changes that must leave nothing behind.
 
-    make soak                           everything, about an hour on two cores
+    make soak                           everything, about an hour and a half on two cores
     SOAK=0.1 make soak                  a tenth of it
     SOAK_SEED=7 make soak               the same random choices again; the seed is printed
     make soak PARTS="stalls hostile"    some parts only
+    KEYS=1 make soak                    encrypted: TLS, passwords and SRTP for video, TLS 1.3 for control
 
 Every part prints its steps and figures; the exit status is 1 if anything failed.
 """
@@ -18,11 +20,13 @@ import time
 import traceback
 from collections.abc import Callable
 
+import churn
 import clocks
 import hostile
 import ip_camera
 import kills
 import openings
+import outages
 import readers
 import reports
 import roaming
@@ -42,7 +46,12 @@ PARTS: dict[str, Part] = {
     "hostile": hostile.soak,
     "reports": reports.soak,
     "clocks": clocks.soak,
+<<<<<<< HEAD
     "roaming": roaming.soak,
+=======
+    "outages": outages.soak,
+    "churn": churn.soak,
+>>>>>>> faults
 }
 
 

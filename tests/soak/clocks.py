@@ -6,6 +6,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import keyed
+
 from rig import ROBOT, clock_ahead, free_port, run
 from runner.drive.read import read_drive
 from runner.records import Sample
@@ -20,7 +22,13 @@ def soak(seed: int, scale: float) -> list[str]:
         began = time.monotonic()
         environment = clock_ahead(Path(directory), AHEAD_S, fast_ppm=FAST_PPM)
         path = Path(directory) / "drive"
-        words = (f"media.port={free_port()}", f"control.port={free_port()}", f"duration_s={seconds}", f"log={path}")
+        words = (
+            f"media.port={free_port()}",
+            f"control.port={free_port()}",
+            f"duration_s={seconds}",
+            f"log={path}",
+            *keyed.words(),
+        )
         done = run("demo", *ROBOT, *words, env=environment, timeout=seconds + 120)
         if done.returncode:
             return [done.stdout + done.stderr]

@@ -1,5 +1,8 @@
 """Garbage sent to running sides over RTSP, MQTT in both directions, WebSocket and HTTP.
 
+With KEYS=1 it comes from holders of keys: a watcher, and a vehicle that speaks to the operator. In addition, clients
+without any break off in the middle of a TLS handshake, or stay connected and say nothing.
+
 No process ends, no thread dies, nothing prints a traceback, watched cameras lose no frame; memory, threads and
 descriptors return to their initial values.
 """
@@ -12,18 +15,24 @@ import os
 import random
 import socket
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import aiohttp
+import keyed
 from system import CAMERAS, System, Watched, running
+
+from rtsp_client import Digest, client_hello, tls
 
 COUNT = 10_000  # of each kind
 GROWTH_MB = 60.0
 POOL = 4 + min(32, (os.cpu_count() or 1) + 4)  # threads
 SETTLE_S = 40.0  # sessions and half-finished requests expire
+SILENT, SILENT_S = 100, 15.0  # connections that say nothing at a time, and until the RTSP server has closed them
+ADMITTED_S = 4.0  # a viewer that comes meanwhile
 
 
 class Size(NamedTuple):
@@ -45,6 +54,8 @@ def soak(seed: int, scale: float) -> list[str]:
         "MQTT to the operator": to_operator,
     }
     with running() as (system, operator):
+        if system.keys:
+            kinds["TLS handshakes"] = handshakes
         # The baseline includes all that is loaded and cached on first use, and the arenas of many threads.
         for kind in kinds.values():
             kind(system, dice, max(100, count // 5))
@@ -135,15 +146,29 @@ def broken(dice: random.Random, data: bytes) -> bytes:
     return data if way == 3 else bytes_of(dice)
 
 
+@contextmanager
+def _connected(system: System) -> Iterator[tuple[socket.socket, Digest | None]]:
+    """A connection to the RTSP server, and the password to give there."""
+    with socket.create_connection(("127.0.0.1", system.media), 1) as sock:
+        if system.keys is None:
+            yield sock, None
+            return
+        own = system.keys / keyed.WATCHER
+        with tls(own).wrap_socket(sock) as encrypted:
+            yield encrypted, Digest(own, keyed.VEHICLE)
+
+
 def rtsp(system: System, dice: random.Random, count: int) -> None:
     """Whole and broken requests, several on a connection; some connections are closed without TEARDOWN."""
     sent = 0
     while sent < count:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", system.media), 1) as sock:
+        with suppress(OSError), _connected(system) as (sock, login):
             sock.settimeout(0.05)
             for number in range(dice.randrange(1, 8)):
                 camera = dice.choice((*CAMERAS, "none", "", "front/../rear", "front?x=1", "front/stream=9", "%00"))
-                head = [f"{dice.choice(METHODS)} rtsp://127.0.0.1:{system.media}/{camera} RTSP/1.0", f"CSeq: {number}"]
+                method, url = dice.choice(METHODS), system.url(camera)
+                head = [f"{method} {url} RTSP/1.0", f"CSeq: {number}"]
+                head += [f"{name}: {value}" for name, value in (login.header(method, url) if login else {}).items()]
                 head += [f"Transport: {dice.choice(TRANSPORTS)}"] * dice.randrange(2)
                 head += [f"Session: {dice.randrange(10**8)}"] * dice.randrange(2)
                 head += [f"Range: npt={dice.choice(('0.000-', 'now-', '-1-', 'x', '9' * 40))}"] * dice.randrange(2)
@@ -151,7 +176,47 @@ def rtsp(system: System, dice: random.Random, count: int) -> None:
                 sock.sendall(broken(dice, "\r\n".join([*head, "", ""]).encode()))
                 sent += 1
                 with suppress(OSError):
-                    sock.recv(4096)
+                    answer = sock.recv(4096)
+                    if login and b" 401 " in answer:
+                        login.challenge(answer.decode(errors="replace"))
+
+
+def handshakes(system: System, dice: random.Random, count: int) -> None:
+    """Clients of RTSP server and broker that say nothing, garbage, or what begins a handshake, whole or broken."""
+    assert system.keys
+    hello, silent = client_hello(system.keys / keyed.WATCHER), deque[tuple[int, socket.socket]]()
+    for _ in range(count):
+        with suppress(OSError):
+            port = dice.choice((system.media, system.broker.port))
+            sock = socket.create_connection(("127.0.0.1", port), 1)
+            silent.append((port, sock))
+            cut = hello[: dice.randrange(len(hello))]
+            sock.sendall(dice.choice((b"", bytes_of(dice), cut, broken(dice, hello), hello)))
+        while len(silent) > SILENT:
+            silent.popleft()[1].close()
+    began = time.monotonic()
+    with system.viewer(CAMERAS[0]) as viewer:
+        assert viewer.open() == [200, 200, 200]
+    took_s = time.monotonic() - began
+    assert took_s < ADMITTED_S, f"a viewer waited {took_s:.1f} s beside {len(silent)} silent clients"
+    for port, sock in silent:
+        with closing(sock):
+            if port == system.media:
+                assert _closed(sock, began + SILENT_S), f"a client was silent for {SILENT_S:g} s and is connected"
+
+
+def _closed(sock: socket.socket, until: float) -> bool:
+    """Whether the other side closes a connection by a time."""
+    while (left_s := until - time.monotonic()) > 0:
+        sock.settimeout(left_s)
+        try:
+            if not sock.recv(65_536):
+                return True
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
+    return False
 
 
 def http(system: System, dice: random.Random, count: int) -> None:
@@ -239,12 +304,8 @@ async def _read(ws: aiohttp.ClientWebSocketResponse) -> None:
         pass
 
 
-def _publish(system: System, dice: random.Random, count: int, topics: tuple[str, ...]) -> None:
-    from paho.mqtt.client import Client
-    from paho.mqtt.enums import CallbackAPIVersion
-
-    client = Client(CallbackAPIVersion.VERSION2)
-    client.connect(system.broker.host, system.broker.port)
+def _publish(system: System, holder: str, dice: random.Random, count: int, topics: tuple[str, ...]) -> None:
+    client = system.mqtt_client(holder)
     client.loop_start()
     for number in range(count):
         info = client.publish(f"tod/delivery_robot/{dice.choice(topics)}", message(dice), qos=dice.randrange(2))
@@ -255,12 +316,16 @@ def _publish(system: System, dice: random.Random, count: int, topics: tuple[str,
 
 
 def to_vehicle(system: System, dice: random.Random, count: int) -> None:
-    _publish(system, dice, count, ("request/hostile", "request/other", "request/\ud7ff", "configuration"))
+    own = keyed.WATCHER if system.keys else "hostile"
+    topics = (f"request/{own}", f"reception/{own}", "request/other", "request/\ud7ff", "configuration")
+    _publish(system, keyed.WATCHER, dice, count, topics)
 
 
 def to_operator(system: System, dice: random.Random, count: int) -> None:
     """Not retained: broken messages are dropped; a valid state would pass for the vehicle's."""
-    _publish(system, dice, count, ("state", "telemetry", "configuration", "reply/x", f"reply/{_operator(system)}"))
+    own = _operator(system)
+    topics = ("state", "telemetry", "configuration", "reply/x", f"reply/{own}", f"clock/{own}")
+    _publish(system, keyed.VEHICLE, dice, count, topics)
 
 
 def _operator(system: System) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import random
 import signal
-import subprocess
 import time
 
-from system import flowing, running
+from system import flowing, player, running
 
 import rig
 from rig import free_port, until
@@ -21,8 +20,7 @@ def soak(seed: int, scale: float) -> list[str]:
     with rig.ip_camera(free_port()) as (address, camera):
         words = ("page.serve=false", "+source@cameras.rear.source=rtsp", f'cameras.rear.source.address="{address}"')
         with running(*words) as (system, operator):
-            command = ["ffmpeg", "-v", "error", "-rtsp_transport", "tcp", "-i", system.url("rear"), "-f", "null", "-"]
-            with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as player:
+            with player(system, "rear", "tcp") as plays:
                 for number in range(max(2, round(10 * scale))):
                     stopped_s = dice.uniform(1, 30)
                     rebuilt = system.samples()["rear"]["rebuilt"]
@@ -42,9 +40,8 @@ def soak(seed: int, scale: float) -> list[str]:
                         problems.append(f"frozen for {stopped_s:.1f} s: back after {back_s:.1f} s, limit {BACK_S:g} s")
                     if system.samples()["rear"]["rebuilt"] != rebuilt:
                         problems.append(f"frozen for {stopped_s:.1f} s: the operator's session was rebuilt")
-                    if player.poll() is not None:
-                        problems.append(f"frozen for {stopped_s:.1f} s: ffmpeg's session ended")
-                player.kill()
+                    if not plays():
+                        problems.append(f"frozen for {stopped_s:.1f} s: the player's session ended")
             until(lambda: flowing(operator), seconds=15)
             problems += system.tracebacks()
     return problems

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import random
-import subprocess
 import time
 
-from system import Watched, newest, running
+from system import Watched, newest, player, running
 
 from rig import free_port
 
@@ -25,21 +24,8 @@ def soak(seed: int, scale: float) -> list[str]:
             camera, seconds = dice.choice(("rear", "rear", "rear", "mast")), dice.uniform(0.3, 3)
             operator.ask(f"on{number}", event="camera_switched", camera="rear", on=state != "switched off")
             operator.ask(f"weight{number}", event="weights_set", weights={"rear": 0 if state == "paused" else 1})
-            command = [
-                "ffmpeg",
-                "-v",
-                "error",
-                "-rtsp_transport",
-                transport,
-                "-i",
-                system.url(camera),
-                "-f",
-                "null",
-                "-",
-            ]
-            with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as player:
+            with player(system, camera, transport):
                 time.sleep(seconds)
-                player.kill()
             print(f"{number:3} {camera} {state:12} {transport} {seconds:.1f} s", flush=True)
             if number % EVERY == EVERY - 1:
                 problems += watched.problems()

@@ -1,4 +1,7 @@
-"""A slow reader per camera, and one that stops: both are disconnected, and regular viewers lose no frame."""
+"""A slow reader per camera, and one that stops: both are disconnected, and regular viewers lose no frame.
+
+Meanwhile a subscriber to all that the vehicle publishes reads nothing.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,8 @@ import random
 import time
 from contextlib import ExitStack
 
+import keyed
 from system import CAMERAS, Watched, running
-
-from rtsp_client import RtspClient
 
 ALONE_S = 300  # with readers at half the rate
 
@@ -16,6 +18,9 @@ ALONE_S = 300  # with readers at half the rate
 def soak(seed: int, scale: float) -> list[str]:
     dice, problems = random.Random(seed), []
     with running("page.serve=false") as (system, operator):
+        deaf = system.mqtt_client(keyed.WATCHER)
+        deaf.subscribe(f"tod/{keyed.VEHICLE}/#")
+        deaf.loop_write()
         watched = [Watched(system, operator, name) for name in CAMERAS]
         end = time.monotonic() + max(30.0, ALONE_S * scale)
         rounds = 0
@@ -25,7 +30,7 @@ def soak(seed: int, scale: float) -> list[str]:
                 slow, stopped = [], []
                 for name in CAMERAS:
                     for group in (slow, stopped):
-                        client = stack.enter_context(RtspClient(system.url(name), small=True))
+                        client = stack.enter_context(system.viewer(name, small=True))
                         if client.open() != [200, 200, 200]:
                             problems.append(f"{name}: a reader was refused")
                         group.append(client)
@@ -38,11 +43,12 @@ def soak(seed: int, scale: float) -> list[str]:
                     if not client.ended(10):
                         problems.append(f"{client.url}: a reader that stopped was not closed")
                 for client in slow:
-                    if client._thread.is_alive():
+                    if client.is_reading():
                         client._thread.join(30)
-                    if client._thread.is_alive():
+                    if client.is_reading():
                         problems.append(f"{client.url}: a reader at half the rate was not closed")
         print(f"{rounds} rounds of {2 * len(CAMERAS)} readers", flush=True)
+        deaf.disconnect()
         for watch in watched:
             problems += watch.problems()
         problems += system.tracebacks()

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import keyed
+
 from rig import CHECKOUT, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
@@ -76,11 +78,20 @@ class Run:
 
 
 def _demo(directory: Path, *more: str) -> Sequence[str]:
-    return ("demo", *ROBOT, f"media.port={free_port()}", f"control.port={free_port()}", "duration_s=60", *more)
+    return (
+        "demo",
+        *ROBOT,
+        f"media.port={free_port()}",
+        f"control.port={free_port()}",
+        "duration_s=60",
+        *keyed.words(),
+        *more,
+    )
 
 
 def _side(verb: str, broker: Endpoint, *more: str) -> Sequence[str]:
-    return (verb, *ROBOT, f"media.port={free_port()}", f"control.port={broker.port}", *more)
+    own = keyed.words(keyed.VEHICLE if verb == "vehicle" else keyed.CONTROLLER)
+    return (verb, *ROBOT, f"media.port={free_port()}", f"control.port={broker.port}", *own, *more)
 
 
 @contextmanager
@@ -93,10 +104,12 @@ def verbs() -> Iterator[dict[str, Verb]]:
             _command(*_demo(directory), "duration_s=4", f"log={drive}"), capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
-        with private_broker(broker):
+        keys = keyed.keys()
+        link = "netns" if keys else "relay"  # a relay cannot pass what keys encrypt
+        with private_broker(broker, keys and keys / "broker"):
             yield {
                 "demo": Verb(_demo, 5.0),
-                "demo relay": Verb(lambda free: _demo(free, "link=relay", f"log={free / 'drive'}"), 5.0),
+                f"demo {link}": Verb(lambda free: _demo(free, f"link={link}", f"log={free / 'drive'}"), 5.0),
                 "vehicle": Verb(lambda free: _side("vehicle", broker, f"log={free / 'drive'}"), 3.0),
                 "operator": Verb(lambda free: _side("operator", broker, f"log={free / 'drive'}"), 3.0),
                 "record": Verb(lambda free: ("record", *ROBOT[:3], f"output={free / 'rec'}"), 3.0),

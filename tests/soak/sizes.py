@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import keyed
+
 TEST = Path(__file__).parents[1] / "integration" / "test_page_sides.py"
 
 
@@ -15,6 +17,8 @@ def soak(seed: int, scale: float) -> list[str]:
     turns = max(20, round(180 * scale))
     command = [sys.executable, "-m", "pytest", str(TEST), "-k", "new_size"]
     environment = {**os.environ, "TOD_NEW_SIZES": str(turns)}
+    if keys := keyed.keys():
+        environment["TOD_NEW_SIZES_KEYS"] = str(keys)
     try:
         done = subprocess.run(command, env=environment, check=False, timeout=60 + 10 * turns)
     except subprocess.TimeoutExpired as late:

@@ -1,4 +1,7 @@
-"""A running broker, vehicle and operator's side, as three processes that a test may stop, kill and start again."""
+"""A running broker, vehicle and operator's side, as three processes that a test may stop, kill and start again.
+
+With KEYS=1 RTSP is TLS with passwords, RTP is SRTP, and MQTT is TLS 1.3.
+"""
 
 from __future__ import annotations
 
@@ -8,40 +11,85 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from rig import CHECKOUT, Operator, free_port, until
-from runner.core.model import Endpoint
-from runner.mqtt.broker import find_mosquitto
+import keyed
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
 
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15", "pqos=constant", "pqos.kbps=3000")
+from rig import CHECKOUT, Operator, free_port, until
+from rtsp_client import RtspClient
+from runner.core.model import Endpoint
+from runner.link import LimitedLink
+from runner.mqtt.broker import find_mosquitto
+from runner.mqtt.login import Login
+from runner.security.broker_files import broker_settings
+from runner.security.keyring import Keyring
+
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
+CONSTANT = ("pqos=constant", "pqos.kbps=3000")
 CAMERAS = ("front", "rear", "mast")
 
 
 class System:
     """Three processes: broker, vehicle, operator.
 
-    words  overrides of both sides
-    url    address of a camera: `url("front")`
-    page   port of the operator's page
+    words        overrides of both sides
+    predictions  overrides that name the source of predictions
+    keys         directory with the keys of everybody; None: nothing is encrypted
+    link         that the vehicle drives behind; None: it is on this machine
+    environment  of each side, by name, in addition to this process's
+    own          overrides of one side, by name
+    url          address of a camera: `url("front")`
+    page         port of the operator's page
     """
 
-    def __init__(self, directory: Path, words: Sequence[str]) -> None:
-        self.directory = directory
-        self.broker = Endpoint("127.0.0.1", free_port())
+    def __init__(
+        self,
+        directory: Path,
+        words: Sequence[str],
+        keys: Path | None = None,
+        link: LimitedLink | None = None,
+        environment: Mapping[str, Mapping[str, str]] | None = None,
+        predictions: Sequence[str] = CONSTANT,
+        own: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        self.directory, self.keys = directory, keys
+        self._environment, self._own = environment or {}, own or {}
+        self.broker = link.broker if link else Endpoint("127.0.0.1", free_port())
         self.media, self.page = free_port(), free_port()
-        self.words = (*ROBOT, *words, f"control.port={self.broker.port}", f"media.port={self.media}")
+        ports = (f"control.port={self.broker.port}", f"media.port={self.media}")
+        self.words = (*ROBOT, *predictions, *(link.operator_overrides if link else ports), *words)
+        self._before = {"vehicle": link.vehicle_command} if link else {}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._started = 0
+        host, port = self.broker.host, self.broker.port
         (directory / "mosquitto.conf").write_text(
-            f"listener {self.broker.port} {self.broker.host}\nallow_anonymous true\nset_tcp_nodelay true\n"
+            f"{broker_settings(str(self.keys / 'broker'), host, port)}user root\n"
+            if self.keys
+            else f"listener {port} {host}\nallow_anonymous true\nset_tcp_nodelay true\n"
         )
 
     def url(self, camera: str) -> str:
-        return f"rtsp://127.0.0.1:{self.media}/{camera}"
+        return f"rtsp{'s' if self.keys else ''}://127.0.0.1:{self.media}/{camera}"
+
+    def viewer(self, camera: str, *, small: bool = False) -> RtspClient:
+        """A client of a camera's stream: with keys, one that may watch and not drive."""
+        keys = self.keys / keyed.WATCHER if self.keys else None
+        return RtspClient(self.url(camera), small=small, keys=keys)
+
+    def mqtt_client(self, holder: str) -> Client:
+        """A client that is connected to the broker, with somebody's keys if there are any."""
+        client = Client(CallbackAPIVersion.VERSION2)
+        if self.keys:
+            login = Login(Keyring(self.keys / holder), print)
+            client.tls_set_context(login.context)
+            client.username_pw_set(login.user, login.refresh())
+        client.connect(self.broker.host, self.broker.port)
+        return client
 
     def start(self, name: str) -> None:
         self._started += 1
@@ -50,7 +98,10 @@ class System:
             command = [find_mosquitto(), "-c", str(self.directory / "mosquitto.conf")]
         else:
             page = [f"page.port={self.page}"] if name == "operator" else ["page.serve=false"]
-            command = [sys.executable, "-m", "runner", name, *self.words, *page, f"log={self.log}"]
+            holder = keyed.VEHICLE if name == "vehicle" else keyed.CONTROLLER
+            own = [*([f"keys={self.keys / holder}"] if self.keys else []), *self._own.get(name, ())]
+            before = self._before.get(name, ())
+            command = [*before, sys.executable, "-m", "runner", name, *self.words, *own, *page, f"log={self.log}"]
         if name == "operator":
             self.operator_log = self.log / "operator.jsonl"
         with self.output(name).open("ab") as output:
@@ -59,7 +110,7 @@ class System:
                 stdout=output,
                 stderr=output,
                 cwd=CHECKOUT,
-                env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+                env={**os.environ, "PYTHONPATH": str(CHECKOUT), **self._environment.get(name, {})},
             )
 
     def output(self, name: str) -> Path:
@@ -95,15 +146,29 @@ class System:
 
 
 @contextmanager
-def running(*words: str) -> Iterator[tuple[System, Operator]]:
-    """A streaming system, and a program at the other end of its control link."""
+def running(
+    *words: str,
+    keys: Path | None = None,
+    link: LimitedLink | None = None,
+    environment: Mapping[str, Mapping[str, str]] | None = None,
+    predictions: Sequence[str] = CONSTANT,
+    own: Mapping[str, Sequence[str]] | None = None,
+    complete: bool = True,
+) -> Iterator[tuple[System, Operator]]:
+    """A streaming system, and a program at the other end of its control link.
+
+    keys      None: those that the environment asks for, if it does
+    complete  wait until all cameras are sent
+    The others are as of `System`.
+    """
     with tempfile.TemporaryDirectory(prefix="tod-soak-") as directory:
-        system = System(Path(directory), words)
+        system = System(Path(directory), words, keys or keyed.keys(), link, environment, predictions, own)
         try:
             for name in ("broker", "vehicle", "operator"):
                 system.start(name)
-            operator = Operator(system.broker)
-            until(lambda: flowing(operator) and system.received(), seconds=30, every_s=0.1)
+            # With the keys of the operator's side, hence in control whenever that is.
+            operator = Operator(system.broker, keys=system.keys and system.keys / keyed.CONTROLLER)
+            until(lambda: (flowing(operator) or not complete) and system.received(), seconds=30, every_s=0.1)
             yield system, operator
         finally:
             system.stop()
@@ -164,6 +229,25 @@ class Watched:
     def _switch(self, on: bool) -> None:
         reply = self._operator.ask(str(time.monotonic()), event="camera_switched", camera=self._camera, on=on)
         assert reply["result"] == "applied", reply
+
+
+@contextmanager
+def player(system: System, camera: str, transport: str) -> Iterator[Callable[[], bool]]:
+    """Somebody else plays a camera: ffmpeg; with keys, which ffmpeg cannot present, `RtspClient`.
+
+    Yields whether it still plays.
+    """
+    if system.keys:
+        with system.viewer(camera) as client:
+            with suppress(OSError, EOFError):  # refused, or there is nothing to see
+                client.open(udp=transport == "udp")
+            client.read()
+            yield client.is_reading
+        return
+    command = ["ffmpeg", "-v", "error", "-rtsp_transport", transport, "-i", system.url(camera), "-f", "null", "-"]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as ffmpeg:
+        yield lambda: ffmpeg.poll() is None
+        ffmpeg.kill()
 
 
 def ended(child: subprocess.Popen[bytes], seconds: float) -> bool:
