@@ -77,7 +77,7 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
 
 
 def _run(words: list[str]) -> int:
-    from runner.verbs import VERBS, Arguments
+    from runner.verbs import VERBS, Arguments, unknown_flag
 
     if not words or words[0] in ("-h", "--help", "help"):
         print(USAGE.format(verbs="\n".join(f"  {name:10}{verb.summary}" for name, verb in VERBS.items())))
@@ -88,6 +88,8 @@ def _run(words: list[str]) -> int:
         print(f"tod-runner {version('tod-runner')}")
         return 0
     name, *rest = words
+    if name.startswith("-"):
+        raise unknown_flag(name)
     if name not in VERBS:
         from runner.core.model import suggest
 
