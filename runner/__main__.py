@@ -101,6 +101,8 @@ def _run(words: list[str]) -> int:
         return 0
     if name == "model" and rest[:1] == ["compare"]:
         return int(module.compare(rest[1:]))
+    if name == "completion" and rest[:1] == ["words"] and len(rest) == 3:
+        return int(module.words(*rest[1:]))
     arguments = Arguments.parse(name, rest)
     if arguments.conf is not None and not arguments.conf.is_dir():
         raise UserError("command line", "conf", str(arguments.conf), "no such directory")

@@ -19,8 +19,9 @@ DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
 class Verb(NamedTuple):
     """A verb: a short description, its module, its arguments.
 
-    takes   meaning of words without =, any number of them; "": none are accepted
-    sweeps  whether -m is accepted
+    takes     meaning of words without =, any number of them; "": none are accepted
+    sweeps    whether -m is accepted
+    composes  whether it reads a configuration, and so takes overrides
     """
 
     summary: str
@@ -28,6 +29,7 @@ class Verb(NamedTuple):
     arguments: tuple[str, ...]
     takes: str = ""
     sweeps: bool = False
+    composes: bool = True
 
 
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
@@ -38,6 +40,7 @@ VERBS = {
         ("total_kbps", "format"),
         sweeps=True,
     ),
+    "init": Verb("a directory of your own to start from", "runner.verbs.init", ("files",), "DIR", composes=False),
     "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
     "replay": Verb(
         "events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link"), sweeps=True
@@ -50,12 +53,17 @@ VERBS = {
     ),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
-    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
-    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE),
-    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
-    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
-    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
+    "report": Verb(
+        "the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE, composes=False
+    ),
+    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
+    "map": Verb(
+        "a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE, composes=False
+    ),
+    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE, composes=False),
+    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
+    "completion": Verb("what completes words in bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }
 
 

@@ -12,7 +12,8 @@ conf=DIR, otherwise the nearest one above it that has folders of groups.
 
 If GStreamer is installed, configurations are also checked against its registry: elements, properties, types, ranges,
 and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends
-with status 2 and reports all problems at once.
+with status 2 and reports all problems at once. If DIR/.schemas, by which your editor checks, is of another version than
+this tod-runner, standard error says so.
 
   tod-runner validate conf=my_vehicles                       your files, the step for your CI
   tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit
@@ -24,6 +25,7 @@ with status 2 and reports all problems at once.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -37,6 +39,7 @@ from runner.configuration.build import PlanCheck
 from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
+from runner.configuration.editors import version_problem
 from runner.configuration.files import GROUPS, bases_of, built_on, conf_directories, find_file, options
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.configuration.yaml_file import label, load_file, load_node
@@ -96,6 +99,8 @@ def run(arguments: Arguments) -> int:
     files, configurations, notes = 0, 0, dict[str, None]()
     _composed.cache_clear()
     for conf, named in _directories(arguments).items():
+        if conf and (problem := version_problem(conf)):
+            print(problem, file=sys.stderr)
         directories = conf_directories(conf)
         found, checked = check_files(directories if everything else directories[:1], named)
         if found:
