@@ -11,7 +11,7 @@ import yaml
 from runner import schema
 from runner.configuration.origin import Composed
 
-WIDEST = 120  # characters of a line, where its value can be written over several
+WIDEST = 100  # characters of a line before its comment, where its value can be written over several
 UNSTATED = "in none of the files and overrides"
 
 
@@ -33,10 +33,10 @@ def _entries(composed: Composed, value: Any, path: schema.Path, indent: str) -> 
 
 def _entry(composed: Composed, value: Any, path: schema.Path, lead: str, indent: str) -> Iterator[str]:
     origins = dict.fromkeys(_origins(composed, value, path))
-    line = f"{lead} {_flow(value)}  # {'; '.join(origins)}"
+    line = f"{lead} {_flow(value)}"
     short = len(line) <= WIDEST or (isinstance(value, list) and not any(map(_is_filled, value)))
     if not _is_filled(value) or (len(origins) == 1 and short):
-        yield line
+        yield f"{line}  # {'; '.join(origins)}"
     elif lead.endswith("-"):
         first, *others = _entries(composed, value, path, indent)
         yield f"{lead} {first.removeprefix(indent)}"
@@ -57,7 +57,7 @@ def _origins(composed: Composed, value: Any, path: schema.Path) -> Iterator[str]
             yield from _origins(composed, inner, (*path, key))
         return
     part = composed.stated_by(path)
-    yield schema.shortened(" ".join(part.name.split())) if part else UNSTATED
+    yield " ".join(part.name.split()) if part else UNSTATED
 
 
 def _flow(value: Any) -> str:

@@ -31,7 +31,7 @@ class Part:
     @property
     def name(self) -> str:
         """Its file, or the command line with the override."""
-        return f"{self.file}: {self.word}" if self.word else self.file
+        return f"{self.file}: {schema.shortened(self.word)}" if self.word else self.file
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,7 +55,6 @@ from runner.system.files import write_whole
 from runner.verbs import Arguments
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
-from runner.verbs.sweep import prepared
 
 FPS_PER_CORE = 5  # Hz; eight cameras are encoded, sent, decoded and shown at this rate without falling behind
 LOOK_S = 0.05  # how soon after a side's end the other is stopped
@@ -105,6 +104,8 @@ def run(arguments: Arguments) -> int:
 
 def _sweep(arguments: Arguments, apply: ModuleType) -> int:
     """The demos of a sweep, one after the other."""
+    from runner.verbs.sweep import prepared
+
     places = {key: path for key in DIRECTORIES if (path := arguments.path(key))}
     for key, place in places.items():
         _check_empty(key, place)

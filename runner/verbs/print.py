@@ -38,7 +38,6 @@ from runner.plans import compile_plans
 from runner.records import CameraDecision, to_json
 from runner.redact import redacted
 from runner.verbs import Arguments
-from runner.verbs.sweep import prepared
 
 
 def run(arguments: Arguments) -> int:
@@ -63,6 +62,8 @@ def _configured(arguments: Arguments) -> int:
 
 
 def _sweep(arguments: Arguments) -> int:
+    from runner.verbs.sweep import prepared
+
     runs = prepared(arguments, _planned)
     lines = [
         json.dumps({"overrides": words, **as_json(plans, decision)}, ensure_ascii=False)

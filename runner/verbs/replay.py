@@ -51,7 +51,6 @@ from runner.records import Began, ReceptionReported, decision_to_json, line_from
 from runner.schema import log_problem
 from runner.system.files import whole_file
 from runner.verbs import Arguments
-from runner.verbs.sweep import prepared
 
 if TYPE_CHECKING:
     from runner.pqos import Pqos
@@ -83,6 +82,8 @@ def run(arguments: Arguments) -> int:
 
 
 def _sweep(arguments: Arguments) -> int:
+    from runner.verbs.sweep import prepared
+
     if arguments.path("input") is None:
         raise UserError("command line", "-m", None, "reads the events once for each run: give input=FILE")
     with _input(arguments) as (name, text):

@@ -39,7 +39,6 @@ from runner.configuration.build import PlanCheck
 from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
-from runner.configuration.editors import version_problem
 from runner.configuration.files import GROUPS, bases_of, built_on, conf_directories, find_file, options
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.configuration.yaml_file import label, load_file, load_node
@@ -99,8 +98,7 @@ def run(arguments: Arguments) -> int:
     files, configurations, notes = 0, 0, dict[str, None]()
     _composed.cache_clear()
     for conf, named in _directories(arguments).items():
-        if conf and (problem := version_problem(conf)):
-            print(problem, file=sys.stderr)
+        _warn_of_other_schemas(conf)
         directories = conf_directories(conf)
         found, checked = check_files(directories if everything else directories[:1], named)
         if found:
@@ -116,6 +114,15 @@ def run(arguments: Arguments) -> int:
     print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
     print("\n".join(notes), end="\n" if notes else "")
     return 0
+
+
+def _warn_of_other_schemas(conf: Path | None) -> None:
+    if conf is None:
+        return
+    from runner.configuration.editors import version_problem
+
+    if problem := version_problem(conf):
+        print(problem, file=sys.stderr)
 
 
 def _counted(count: int, what: str) -> str:
