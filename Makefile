@@ -69,7 +69,7 @@ UPLINK ?= ../shared/data/traces/tidy/orange-4G-traces-A-up_uplink_1s.csv
 deadspot: $(TEST_READY)
 	$(BIN)/python bench/deadspot.py $(UPLINK) docs/images/deadspot.png
 
-soak: $(TEST_READY)
+soak: $(TEST_READY) $(NODE_READY)
 	$(if $(PARTS),,$(BIN)/pytest -m soak)
 	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)
 

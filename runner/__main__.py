@@ -77,7 +77,7 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
 
 
 def _run(words: list[str]) -> int:
-    from runner.verbs import VERBS, Arguments
+    from runner.verbs import VERBS, Arguments, unknown_flag
 
     if not words or words[0] in ("-h", "--help", "help"):
         print(USAGE.format(verbs="\n".join(f"  {name:10}{verb.summary}" for name, verb in VERBS.items())))
@@ -88,6 +88,8 @@ def _run(words: list[str]) -> int:
         print(f"tod-runner {version('tod-runner')}")
         return 0
     name, *rest = words
+    if name.startswith("-"):
+        raise unknown_flag(name)
     if name not in VERBS:
         from runner.core.model import suggest
 
@@ -99,6 +101,8 @@ def _run(words: list[str]) -> int:
         return 0
     if name == "model" and rest[:1] == ["compare"]:
         return int(module.compare(rest[1:]))
+    if name == "completion" and rest[:1] == ["words"] and len(rest) == 3:
+        return int(module.words(*rest[1:]))
     arguments = Arguments.parse(name, rest)
     if arguments.conf is not None and not arguments.conf.is_dir():
         raise UserError("command line", "conf", str(arguments.conf), "no such directory")

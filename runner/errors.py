@@ -34,10 +34,10 @@ class UserError(Exception):
 class ConfigError(UserError):
     """The configuration is wrong: all problems at once."""
 
-    def __init__(self, problems: Sequence[Problem]) -> None:
+    def __init__(self, problems: Sequence[Problem], outcome: str = "nothing was started") -> None:
         self.problems = list(dict.fromkeys(problems))
         count = len(self.problems)
-        summary = f"{count} problem{'' if count == 1 else 's'}, nothing was started"
+        summary = f"{count} problem{'' if count == 1 else 's'}, {outcome}"
         Exception.__init__(self, "\n".join([*map(str, self.problems), summary]))
 
 

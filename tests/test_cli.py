@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 from helpers import Command, process
 
+from runner.__main__ import main
 from runner.verbs import VERBS
 
 PAPER = ("modes=paper", "source=test")
@@ -233,3 +235,48 @@ def test_ctrl_c_ends_with_130() -> None:
     replay.send_signal(signal.SIGINT)
     _, err = replay.communicate(timeout=20)
     assert (replay.returncode, err) == (130, b"")
+
+
+# --- exit statuses ----------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_exit_statuses_has_every_verb(tod: Command) -> None:
+    """And every status of `main`; wrong words end every verb with 2."""
+    page = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
+    section = page.partition("## Exit statuses")[2].partition("\n## ")[0]
+    first = [row.split(" | ")[0].removeprefix("| ") for row in section.splitlines() if row.startswith("| ")]
+    statuses, verbs = [cell for cell in first if cell.isdigit()], [cell for cell in first if "`" in cell]
+    assert verbs == [f"`{verb}`" for verb in VERBS]
+    assert main.__doc__
+    returned = main.__doc__.partition("exit status: ")[2]
+    assert statuses == re.findall(r"\d+", returned) == ["0", "1", "2", "130", "143"]
+    for verb in VERBS:
+        assert tod(verb, "--nonsense").status == 2
+
+
+@pytest.mark.parametrize(
+    "words, status",
+    [
+        (["init", "/proc/nowhere"], 1),
+        (["replay", "source=test", "input=/dev/null"], 0),
+        (["replay", "source=test", "input=/dev/null", "output=/proc/nowhere"], 2),
+        (["map", "/nowhere", "output=x.csv"], 2),
+        (["report", "/nowhere"], 2),
+        (["quality", "/nowhere"], 2),
+        (["export", "/nowhere"], 2),
+        (["keys"], 2),
+        (["completion", "fish"], 2),
+        (["doctor", "fps_max=0"], 2),
+        (["record", "fps_max=0", "output=x"], 2),
+        (["model", "fps_max=0"], 2),
+        (["vehicle", "fps_max=0"], 2),
+        (["operator", "fps_max=0"], 2),
+        (["demo", "fps_max=0"], 2),
+        (["print", "fps_max=0"], 2),
+        (["validate", "fps_max=0"], 2),
+    ],
+)
+def test_exit_statuses(tod: Command, words: list[str], status: int) -> None:
+    result = tod(*words)
+    assert result.status == status, result
+    assert "Traceback" not in result.err and (status == 0) == (result.err == "")

@@ -18,6 +18,7 @@ CAMERA_KEYS = (
     "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, shed, place, pose, device, ..."
 )
 OWN = "files of your own need conf=DIR"
+SWEEP = "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,c] for a list"
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
     "kbps, bps, vbv_ms, left, right, top, bottom, on, off (quote these two), or a caps template over"
@@ -409,8 +410,8 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             f"vehicle: null: no such file in conf/vehicle/; expected one of delivery_robot, tum_q7; {OWN}",
         ),
         (["+graph@cameras.front_left.graph=h264_srtt"], "no such file in conf/graph/, did you mean h264_srt?"),
-        (["vehicle=a,b"], "vehicle=a,b: a,b,c is a sweep; write [a,b,c] for a list"),
-        (["mode=single,automatic"], "mode=single,automatic: a,b,c is a sweep; write [a,b,c] for a list"),
+        (["vehicle=a,b"], f"vehicle=a,b: {SWEEP}"),
+        (["mode=single,automatic"], f"mode=single,automatic: {SWEEP}"),
         (["mode=autmatic"], "mode: 'autmatic': must be one of single, automatic, collective, did you mean automatic?"),
         (["nothing=3"], f"nothing: unknown key; expected one of {TOP_KEYS}"),
         (["+_target_=os.system"], f"_target_: unknown key; expected one of {TOP_KEYS}"),

@@ -9,7 +9,13 @@ import subprocess
 from typing import Any
 
 import pytest
+import yaml
 from helpers import CONF, Command, UserConf
+from omegaconf._utils import get_yaml_loader
+
+from runner.configuration.config import configuration
+from runner.configuration.listing import UNSTATED, listing
+from runner.configuration.origin import Composed, Part
 
 GRAPHS = sorted(path.stem for path in (CONF / "graph").glob("*.yaml"))
 SETTING = {"on", "sending", "demand_kbps", "kbps", "scaling", "roi", "width", "height", "reason"}
@@ -158,9 +164,89 @@ def test_a_transport_without_a_server(tod: Command) -> None:
         ("total_kbps=nan", "command line: total_kbps: 'nan': must be a number from 0"),
         ("total_kbps=inf", "command line: total_kbps: 'inf': must be a number from 0"),
         ("total_kbps=", "command line: total_kbps: '': must be a number from 0"),
-        ("format=xml", "command line: format: 'xml': must be one of text, json"),
+        ("format=xml", "command line: format: 'xml': must be one of text, json, yaml"),
         ("conf=/nowhere", "command line: conf: /nowhere: no such directory"),
     ],
 )
 def test_wrong_arguments(tod: Command, word: str, expected: str) -> None:
     assert tod("print", "source=test", word) == (2, "", f"{expected}\n")
+
+
+# --- format=yaml ------------------------------------------------------------------------------------------------------
+
+MOUNTS = ("+graph@cameras.front.graph=h264_srt", "+source@cameras.rear.source=v4l2")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (
+            "graph=openh264_rtsp",
+            "modes=steady",
+            "cameras.front_left.rate_quality.b_min_kbps=[0,1,2]",
+            "log={video: true}",
+        ),
+        ("vehicle=delivery_robot", *MOUNTS, "~cameras.mast", "modes.automatic.2.cap_by_link.reserve_kbps=7"),
+        ("experiment=bottleneck", "link=relay", "study=paper", "pqos=trace"),
+        ("vehicle=delivery_robot", "graph=h264_jetson_rtsp", "latency={fixed_ms: 1e1}", "fps_max=12.5"),
+    ],
+)
+def test_yaml_loads_as_the_configuration_and_every_value_has_an_origin(tod: Command, words: tuple[str, ...]) -> None:
+    status, out, err = tod("print", "source=test", "format=yaml", *words)
+    assert (status, err) == (0, "")
+    assert yaml.load(out, get_yaml_loader()) == configuration(["source=test", *words]).document
+    assert UNSTATED not in out
+
+
+def test_yaml_names_the_file_or_the_override_of_each_value(tod: Command, conf: UserConf) -> None:
+    conf.write("cameras/own.yaml", "defaults: [compact_480p, _self_]\nfps: 12\n")
+    mounts = "defaults: [{/cameras@cameras.a: own}, {/cameras@cameras.b: own}, _self_]\n"
+    cameras = 'cameras: {a: {weight: 2}, b: {device: "/dev/${name}"}}\n'
+    conf.write("vehicle/van.yaml", f"# @package _global_\n{mounts}name: van\n{cameras}")
+    words = ("vehicle=van", "source=test", "cameras.b.fps=9", "+cameras.a.place={row: 0, column: 0}")
+    out = tod("print", conf.word, *words, "format=yaml").out
+    own, van, kind = (conf.path / "cameras/own.yaml", conf.path / "vehicle/van.yaml", "conf/cameras/compact_480p.yaml")
+    expected = f"""\
+cameras:
+  a:
+    width_px: 848  # {kind}
+    height_px: 480  # {kind}
+    fps: 12  # {own}
+    fov_deg: 78  # {kind}
+    rate_quality: {{scaling: [0.25, 0.5, 1.0], b_min_kbps: [0, 120, 500], b_full_kbps: 1500}}  # {kind}
+    weight: 2  # {van}
+    place: {{row: 0, column: 0}}  # command line: +cameras.a.place={{row: 0, column: 0}}
+  b:
+    width_px: 848  # {kind}
+    height_px: 480  # {kind}
+    fps: 9  # command line: cameras.b.fps=9
+    fov_deg: 78  # {kind}
+    rate_quality: {{scaling: [0.25, 0.5, 1.0], b_min_kbps: [0, 120, 500], b_full_kbps: 1500}}  # {kind}
+    device: /dev/van  # {van}
+"""
+    assert sorted(out[out.index("cameras:") : out.index("\nname: ")].splitlines()) == sorted(expected.splitlines())
+    assert f"\nname: van  # {van}\n" in out
+
+
+def test_yaml_does_not_guess_where_the_order_of_files_is_unusual(tod: Command, conf: UserConf) -> None:
+    """A vehicle that lets the kind of camera win: the value, not the usual order, tells the file."""
+    text = "# @package _global_\ndefaults: [_self_, {/cameras@cameras.a: compact_480p}]\nname: van\n"
+    conf.write("vehicle/van.yaml", f"{text}cameras: {{a: {{fps: 99, weight: 2}}}}\n")
+    out = tod("print", conf.word, "vehicle=van", "source=test", "format=yaml").out
+    assert "\n    fps: 30  # conf/cameras/compact_480p.yaml\n" in out
+    assert f"\n    weight: 2  # {conf.path}/vehicle/van.yaml\n" in out
+
+
+@pytest.mark.parametrize("text", ["on", "1e3", "a\nb", "x\n", "# no comment", " a", "{b}", "é", "null", "0x1", "a: b"])
+def test_yaml_writes_text_as_omegaconf_reads_it(text: str) -> None:
+    document = {"a": text, "b": [text], text: 1}
+    written = listing(Composed(document, [Part("file", (), document)]))
+    assert yaml.load(written, get_yaml_loader()) == document
+    assert len(written.splitlines()) == 3
+
+
+def test_yaml_is_of_a_valid_configuration_and_decides_nothing(tod: Command) -> None:
+    assert tod("print", "format=yaml", "total_kbps=3").err == (
+        "command line: total_kbps: decides nothing with format=yaml\n"
+    )
+    assert tod("print", "format=yaml", "fps_max=0").problems == ["command line: fps_max: 0: must be above 0"]

@@ -131,7 +131,7 @@ def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iter
 
 
 def _part(override: Override) -> Part:
-    return Part(COMMAND_LINE, (), nested(override.key, override.value))
+    return Part(COMMAND_LINE, (), nested(override.key, override.value), word=override.text)
 
 
 # --- Hydra ------------------------------------------------------------------------------------------------------------

@@ -56,6 +56,12 @@ class Configuration:
         """The configuration as plain data, not yet checked."""
         return self._composed.document
 
+    def listing(self) -> str:
+        """The configuration as YAML, each value with the file or the override that it comes from as a comment."""
+        from runner.configuration.listing import listing
+
+        return listing(self._composed)
+
     def vehicle(self) -> Vehicle:
         return self._builder.finished(self._builder.vehicle)
 

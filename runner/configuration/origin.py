@@ -17,12 +17,21 @@ GRAPH_PARTS = {"encoder": "vehicle", "sender": "vehicle", "receiver": "operator"
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One contributing file or override, with its content and its place in the whole configuration."""
+    """One contributing file or override, with its content and its place in the whole configuration.
+
+    word  the override, as given
+    """
 
     file: str
     package: schema.Path
     content: Any
     path: Path | None = None
+    word: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its file, or the command line with the override."""
+        return f"{self.file}: {schema.shortened(self.word)}" if self.word else self.file
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +54,11 @@ class Composed:
     def later_parts(self, path: schema.Path) -> list[Part]:
         """The parts that take precedence over the one that the value comes from, the last one first."""
         return self.parts[: self._age(self.written(path))]
+
+    def stated_by(self, path: schema.Path) -> Part | None:
+        """The part that states a value of the document, itself or by an interpolation; None: none does."""
+        value, path = value_at(self.document, path), self.written(path)
+        return next((part for part in self._visible(path) if _states(part, path, value)), None)
 
     def written(self, path: schema.Path) -> schema.Path:
         """Where a value of the document is written."""
@@ -115,6 +129,17 @@ def _merge(document: dict[str, Any], added: Mapping[str, Any]) -> None:
             _merge(document[key], value)
         else:
             document[key] = value
+
+
+def _states(part: Part, path: schema.Path, value: Any) -> bool:
+    """Whether a part holds this value at a path of the whole document, or an interpolation in its place."""
+    if path[: len(part.package)] != part.package:
+        return False
+    inner = path[len(part.package) :]
+    above = (value_at(part.content, inner[:length]) for length in range(len(inner) + 1))
+    if any(isinstance(held, str) and "${" in held for held in above):
+        return True
+    return _holds(part.content, inner) and value_at(part.content, inner) == value
 
 
 def _locality(part: Part) -> int:

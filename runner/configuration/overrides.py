@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice, product
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from runner import schema
 from runner.configuration.files import GROUPS, options
@@ -13,10 +15,15 @@ from runner.configuration.yaml_file import label
 from runner.core.model import suggest
 from runner.errors import ConfigError, Problem
 
+if TYPE_CHECKING:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import Override as HydraOverride
+
 COMMAND_LINE = "command line"
 OPTIONAL = ("link", "experiment")  # groups that need no chosen file
 LONGEST_WORD = 4096  # characters of an override, as for a path
 DEEPEST = 32  # brackets of one kind in an override
+MOST_RUNS = 1000  # of a sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,27 +64,79 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
     parser, parsed, problems = OverridesParser.create(), [], []
     for text in overrides:
         try:
-            if len(text) > LONGEST_WORD or max(map(text.count, "[{(")) > DEEPEST:
-                raise HydraException("is too long or nested too deeply, write it into a file")
-            override = parser.parse_override(text)
-            group = override.key_or_group.split("@")[0].lstrip("/")
+            override, group = _parsed(parser, text)
             if override.is_sweep_override():
-                raise HydraException("a,b,c is a sweep; write [a,b,c] for a list")
-            if group.partition(".")[0].partition("/")[0] in ("", "hydra"):
-                raise HydraException("no such key")
+                raise HydraException(
+                    "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,c] for a list"
+                )
             value = None if override.is_delete() else override.value()
             choice = group in GROUPS and not isinstance(value, dict)
             if choice and value is None and not override.is_delete():
                 value = "null"
             parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice))
         except HydraException as error:
-            rule = str(error).partition("\n")[0]
-            plain = "sweep" in rule or "no such" in rule or "too long" in rule
-            hint = "" if plain else """; quote a value with special characters: 'key="value"'"""
-            problems.append(Problem(COMMAND_LINE, "", schema.shortened(text), rule + hint))
+            problems.append(_problem(text, error))
     if problems:
         raise ConfigError(problems)
     return parsed
+
+
+def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
+    """The overrides of each run that sweeps stand for: a=1,2 or a=choice(1,2), a=range(1,5), in Hydra's grammar.
+
+    returns  one word for each given one, in the order of Hydra's own sweeper: the last word changes fastest
+    raises   ConfigError
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser, swept, problems = OverridesParser.create(), [], []
+    for text in words:
+        try:
+            override, _ = _parsed(parser, text)
+            swept.append(list(islice(_values(override), MOST_RUNS + 1)))
+        except HydraException as error:
+            problems.append(_problem(text, error))
+    if problems:
+        raise ConfigError(problems)
+    if (count := prod(map(len, swept))) > MOST_RUNS:
+        raise ConfigError([Problem(COMMAND_LINE, "-m", None, f"{count} runs or more: must be at most {MOST_RUNS}")])
+    return list(product(*swept))
+
+
+def _values(override: HydraOverride) -> Iterator[str]:
+    """An override for each value of a sweep; one that is no sweep as it is."""
+    from hydra.errors import HydraException
+
+    if not override.is_sweep_override():
+        yield str(override.input_line)
+    elif override.value_type and override.value_type.name in ("INTERVAL_SWEEP", "GLOB_CHOICE_SWEEP"):
+        raise HydraException("cannot be enumerated; a sweep is a,b,c or choice(a,b,c) or range(from,to,step)")
+    else:
+        yield from (f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator())
+
+
+def _parsed(parser: OverridesParser, text: str) -> tuple[HydraOverride, str]:
+    """A word as Hydra reads it, and the group or key that it names.
+
+    raises  HydraException
+    """
+    from hydra.errors import HydraException
+
+    if len(text) > LONGEST_WORD or max(map(text.count, "[{(")) > DEEPEST:
+        raise HydraException("is too long or nested too deeply, write it into a file")
+    override = parser.parse_override(text)
+    group = override.key_or_group.split("@")[0].lstrip("/")
+    if group.partition(".")[0].partition("/")[0] in ("", "hydra"):
+        raise HydraException("no such key")
+    return override, group
+
+
+def _problem(text: str, error: Exception) -> Problem:
+    rule = str(error).partition("\n")[0]
+    plain = any(part in rule for part in ("sweep", "no such", "too long"))
+    hint = "" if plain else """; quote a value with special characters: 'key="value"'"""
+    return Problem(COMMAND_LINE, "", schema.shortened(text), rule + hint)
 
 
 def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,34 +19,68 @@ DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
 class Verb(NamedTuple):
     """A verb: a short description, its module, its arguments.
 
-    takes  meaning of words without =, any number of them; "": none are accepted
+    takes     meaning of words without =, any number of them; "": none are accepted
+    sweeps    whether -m is accepted
+    composes  whether it reads a configuration, and so takes overrides
     """
 
     summary: str
     module: str
     arguments: tuple[str, ...]
     takes: str = ""
+    sweeps: bool = False
+    composes: bool = True
 
 
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
-        "print pipelines and decisions without starting them", "runner.verbs.print", ("total_kbps", "format")
+        "print pipelines and decisions without starting them",
+        "runner.verbs.print",
+        ("total_kbps", "format"),
+        sweeps=True,
     ),
+    "init": Verb("a directory of your own to start from", "runner.verbs.init", ("files",), "DIR", composes=False),
     "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
-    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link")),
+    "replay": Verb(
+        "events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link"), sweeps=True
+    ),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "latency": Verb("measure glass-to-glass latency", "runner.verbs.latency", ("camera", "duration_s", "loop")),
-    "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),
+    "demo": Verb(
+        "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
+    ),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
-    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
-    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE),
-    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
-    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
-    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
+    "report": Verb(
+        "the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE, composes=False
+    ),
+    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
+    "map": Verb(
+        "a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE, composes=False
+    ),
+    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE, composes=False),
+    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
+    "completion": Verb("what completes words in bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
+}
+
+
+SWEPT = ("total_kbps",)  # arguments over which -m sweeps, like over overrides; others may be paths with a comma
+# Flags of a Hydra application, and what stands in their place here.
+HYDRAS_FLAGS = {
+    ("--multirun",): "write -m",
+    ("--cfg", "-c"): "print format=yaml shows the composed configuration, and where each value comes from",
+    ("--resolve",): "print format=yaml resolves interpolations",
+    ("--package", "-p"): "print format=yaml shows the whole configuration",
+    ("--info", "-i"): "print format=yaml shows which files were composed; validate all=true checks all of them",
+    ("--config-dir", "-cd", "--config-path", "-cp"): "conf=DIR names a directory of your own",
+    ("--config-name", "-cn"): "conf=DIR may hold a config.yaml of your own",
+    ("--run", "-r"): "a verb runs without a flag",
+    ("--shell-completion", "-sc"): "tod-runner completion bash or zsh prints the script",
+    ("--hydra-help",): "docs/configuration.md says what of Hydra is supported",
+    ("--experimental-rerun",): "replay input=DRIVE repeats a drive with its own configuration",
 }
 
 
@@ -74,7 +108,8 @@ def extra_of(module: str) -> str | None:
 class Arguments:
     """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra.
 
-    words  those without =, if the verb takes any
+    words   those without =, if the verb takes any
+    sweeps  whether -m was given
     """
 
     verb: str
@@ -82,14 +117,17 @@ class Arguments:
     conf: Path | None = None
     values: dict[str, str] = field(default_factory=dict)
     words: tuple[str, ...] = ()
+    sweeps: bool = False
 
     @staticmethod
     def parse(verb: str, words: Sequence[str]) -> Arguments:
         """Split the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag, which no verb has, and for a name that only another verb or none takes
+        raises  UserError for a flag other than -m, and for a name that only another verb or none takes
         """
         own = (*VERBS[verb].arguments, "conf")
+        sweeps = VERBS[verb].sweeps and "-m" in words
+        words = [word for word in words if not (sweeps and word == "-m")]
         values: dict[str, str] = {}
         overrides, plain = [], []
         for word in words:
@@ -97,7 +135,7 @@ class Arguments:
             if equals and key in own:
                 values[key] = value
             elif word.startswith("-"):
-                raise UserError("command line", "", word, "flags are not supported; write NAME=VALUE, or --help")
+                raise unknown_flag(word)
             elif VERBS[verb].takes == DRIVE and (not equals or "/" in key):  # a path may contain a =
                 plain.append(word)
             elif not equals and not word.startswith("~"):
@@ -108,7 +146,28 @@ class Arguments:
                 _check_name(verb, key)
                 overrides.append(word)
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
-        return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain))
+        return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
+
+    def runs(self) -> list[tuple[tuple[str, ...], Arguments]]:
+        """The words and the arguments of each run that -m makes of sweeps.
+
+        raises  ConfigError
+        """
+        from runner.configuration.overrides import sweep
+
+        count = len(self.overrides)
+        swept = [key for key in SWEPT if key in self.values]
+        made = []
+        for words in sweep([*self.overrides, *(f"{key}={self.values[key]}" for key in swept)]):
+            values = {key: word.partition("=")[2] for key, word in zip(swept, words[count:], strict=True)}
+            own = replace(self, overrides=list(words[:count]), values=self.values | values, sweeps=False)
+            made.append((words, own))
+        return made
+
+    def in_directory(self, name: str, keys: Sequence[str]) -> Arguments:
+        """The same with directories, as far as they are given, replaced by one below them."""
+        inner = {key: str(path / name) for key in keys if (path := self.path(key))}
+        return replace(self, values=self.values | inner)
 
     def choice(self, key: str, options: Sequence[str]) -> str:
         """One of some words; the first if not given."""
@@ -135,6 +194,16 @@ class Arguments:
         if self.values.get(key) == "":  # an unset variable of the shell, which would mean the current directory
             raise UserError("command line", key, "''", "must not be empty")
         return Path(self.values[key]) if key in self.values else None
+
+
+def unknown_flag(word: str) -> UserError:
+    """What is wrong with a flag; one of Hydra's gets what stands in its place."""
+    name = word.partition("=")[0]
+    if name == "-m":
+        sweeping = ", ".join(verb for verb, its in VERBS.items() if its.sweeps)
+        return UserError("command line", "", word, f"must follow one of {sweeping}")
+    rule = next((instead for names, instead in HYDRAS_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
+    return UserError("command line", "", word, f"flags are not supported; {rule}")
 
 
 def _check_name(verb: str, key: str) -> None:

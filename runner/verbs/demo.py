@@ -1,4 +1,4 @@
-"""usage: tod-runner demo [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
+"""usage: tod-runner demo [-m] [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
 
 Both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a drive
 through a bandwidth map in mode A. Open the page that it names, http://127.0.0.1:8090/, in a browser; the table in the
@@ -10,6 +10,10 @@ With log=DIR both sides write their logs to DIR. With output=OUT a report is mad
 defines the drives; one with several runs makes several drives and compares them. With link= a link of limited rate
 connects both sides. keys= names the directory with everybody's keys, see the verb keys.
 
+With -m commas and range() are sweeps: each combination of values is a run, one after the other, as if started alone
+with output=OUT/0, OUT/1, ..., and with log=DIR/0, DIR/1, ...; all are checked before the first one starts.
+OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each: its directory and its overrides.
+
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
   tod-runner demo vehicle=delivery_robot duration_s=20
@@ -17,6 +21,7 @@ connects both sides. keys= names the directory with everybody's keys, see the ve
   tod-runner demo pqos.file=tum_bandwidth_map.yaml            along another map
   tod-runner demo experiment=driving_test output=OUT          the paper's driving test, with its figures
   tod-runner demo experiment=bottleneck output=OUT            three ways to share a link that is really limited
+  tod-runner demo -m modes=paper,safe output=OUT              the same drive under other rules
   tod-runner demo link=netns link.file=uplink.csv output=OUT  an uplink of your own; as root
 """
 
@@ -29,6 +34,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -45,6 +51,7 @@ from runner.plans import render_missing
 from runner.security.exposure import KeysOfAll
 from runner.system import children, signals
 from runner.system.children import VerbProcess
+from runner.system.files import write_whole
 from runner.verbs import Arguments
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
@@ -53,6 +60,7 @@ FPS_PER_CORE = 5  # Hz; eight cameras are encoded, sent, decoded and shown at th
 LOOK_S = 0.05  # how soon after a side's end the other is stopped
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
+DIRECTORIES = ("output", "log")  # arguments that get a directory for each run of a sweep
 DRIVE = "drive"  # where a drive is stored below output=
 
 
@@ -76,46 +84,85 @@ class _Run(NamedTuple):
     keys: KeysOfAll | None
 
 
+class _Demo(NamedTuple):
+    """The drives of an experiment, or the only one, and the report on them."""
+
+    about: str
+    runs: list[_Run]
+    output: Path | None
+    models: Path | None
+    bases: list[Path]
+
+
 def run(arguments: Arguments) -> int:
     apply = streaming()
+    if arguments.sweeps:
+        return _sweep(arguments, apply)
+    _carry_out(_prepared_demo(arguments, apply))
+    return 0
+
+
+def _sweep(arguments: Arguments, apply: ModuleType) -> int:
+    """The demos of a sweep, one after the other."""
+    from runner.verbs.sweep import prepared
+
+    places = {key: path for key in DIRECTORIES if (path := arguments.path(key))}
+    for key, place in places.items():
+        _check_empty(key, place)
+    numbers = count()
+    demos = prepared(arguments, lambda own: _prepared_demo(own.in_directory(str(next(numbers)), DIRECTORIES), apply))
+    lines = [json.dumps({"directory": str(number), "overrides": words}) for number, (words, _) in enumerate(demos)]
+    for place in places.values():
+        write_whole(place / "runs.jsonl", "".join(f"{line}\n" for line in lines).encode())
+    for number, (words, demo) in enumerate(demos, 1):
+        say(f"run {number} of {len(demos)}: {' '.join(words)}, {sum(one.duration_s for one in demo.runs):g} s")
+        _carry_out(demo)
+    return 0
+
+
+def _prepared_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
+    """What a demo needs, checked before it begins."""
     arguments, config = _with_rate(arguments)
     experiment, link = config.experiment(), config.link()
     output, models = arguments.path("output"), arguments.path("models")
     if output:
         check_report(output, models)
-        _check_empty(output)
+        _check_empty("output", output)
     elif models:
         raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
     runs = [
         _prepared(arguments, name, words, config, link, apply) for name, words in (experiment.runs or {"": ()}).items()
     ]
-    if experiment.about:
-        say(experiment.about)
+    bases = [base / "cameras" for base in conf_directories(arguments.conf)]
+    return _Demo(experiment.about, runs, output, models, bases)
+
+
+def _carry_out(demo: _Demo) -> None:
+    if demo.about:
+        say(demo.about)
     driven = list[Path]()
-    for number, one in enumerate(runs, 1):
+    for number, one in enumerate(demo.runs, 1):
         if one.name:
-            say(f"drive {number} of {len(runs)}: {one.name}, {one.duration_s:g} s")
+            say(f"drive {number} of {len(demo.runs)}: {one.name}, {one.duration_s:g} s")
         _drive(one)
         driven += [one.directory] if one.directory else []
-    if output and driven:
-        bases = [base / "cameras" for base in conf_directories(arguments.conf)]
+    if demo.output and driven:
         with signals.interruptible():
-            say(f"report: {report(driven, output, models, bases)}")
-    return 0
+            say(f"report: {report(driven, demo.output, demo.models, demo.bases)}")
 
 
-def _check_empty(output: Path) -> None:
-    """Check that everything in the directory will come from this demo.
+def _check_empty(key: str, directory: Path) -> None:
+    """Check that everything in the directory of an argument will come from this demo.
 
     raises  UserError
     """
     try:
-        found = sorted(path.name for path in output.iterdir()) if output.exists() else []
+        found = sorted(path.name for path in directory.iterdir()) if directory.exists() else []
     except OSError as error:
-        raise UserError("command line", "output", repr(str(output)), (error.strerror or str(error)).lower()) from None
+        raise UserError("command line", key, repr(str(directory)), (error.strerror or str(error)).lower()) from None
     if found:
         rule = f"must be a new or an empty directory, holds {', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
-        raise UserError("command line", "output", repr(str(output)), rule)
+        raise UserError("command line", key, repr(str(directory)), rule)
 
 
 def _prepared(

@@ -1,13 +1,20 @@
-"""usage: tod-runner print [OVERRIDE ...] [total_kbps=N] [format=text|json]
+"""usage: tod-runner print [-m] [OVERRIDE ...] [total_kbps=N] [format=text|json|yaml]
 
 Dry run: for each camera the pipeline of the vehicle and of the operator, and the rules' decision for a total of
 N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: in place of the live system's
 RTSP server and client, the lines have a UDP sink and the matching source, since gst-launch has neither. Passwords in
 addresses are left out: put them back to run such a line.
 
+format=yaml shows the composed configuration instead, with the file or the override that each value comes from.
+
+With -m commas and range() are sweeps, also of total_kbps: each combination is a run, the last word changes fastest.
+Each is one line of JSON, as by format=json, with the key overrides.
+
   tod-runner print total_kbps=3000                              the paper's vehicle at 3 Mbit/s
   tod-runner print vehicle=delivery_robot mode=collective       another vehicle
   tod-runner print graph=openh264_rtsp format=json              for programs
+  tod-runner print vehicle=delivery_robot format=yaml           what is configured, and where
+  tod-runner print -m modes=paper,safe 'total_kbps=range(1000,9000,1000)'
   sh -c "gst-launch-1.0 $(tod-runner print source=test format=json | jq -r .cameras.front_left.vehicle)"
 """
 
@@ -17,6 +24,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
@@ -24,6 +32,7 @@ from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
+from runner.errors import UserError
 from runner.graph import Plan
 from runner.plans import compile_plans
 from runner.records import CameraDecision, to_json
@@ -32,18 +41,50 @@ from runner.verbs import Arguments
 
 
 def run(arguments: Arguments) -> int:
-    form = arguments.choice("format", ("text", "json"))
+    form = arguments.choice("format", ("json",) if arguments.sweeps else ("text", "json", "yaml"))
+    if arguments.sweeps:
+        return _sweep(arguments)
+    if form == "yaml":
+        return _configured(arguments)
+    vehicle, plans, decision = _planned(arguments)
+    text = json.dumps(as_json(plans, decision), indent=2, ensure_ascii=False) if form == "json" else ""
+    _print(text or as_text(vehicle, plans, decision), _stand_ins(plans) if form == "json" else [])
+    return 0
+
+
+def _configured(arguments: Arguments) -> int:
+    if "total_kbps" in arguments.values:
+        raise UserError("command line", "total_kbps", None, "decides nothing with format=yaml")
+    config = configuration(arguments.overrides, arguments.conf)
+    config.vehicle()
+    _print(config.listing(), [])
+    return 0
+
+
+def _sweep(arguments: Arguments) -> int:
+    from runner.verbs.sweep import prepared
+
+    runs = prepared(arguments, _planned)
+    lines = [
+        json.dumps({"overrides": words, **as_json(plans, decision)}, ensure_ascii=False)
+        for words, (_, plans, decision) in runs
+    ]
+    _print("\n".join(lines), list(dict.fromkeys(note for _, (_, plans, _) in runs for note in _stand_ins(plans))))
+    return 0
+
+
+def _planned(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:
     total = arguments.number("total_kbps")
     vehicle = configuration(arguments.overrides, arguments.conf).vehicle()
-    plans = compile_plans(vehicle)
-    decision = decide(vehicle, None if total is None else exact(total))
-    text = as_json(plans, decision) if form == "json" else as_text(vehicle, plans, decision)
+    return vehicle, compile_plans(vehicle), decide(vehicle, None if total is None else exact(total))
+
+
+def _print(text: str, notes: list[str]) -> None:
+    """Print without passwords; notes go to standard error."""
     print(redacted(text))
-    notes = _stand_ins(plans) if form == "json" else []
     if redacted(text) != text:
         notes.append("passwords of addresses are left out")
     print("\n".join(notes), end="\n" if notes else "", file=sys.stderr)
-    return 0
 
 
 def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
@@ -60,7 +101,7 @@ def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
     return run.decision
 
 
-def as_json(plans: Sequence[Plan], decision: Decision) -> str:
+def as_json(plans: Sequence[Plan], decision: Decision) -> dict[str, Any]:
     cameras = {
         plan.camera.name: {
             "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
@@ -70,8 +111,7 @@ def as_json(plans: Sequence[Plan], decision: Decision) -> str:
         }
         for plan in plans
     }
-    document = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
-    return json.dumps(document, indent=2, ensure_ascii=False)
+    return {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
 
 
 def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:

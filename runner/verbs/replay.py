@@ -1,4 +1,4 @@
-"""usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
+"""usage: tod-runner replay [-m] [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
@@ -15,6 +15,9 @@ from the positions and times of the input; its events are marked "source": "pqos
 Measurements of the link are those of the input. With link=again they are estimated again from the drive's reception
 reports: by the same version, to the same events.
 
+With -m, which needs input=, commas and range() are sweeps: each combination of values is a run over the same events,
+one after the other. Each line then begins with the key overrides; with log=DIR the drives are DIR/0, DIR/1, ...
+
   echo '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}' | tod-runner replay modes=paper
   tod-runner replay input=drive output=decisions.jsonl
   tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
@@ -22,6 +25,7 @@ reports: by the same version, to the same events.
   tod-runner replay input=drive link=again     for a change of the estimator
   tod-runner replay input=drive cameras.rear_center.weight=2
   tod-runner replay input=drive vehicle=delivery_robot
+  tod-runner replay -m input=drive modes=safe,steady cameras.rear_center.weight=1,2
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
@@ -57,17 +61,56 @@ InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
 _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
 
+class _Prepared(NamedTuple):
+    """What a run needs beside the events. pqos: predicts in place of the events' own predictions"""
+
+    arguments: Arguments
+    config: Mapping[str, Any]
+    vehicle: Vehicle
+    pqos: Pqos | None
+
+
 def run(arguments: Arguments) -> int:
+    if arguments.sweeps:
+        return _sweep(arguments)
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
-        config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
-        chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
-        pqos = config.pqos()[0] if chosen else None
-        vehicle = config.vehicle()
-        with _output(arguments) as output, _log(arguments, config.document, began) as log:
-            for line in replay(vehicle, events(lines, name, _uplink(arguments, vehicle)), pqos, log):
-                output.write(line)
+        one = _prepared(arguments, name, began)
+        with _output(arguments) as output:
+            output.writelines(_answered(one, lines, name, began))
     return 0
+
+
+def _sweep(arguments: Arguments) -> int:
+    from runner.verbs.sweep import prepared
+
+    if arguments.path("input") is None:
+        raise UserError("command line", "-m", None, "reads the events once for each run: give input=FILE")
+    with _input(arguments) as (name, text):
+        _, began = _begin(text, name)
+    runs = prepared(arguments, lambda own: _prepared(own, name, began))
+    with _output(arguments) as output:
+        for number, (words, one) in enumerate(runs):
+            own = one._replace(arguments=one.arguments.in_directory(str(number), ["log"]))
+            with _input(arguments) as (_, text):
+                lines, _ = _begin(text, name)
+                output.writelines(
+                    f'{{"overrides": {_encode(words)}, {line[1:]}' for line in _answered(own, lines, name, began)
+                )
+    return 0
+
+
+def _prepared(arguments: Arguments, name: str, began: Began | None) -> _Prepared:
+    config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
+    chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
+    pqos = config.pqos()[0] if chosen else None
+    return _Prepared(arguments, config.document, config.vehicle(), pqos)
+
+
+def _answered(run: _Prepared, lines: Iterable[str], name: str, began: Began | None) -> Iterator[str]:
+    """The lines of a run, which is logged if requested."""
+    with _log(run.arguments, run.config, began) as log:
+        yield from replay(run.vehicle, events(lines, name, _uplink(run.arguments, run.vehicle)), run.pqos, log)
 
 
 def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:

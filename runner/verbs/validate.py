@@ -12,7 +12,8 @@ conf=DIR, otherwise the nearest one above it that has folders of groups.
 
 If GStreamer is installed, configurations are also checked against its registry: elements, properties, types, ranges,
 and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends
-with status 2 and reports all problems at once.
+with status 2 and reports all problems at once. If DIR/.schemas, by which your editor checks, is of another version than
+this tod-runner, standard error says so.
 
   tod-runner validate conf=my_vehicles                       your files, the step for your CI
   tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit
@@ -24,6 +25,7 @@ with status 2 and reports all problems at once.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -96,6 +98,7 @@ def run(arguments: Arguments) -> int:
     files, configurations, notes = 0, 0, dict[str, None]()
     _composed.cache_clear()
     for conf, named in _directories(arguments).items():
+        _warn_of_other_schemas(conf)
         directories = conf_directories(conf)
         found, checked = check_files(directories if everything else directories[:1], named)
         if found:
@@ -111,6 +114,15 @@ def run(arguments: Arguments) -> int:
     print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
     print("\n".join(notes), end="\n" if notes else "")
     return 0
+
+
+def _warn_of_other_schemas(conf: Path | None) -> None:
+    if conf is None:
+        return
+    from runner.configuration.editors import version_problem
+
+    if problem := version_problem(conf):
+        print(problem, file=sys.stderr)
 
 
 def _counted(count: int, what: str) -> str:

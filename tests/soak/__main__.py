@@ -46,12 +46,9 @@ PARTS: dict[str, Part] = {
     "hostile": hostile.soak,
     "reports": reports.soak,
     "clocks": clocks.soak,
-<<<<<<< HEAD
     "roaming": roaming.soak,
-=======
     "outages": outages.soak,
     "churn": churn.soak,
->>>>>>> faults
 }
 
 

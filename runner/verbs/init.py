@@ -1,0 +1,98 @@
+"""usage: tod-runner init DIR [files=all|schemas]
+
+A directory to start from: a vehicle with two cameras, a kind of camera, a modes file, checks for GitHub Actions and for
+pre-commit, and in DIR/.schemas the schemas by which your editor completes, explains and checks keys. It passes
+`validate` as it is. Files that exist are never overwritten: then nothing is written, and each is named. A new
+directory appears when it is complete.
+
+With files=schemas only the schemas are written: for a directory that you have, and after an update.
+
+  tod-runner init my_fleet
+  tod-runner validate conf=my_fleet
+  tod-runner print conf=my_fleet vehicle=my_vehicle modes=my_modes
+  tod-runner init my_vehicles files=schemas
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+from runner.configuration.editors import copies
+from runner.errors import ConfigError, Problem, UserError
+from runner.verbs import Arguments
+
+VEHICLE = "my_vehicle"
+STARTING = {  # by path in the directory, the file in static/
+    f"vehicle/{VEHICLE}.yaml": "vehicle.yaml",
+    "cameras/my_camera.yaml": "camera.yaml",
+    "modes/my_modes.yaml": "modes.yaml",
+    ".github/workflows/validate.yaml": "workflow.yaml",
+    ".pre-commit-config.yaml": "pre-commit.yaml",
+}
+
+
+def run(arguments: Arguments) -> int:
+    everything = arguments.choice("files", ("all", "schemas")) == "all"
+    if len(arguments.words) != 1 or arguments.overrides:
+        found = " ".join([*arguments.words, *arguments.overrides])
+        raise UserError("command line", "", found or None, "must be one directory, and nothing to compose: init DIR")
+    place = Path(arguments.words[0])
+    texts = {**(_starting() if everything else {}), **copies()}
+    if problems := list(dict.fromkeys(_problems(place, texts))):
+        raise ConfigError(problems, "nothing was written")
+    _write(place, texts)
+    print("\n".join(str(place / name) for name in texts))
+    if everything:
+        print(f"next: tod-runner validate conf={place}; tod-runner print conf={place} vehicle={VEHICLE} modes=my_modes")
+    return 0
+
+
+def _starting() -> dict[str, str]:
+    static = Path(__file__).parent / "static"
+    return {name: (static / file).read_text(encoding="utf-8") for name, file in STARTING.items()}
+
+
+def _problems(place: Path, texts: Mapping[str, str]) -> Iterator[Problem]:
+    """What stands where something is to be written."""
+    for name in texts:
+        path = place / name
+        above = [folder for folder in path.parents if os.path.lexists(folder) and not folder.is_dir()]
+        if above:
+            yield Problem(str(above[0]), "", None, "must be a directory")
+        elif os.path.lexists(path):
+            yield Problem(str(path), "", None, "exists, and init overwrites nothing")
+
+
+def _write(place: Path, texts: Mapping[str, str]) -> None:
+    """Write all files or none. A new or an empty directory is made beside its place and then put there."""
+    if place.is_dir() and any(place.iterdir()):
+        _fill(place, texts)
+        return
+    place = place.resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    part = place.with_name(f".{place.name}.{os.getpid()}")
+    try:
+        part.mkdir()
+        _fill(part, texts)
+        part.rename(place)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _fill(place: Path, texts: Mapping[str, str]) -> None:
+    """Write files into a directory; if one fails, all are removed again."""
+    with ExitStack() as made:
+        for name, text in texts.items():
+            path = place / name
+            for folder in reversed([above for above in path.parents if not above.exists()]):
+                folder.mkdir()
+                made.callback(folder.rmdir)
+            with path.open("x", encoding="utf-8") as file:
+                made.callback(path.unlink)
+                file.write(text)
+        made.pop_all()

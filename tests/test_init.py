@@ -1,0 +1,207 @@
+"""`init`: a directory to start from, that is valid at once, and whose files an editor checks."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import pytest
+import yaml
+from helpers import Command, process
+
+from runner.configuration.editors import FOLDER
+from runner.resources import directory
+from runner.verbs.init import STARTING
+
+CHECKOUT = directory("schemas").parent
+SERVER = CHECKOUT / "node_modules" / ".bin" / "yaml-language-server"
+SCHEMAS = sorted(path.name for path in directory("schemas").glob("*.json"))
+
+
+@pytest.fixture
+def fleet(tod: Command, tmp_path: Path) -> Path:
+    assert tod("init", str(tmp_path / "fleet")).status == 0
+    return tmp_path / "fleet"
+
+
+def files(place: Path) -> dict[str, str]:
+    return {str(path.relative_to(place)): path.read_text() for path in place.rglob("*") if path.is_file()}
+
+
+def test_the_directory_is_valid_at_once(tod: Command, fleet: Path) -> None:
+    assert set(files(fleet)) == {*STARTING, f"{FOLDER}/VERSION", *(f"{FOLDER}/{name}" for name in SCHEMAS)}
+    assert tod("validate", f"conf={fleet}").err == ""
+    status, out, err = tod("print", f"conf={fleet}", "vehicle=my_vehicle", "modes=my_modes", "source=v4l2")
+    assert (status, err) == (0, "")
+    assert [line.partition(":")[0] for line in out.splitlines() if " kbit/s: " in line] == ["# front", "# rear"]
+
+
+def test_the_checks_run_validate(fleet: Path) -> None:
+    steps = yaml.safe_load((fleet / ".github/workflows/validate.yaml").read_text())["jobs"]["validate"]["steps"]
+    (hook,) = yaml.safe_load((fleet / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert hook["entry"] == steps[-1]["run"] == "tod-runner validate conf=."
+    result = process(*hook["entry"].split()[1:], cwd=fleet)
+    assert (result.status, result.err) == (0, "")
+
+
+@pytest.mark.parametrize("place", [".", "new/below"])
+def test_a_directory_without_our_files(
+    tod: Command, tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "README.md").touch()
+    monkeypatch.chdir(tmp_path)
+    assert tod("init", place).status == 0
+    assert (tmp_path / place / "cameras" / "my_camera.yaml").is_file()
+    assert (tmp_path / "README.md").exists()
+
+
+def test_nothing_is_overwritten_and_every_problem_is_named(tod: Command, tmp_path: Path) -> None:
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "cameras" / "my_camera.yaml").write_text("mine\n")
+    (tmp_path / "modes").touch()
+    (tmp_path / FOLDER).symlink_to(tmp_path / "nowhere")
+    before = files(tmp_path)
+    assert tod("init", str(tmp_path)) == (
+        2,
+        "",
+        f"{tmp_path}/cameras/my_camera.yaml: exists, and init overwrites nothing\n"
+        f"{tmp_path}/modes: must be a directory\n"
+        f"{tmp_path}/{FOLDER}: must be a directory\n"
+        "3 problems, nothing was written\n",
+    )
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("there", [False, True], ids=["new", "in use"])
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, there: bool) -> None:
+    place = tmp_path / "fleet"
+    if there:
+        place.mkdir()
+        (place / "mine").write_text("mine\n")
+
+    def small_files() -> None:
+        """A limit that the small files keep and a schema exceeds."""
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+
+    result = process("init", str(place), preexec_fn=small_files, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
+    assert result.status == 1 and "file too large" in result.err and len(result.err.splitlines()) == 1, result
+    assert files(tmp_path) == ({"fleet/mine": "mine\n"} if there else {})
+    assert len(list(tmp_path.rglob("*"))) == (2 if there else 0)
+
+
+@pytest.mark.parametrize("words", [[], ["a", "b"], ["a", "vehicle=tum_q7"]])
+def test_one_directory_is_named(
+    tod: Command, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, err = tod("init", *words)
+    assert (status, out) == (2, "")
+    assert "must be one directory" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validate_tells_that_the_editor_knows_another_version(tod: Command, fleet: Path) -> None:
+    (fleet / FOLDER / "VERSION").write_text("0.0.1\n")
+    status, out, err = tod("validate", f"conf={fleet}")
+    assert status == 0 and out.startswith("valid: 3 files")
+    again = f"rm -r {fleet}/{FOLDER} && tod-runner init {fleet} files=schemas"
+    own = version("tod-runner")
+    assert (
+        err == f"{fleet}/{FOLDER}: version 0.0.1, this is tod-runner {own}; your editor may know other keys: {again}\n"
+    )
+    subprocess.run(["rm", "-r", fleet / FOLDER], check=True)
+    assert tod("validate", f"conf={fleet}").err == ""  # no copies, nothing to be wrong
+    assert tod("init", str(fleet), "files=schemas").status == 0
+    assert tod("validate", f"conf={fleet}").err == ""
+
+
+# --- an editor --------------------------------------------------------------------------------------------------------
+
+
+class Editor:
+    """Speaks the Language Server Protocol with yaml-language-server, as an editor does."""
+
+    def __init__(self, server: subprocess.Popen[bytes]) -> None:
+        self._server = server
+
+    def send(self, method: str, params: Any, number: int | None = None) -> None:
+        message = {"jsonrpc": "2.0", "method": method, "params": params} | ({} if number is None else {"id": number})
+        body = json.dumps(message).encode()
+        assert self._server.stdin
+        self._server.stdin.write(b"Content-Length: %d\r\n\r\n%s" % (len(body), body))
+        self._server.stdin.flush()
+
+    def ask(self, number: int, method: str, params: Any) -> Any:
+        self.send(method, params, number)
+        return next(message["result"] for message in self.messages() if message.get("id") == number)
+
+    def opened(self, path: Path, text: str) -> list[str]:
+        """The diagnostics of a file."""
+        document = {"uri": path.as_uri(), "languageId": "yaml", "version": 1, "text": text}
+        self.send("textDocument/didOpen", {"textDocument": document})
+        found = (message["params"] for message in self.messages() if message.get("method", "").endswith("Diagnostics"))
+        return [each["message"] for each in next(each for each in found if each["uri"] == path.as_uri())["diagnostics"]]
+
+    def messages(self) -> Iterator[dict[str, Any]]:
+        """Messages of the server; its own requests are answered with null."""
+        assert self._server.stdout
+        while header := self._server.stdout.readline():
+            length = int(header.split(b":")[1])
+            while self._server.stdout.readline().strip():
+                pass
+            message = json.loads(self._server.stdout.read(length))
+            if "method" in message and "id" in message:
+                count = len(message["params"].get("items", ())) if message["params"] else 0
+                body = json.dumps({"jsonrpc": "2.0", "id": message["id"], "result": [None] * count or None}).encode()
+                assert self._server.stdin
+                self._server.stdin.write(b"Content-Length: %d\r\n\r\n%s" % (len(body), body))
+                self._server.stdin.flush()
+                continue
+            yield message
+
+
+@contextmanager
+def editor(place: Path) -> Iterator[Editor]:
+    with subprocess.Popen([SERVER, "--stdio"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
+        limit = Timer(60, server.kill)  # its end is the end of its messages
+        limit.start()
+        try:
+            one = Editor(server)
+            one.ask(1, "initialize", {"processId": None, "rootUri": place.as_uri(), "capabilities": {}})
+            one.send("initialized", {})
+            yield one
+        finally:
+            limit.cancel()
+            server.kill()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "name, right, wrong, description",
+    [
+        ("cameras/my_camera.yaml", "height_px", "heigth_px", "Height of the full image"),
+        ("vehicle/my_vehicle.yaml", "pose", "psoe", "Where the camera sits"),
+        ("modes/my_modes.yaml", "automatic", "autmatic", "Mode A: the total"),
+    ],
+)
+def test_an_editor_checks_and_explains_keys(fleet: Path, name: str, right: str, wrong: str, description: str) -> None:
+    path = fleet / name
+    text = path.read_text()
+    with editor(fleet) as one:
+        assert one.opened(path, text) == []
+        line = next(number for number, line in enumerate(text.splitlines()) if line.lstrip().startswith(f"{right}:"))
+        place = {"line": line, "character": text.splitlines()[line].index(right) + 1}
+        hover = one.ask(2, "textDocument/hover", {"textDocument": {"uri": path.as_uri()}, "position": place})
+        assert description in str(hover["contents"]), hover
+        other = path.with_name(f"misspelt_{path.name}")
+        found = one.opened(other, text.replace(f"{right}:", f"{wrong}:", 1))
+        assert any(wrong in message for message in found), found
