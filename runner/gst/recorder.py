@@ -9,6 +9,7 @@ from enum import Enum
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.bag_feed import BagFeed, read_bag
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.pipeline import counted
@@ -75,6 +76,15 @@ class Recorder:
         self._counting_down = self._finishing = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
         self._rated = fixed_rate(self._pipeline) if not plan.loops else []
+        self._feed = self._read_bag() if plan.bag else None
+
+    def _read_bag(self) -> BagFeed:
+        """A bag is recorded as fast as the encoder takes it: once, or again and again up to a given length."""
+        assert self._plan.bag
+        self._queue.set_property("leaky", "no")
+        source = self._pipeline.get_by_name(self._plan.source[0].name)
+        loop = self._plan.camera.source.loop and self._duration_s is not None
+        return read_bag(source, self._plan.bag, self._plan.camera.fps, loop)
 
     def start(self) -> None:
         """Begin; a recording that cannot begin is FAILED at the next check."""
@@ -146,7 +156,9 @@ class Recorder:
         )
 
     def _began(self) -> float:
-        """Wall-clock time of the first frame."""
+        """Wall-clock time of the first frame; of a bag's, when it was captured."""
+        if self._feed and self._feed.first is not None:
+            return float(self._feed.first / Gst.SECOND)
         clock = self._pipeline.get_clock()
         if clock is None:
             return 0.0

@@ -60,6 +60,7 @@ EXTRAS = {
     "vmaf": ("imageio_ffmpeg",),
     "cluster": ("distributed",),
     "mcap": ("foxglove",),
+    "bag": ("rosbags",),
     "security": ("cryptography",),
     "metrics": ("prometheus_client",),
 }
