@@ -35,7 +35,7 @@ class Recorded:
 
     frames     frames kept
     seconds    from the first to the end of the last one, by their timestamps
-    missing    frames expected in this time that are absent
+    missing    frames expected in this time that are absent; a bag is not expected to have any
     overruns   frames dropped at the full queue before the encoder, even after the end
     repeated   frames that the source repeated to keep its rate, not counted for a clip
     left_out   frames that the source dropped to keep its rate, likewise
@@ -88,7 +88,8 @@ class Recorder:
 
     def start(self) -> None:
         """Begin; a recording that cannot begin is FAILED at the next check."""
-        self._queue.connect("overrun", self._on_overrun)
+        if not self._feed:  # whose pictures wait
+            self._queue.connect("overrun", self._on_overrun)
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
             element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
@@ -146,14 +147,20 @@ class Recorder:
         return Recorded(
             frames=frames,
             seconds=seconds,
-            missing=max(0, round(seconds * self._plan.camera.fps) - frames),
+            missing=0 if self._feed else max(0, round(seconds * self._plan.camera.fps) - frames),
             overruns=self._overruns,
             repeated=sum(element.get_property("duplicate") for element in self._rated),
-            left_out=sum(element.get_property("drop") for element in self._rated),
+            left_out=sum(map(self._dropped, self._rated)),
             width=picture.get_int("width")[1],
             height=picture.get_int("height")[1],
             began=self._recorded.began or self._began(),
         )
+
+    def _dropped(self, element: Gst.Element) -> int:
+        """Frames that an element has dropped to keep a rate."""
+        if self._feed:  # its own count includes the end of the bag
+            return int(element.get_property("in") - element.get_property("out"))
+        return int(element.get_property("drop"))
 
     def _began(self) -> float:
         """Wall-clock time of the first frame; of a bag's, when it was captured."""
