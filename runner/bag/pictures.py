@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 SECOND_NS = 1_000_000_000
 # By encoding (sensor_msgs/image_encodings.hpp), GStreamer's name of the format and bytes of a pixel.
 FORMATS = {
@@ -97,6 +95,8 @@ def stamp_ns(message: Any) -> int:
 
 def _padded(data: Any, height: int, row: int) -> bytes:
     """Rows without their padding in the message, with that of GStreamer."""
+    import numpy as np
+
     rows = np.asarray(data, np.uint8).reshape(height, -1)
     stride = -(-row // ALIGNED) * ALIGNED
     if rows.shape[1] == stride:

@@ -34,16 +34,27 @@ VERBS = {
         "print pipelines and decisions without starting them", "runner.verbs.print", ("total_kbps", "format")
     ),
     "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
-    "replay": Verb("events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link")),
+    "replay": Verb(
+        "events in, decisions out, no video",
+        "runner.verbs.replay",
+        ("input", "output", "log", "link", "positions", "topic"),
+    ),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "latency": Verb("measure glass-to-glass latency", "runner.verbs.latency", ("camera", "duration_s", "loop")),
     "demo": Verb("both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s")),
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
-    "report": Verb("the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE),
+    "report": Verb(
+        "the paper's figures from real drives", "runner.verbs.report", ("output", "models", "positions", "topic"), DRIVE
+    ),
     "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE),
-    "map": Verb("a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE),
+    "map": Verb(
+        "a bandwidth map from drives",
+        "runner.verbs.map",
+        ("output", "percentile", "cell_m", "positions", "topic"),
+        DRIVE,
+    ),
     "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),

@@ -1,4 +1,5 @@
 """usage: tod-runner replay [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
+                         [positions=BAG [topic=NAME]]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
@@ -15,10 +16,14 @@ from the positions and times of the input; its events are marked "source": "pqos
 Measurements of the link are those of the input. With link=again they are estimated again from the drive's reception
 reports: by the same version, to the same events.
 
+Positions are those of the input. With positions=BAG they are replaced by those of a bag of ROS that was recorded during
+the drive (sensor_msgs/NavSatFix), marked "source": "bag"; topic= is needed if it has several such topics.
+
   echo '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}' | tod-runner replay modes=paper
   tod-runner replay input=drive output=decisions.jsonl
   tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
   tod-runner replay input=drive pqos=map pqos.file=other_map.csv
+  tod-runner replay input=drive positions=gps.bag pqos=map pqos.file=other_map.csv
   tod-runner replay input=drive link=again     for a change of the estimator
   tod-runner replay input=drive cameras.rear_center.weight=2
   tod-runner replay input=drive vehicle=delivery_robot
@@ -29,6 +34,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain, islice
@@ -37,7 +43,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
-from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, parse, to_json
+from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, log_run
@@ -64,8 +70,11 @@ def run(arguments: Arguments) -> int:
         chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
         pqos = config.pqos()[0] if chosen else None
         vehicle = config.vehicle()
+        inputs = events(lines, name, _uplink(arguments, vehicle))
+        if not arguments.values.keys().isdisjoint(("positions", "topic")):
+            inputs = _positioned(inputs, arguments, began)
         with _output(arguments) as output, _log(arguments, config.document, began) as log:
-            for line in replay(vehicle, events(lines, name, _uplink(arguments, vehicle)), pqos, log):
+            for line in replay(vehicle, inputs, pqos, log):
                 output.write(line)
     return 0
 
@@ -130,6 +139,26 @@ def replay(
         if log:
             log_run(log, event, before, now)
         yield answers.line(document, now)
+
+
+def _positioned(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
+    """The events with the positions of a bag in place of their own."""
+    from runner.drive.positions import given_positions, spanned
+
+    recorded = given_positions(arguments.values)
+    if began is None:
+        rule = "needs a drive as input: events alone do not state when they happened"
+        raise UserError("command line", "positions", recorded.where, rule)
+    waiting, last, found = deque(recorded.since(began.time)), 0.0, False
+    for document, event in inputs:
+        last = event.t
+        while waiting and waiting[0].t <= last:
+            position, found = waiting.popleft(), True
+            yield to_json(position) | {"source": "bag"}, position
+        if not isinstance(event, PositionReported):
+            yield document, event
+    if not found:
+        raise recorded.refuse(f"the input: {spanned(began.time, began.time + last)}")
 
 
 def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
