@@ -55,7 +55,7 @@ VERBS = {
         ("output", "percentile", "cell_m", "positions", "topic"),
         DRIVE,
     ),
-    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE),
+    "export": Verb("a drive as MCAP or ROS 2 bag", "runner.verbs.export", ("output", "format"), DRIVE),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
 }
