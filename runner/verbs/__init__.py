@@ -28,6 +28,7 @@ class Verb(NamedTuple):
     takes: str = ""
 
 
+CONVERSION = ("output", "vehicle", "bag", "width_px", "height_px", "fps", "overwrite")
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
@@ -56,6 +57,7 @@ VERBS = {
         DRIVE,
     ),
     "export": Verb("a drive as MCAP or ROS 2 bag", "runner.verbs.export", ("output", "format"), DRIVE),
+    "convert": Verb("a vehicle from the paper's own camera list", "runner.verbs.convert", CONVERSION, "FILE"),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
 }

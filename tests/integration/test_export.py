@@ -399,7 +399,10 @@ def test_words_that_are_no_export(tmp_path):
         ([str(drive), str(drive)], f"command line: {drive} {drive}: {name}"),
         ([f"{tmp_path}/none"], f"{tmp_path}/none: no such directory"),
         ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
-        ([str(drive), "mode=single"], "command line: mode=single: an export has no configuration, only format= and output="),
+        (
+            [str(drive), "mode=single"],
+            "command line: mode=single: an export has no configuration, only format= and output=",
+        ),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],
             f"command line: output: '{tmp_path}/there.mcap': {there}",
