@@ -24,8 +24,8 @@ from pathlib import Path
 from runner import schema
 from runner.configuration.camera_list import (
     NAME,
-    ListedCamera,
     CameraSize,
+    ListedCamera,
     camera_document,
     camera_text,
     read_camera_list,
