@@ -20,11 +20,10 @@ ENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
 UNPACED = {"is-live": False, "leaky-type": 0, "block": True}  # of an appsrc that waits until each picture is taken
 
 
-def play_bag(pipeline: Gst.Bin, plan: Plan, on_report: Callable[[str], None]) -> None:
-    """Let the source of a new pipeline play its bag, if it plays one, as a camera would: live, at the bag's pace."""
-    if plan.bag:
-        source = pipeline.get_by_name(plan.source[0].name)
-        BagFeed(source, plan.bag, plan.camera.fps, plan.camera.source.loop, on_report)
+def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[str], None]) -> None:
+    """Let the source of a new pipeline play a bag as a camera would: live, at the bag's pace."""
+    source = pipeline.get_by_name(plan.source[0].name)
+    BagFeed(source, bag, plan.camera.fps, plan.camera.source.loop, on_report)
 
 
 def read_bag(source: Gst.Element, bag: BagTopic, fps: Fraction, loop: bool = False) -> BagFeed:
@@ -136,7 +135,7 @@ class BagFeed:
                 self._waiting.wait(min(early / Gst.SECOND, LOOK_S))
                 if self._source.get_state(0).state < Gst.State.PAUSED:
                     return False
-            if -early > BEHIND_S * Gst.SECOND:  # as a clip, it does not catch up
+            if -early > BEHIND_S * Gst.SECOND:  # like a clip, it does not catch up
                 self._shift -= early
                 self._last -= early
         buffer = Gst.Buffer.new_wrapped(picture.data)
@@ -144,8 +143,9 @@ class BagFeed:
         return bool(self._source.emit("push-buffer", buffer) == Gst.FlowReturn.OK)
 
     def _now(self) -> int:
-        """Running time of the pipeline, ns."""
-        return int(self._source.get_clock().get_time() - self._source.get_base_time())
+        """Running time of the pipeline, ns; 0 once the source has been taken out of it."""
+        clock = self._source.get_clock()
+        return int(clock.get_time() - self._source.get_base_time()) if clock else 0
 
     def _fail(self, why: str) -> None:
         error = GLib.Error.new_literal(Gst.ResourceError.quark(), why, Gst.ResourceError.READ)

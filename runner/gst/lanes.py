@@ -14,7 +14,6 @@ from fractions import Fraction
 from gi.repository import GLib, Gst
 
 from runner.errors import RunError
-from runner.gst.bag_feed import read_bag
 from runner.gst.pictures import LumaPlane, luma_of
 from runner.gst.pipeline import counted
 from runner.lanes import BAG, FRAMES, LaneSet
@@ -64,6 +63,8 @@ def run_lanes(
     """
     pipeline = _parsed(lanes.line)
     if lanes.bag:
+        from runner.gst.bag_feed import read_bag
+
         read_bag(pipeline.get_by_name(BAG), lanes.bag, lanes.fps)
     run = _Run(lanes.fps)
     pipeline.get_by_name(FRAMES).get_static_pad("sink").add_probe(

@@ -11,7 +11,6 @@ from runner.core.commands import KnobValue
 from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
-from runner.gst.bag_feed import play_bag
 from runner.gst.knobs import KnobPanel
 from runner.gst.repeats import RepeatedPicture
 from runner.gst.sender_stages import EncoderWatch, SenderStages
@@ -46,8 +45,10 @@ class CameraPipeline:
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
             loop_clip(pipeline, plan)
-        if source is None:
-            play_bag(pipeline, plan, on_report)
+        if plan.bag and source is None:
+            from runner.gst.bag_feed import play_bag
+
+            play_bag(pipeline, plan, plan.bag, on_report)
         self._started = False
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)

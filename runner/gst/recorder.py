@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
-from runner.gst.bag_feed import BagFeed, read_bag
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.pipeline import counted
 from runner.gst.source import fixed_rate, loop_clip
+
+if TYPE_CHECKING:
+    from runner.gst.bag_feed import BagFeed
 
 CHECK_MS = 100
 SILENT_S = 10.0  # a source that delivers nothing for this long has failed
@@ -80,6 +83,8 @@ class Recorder:
 
     def _read_bag(self) -> BagFeed:
         """A bag is recorded as fast as the encoder takes it: once, or again and again up to a given length."""
+        from runner.gst.bag_feed import read_bag
+
         assert self._plan.bag
         self._queue.set_property("leaky", "no")
         source = self._pipeline.get_by_name(self._plan.source[0].name)

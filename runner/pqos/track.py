@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from runner.bag import POSITIONS, Bag, is_bag
-from runner.bag.pictures import SECOND_NS
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
 from runner.pqos import SLOWEST_MPS
@@ -76,6 +74,8 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
         case "track":
             with within("position"):
                 path = find_path(position, "file", bases)
+                from runner.bag import is_bag
+
                 if is_bag(path):
                     return of_bag(path, position.get("topic"), loop)
                 return recorded(find_file(position, "file", bases), loop)
@@ -98,6 +98,9 @@ def of_bag(path: Path, topic: str | None, loop: bool) -> Track:
 
     raises  ModelError
     """
+    from runner.bag import POSITIONS, Bag
+    from runner.bag.pictures import SECOND_NS
+
     try:
         with Bag(path) as bag:
             found = bag.find(POSITIONS, topic, "positions")

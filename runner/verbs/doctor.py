@@ -97,6 +97,8 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield "page"
     if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
         yield "synthetic"
+    if verb in ("vehicle", "demo", "record", "model") and any(c.source.plays_bags for c in vehicle.cameras.values()):
+        yield "bag"
     if verb == "model":
         study = document["study"]
         yield from ["vmaf"] if "vmaf" in study["metric"] else []
