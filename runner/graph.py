@@ -12,6 +12,7 @@ from fractions import Fraction
 from runner.core.commands import KnobValue
 from runner.core.model import (
     PLACEHOLDER,
+    BagTopic,
     Camera,
     Capture,
     Element,
@@ -83,6 +84,7 @@ class Plan:
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
     recorder   elements that follow the source when it is recorded, without the file; empty if it is not recorded
+    bag        pictures that are pushed into the first element of the source; None: it needs none
     video      whether each side also writes what it sends or receives into a file
     """
 
@@ -96,6 +98,7 @@ class Plan:
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
     recorder: tuple[Element, ...] = ()
+    bag: BagTopic | None = None
     video: bool = False
 
     @property
@@ -199,7 +202,7 @@ def compile_graph(
     return Plan(
         camera=camera,
         source=frames,
-        loops=source.loop and not unrendered,
+        loops=source.loop and not unrendered and not source.plays_bags,
         printed=stand_in if stands_in else frames,
         stands_in=stands_in,
         vehicle=fill(graph.vehicle, "graph.vehicle"),
@@ -207,7 +210,14 @@ def compile_graph(
         wire_vehicle=fill(graph.wire_vehicle, "graph.wire.vehicle"),
         wire_operator=fill(graph.wire_operator, "graph.wire.operator"),
         recorder=fill(recorder, "recording.elements"),
+        bag=bag_topic(camera),
     )
+
+
+def bag_topic(camera: Camera) -> BagTopic | None:
+    """The pictures of a bag that a camera's source plays; None: it plays none, or they are not named."""
+    path, topic = (camera.mount.get(key, camera.source.settings.get(key)) for key in ("bag", "topic"))
+    return BagTopic(str(path), str(topic)) if camera.source.plays_bags and path and topic else None
 
 
 def check_video(graph: Graph) -> None:

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from runner.core.commands import KnobValue
-from runner.core.model import Element, ModelError, Roi
+from runner.core.model import BagTopic, Element, ModelError, Roi
 from runner.core.scaling import output_size
 from runner.graph import Plan, launch, turn_elements
 
+BAG = "bag"  # the appsrc of a sequence that is a topic of a bag
 FRAMES = "frames"  # the tee that passes every frame of the sequence
 QUEUE = "queue max-size-buffers=3 max-size-bytes=0 max-size-time=0"
 SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=true sync=false async=false max-buffers=2"
@@ -39,18 +40,23 @@ class LaneNames:
 
 @dataclass(frozen=True, slots=True)
 class LaneSet:
-    """A line to run and the elements to watch in it."""
+    """A line to run and the elements to watch in it.
+
+    bag  pictures that are pushed into its element `BAG`; None: it has none
+    """
 
     line: str
     fps: Fraction
     lanes: tuple[LaneNames, ...]
+    bag: BagTopic | None = None
 
 
-def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane]) -> LaneSet:
+def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag: BagTopic | None = None) -> LaneSet:
     """One line for some lanes of a camera.
 
     plan    the camera at the size and rate of the sequence
     decode  the line that decodes the sequence to I420 frames
+    bag     the pictures of the sequence, if they are a topic of a bag
     roi     part of the full image that is encoded
     raises  ModelError if the graph's bitrate knob names no element that frames pass through
     """
@@ -65,7 +71,7 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane]) -> L
         own = _turned(plan, behind, {"bitrate": lane.kbps}, f"_lane{j}")
         parts.append(f"scaled_{factors.index(lane.scaling)}. ! {QUEUE} ! {launch(own)} ! {SINK.format(f'sink_{j}')}")
         names.append(LaneNames(f"{encoder(plan)}_lane{j}", f"{_counter(plan)}_lane{j}", f"sink_{j}"))
-    return LaneSet(" ".join(parts), plan.camera.fps, tuple(names))
+    return LaneSet(" ".join(parts), plan.camera.fps, tuple(names), bag)
 
 
 def fragment(plan: Plan, roi: Roi, lane: Lane) -> str:

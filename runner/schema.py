@@ -279,9 +279,9 @@ def _explain(error: Any) -> Iterator[Finding]:
     limit, parent = error.validator_value, error.schema
     match error.validator:
         case "additionalProperties":
-            known = parent.get("properties", {})
+            known, patterns = parent.get("properties", {}), parent.get("patternProperties", {})
             for key in value:
-                if key not in known:
+                if key not in known and not any(re.search(pattern, str(key)) for pattern in patterns):
                     yield Finding((*path, key), None, f"unknown key{suggest(str(key), known)}")
         case "required":
             for key in limit:

@@ -9,7 +9,20 @@ from runner.schema import Path, dotted, shown
 
 SECTIONS = ("name", "fps_max", "cameras", "graph")
 # Camera keys that concern one side only: the source of its frames, the place of its tile.
-OWN = ("source", "device", "address", "clip", "capture", "credentials", "place", "pose", "fov_deg", "lens")
+OWN = (
+    "source",
+    "device",
+    "address",
+    "clip",
+    "bag",
+    "topic",
+    "capture",
+    "credentials",
+    "place",
+    "pose",
+    "fov_deg",
+    "lens",
+)
 NAMED = 3  # differences that a message names
 
 SettingsByPath = Mapping[str, Any]

@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
-MOUNT_KEYS = ("device", "address", "clip")
+MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
+BAG_KEYS = ("bag", "topic")
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
 GRAPH_STRUCTURE = ("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable")
 
@@ -67,6 +68,7 @@ class Builder:
 
     composed: Composed
     runnable: bool
+    bags: bool
     check: PlanCheck | None
     fits: Collection[str] = ()  # sections already known to satisfy the schemas
     problems: list[Problem] = field(default_factory=list)
@@ -77,9 +79,11 @@ class Builder:
     others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
 
     @classmethod
-    def of(cls, composed: Composed, runnable: bool, check: PlanCheck | None, fits: Collection[str]) -> Builder:
+    def of(
+        cls, composed: Composed, runnable: bool, bags: bool, check: PlanCheck | None, fits: Collection[str]
+    ) -> Builder:
         """The builder of a configuration, with its vehicle built."""
-        builder = cls(composed, runnable, check, fits)
+        builder = cls(composed, runnable, bags, check, fits)
         builder.vehicle = builder._vehicle()
         builder._attribute_problems()
         return builder
@@ -114,6 +118,8 @@ class Builder:
                 self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
+            if self.bags:
+                self._check_bag(camera)
         if self.problems or recording is None:
             return None
         return Vehicle(
@@ -195,7 +201,7 @@ class Builder:
         """The builder of the configuration without a part."""
         if id(part) not in self.others:
             composed = without(self.composed, part) if self._is_determined else None
-            other = Builder(composed, self.runnable, self.check) if composed else None
+            other = Builder(composed, self.runnable, self.bags, self.check) if composed else None
             if other:
                 other._vehicle()
             self.others[id(part)] = other
@@ -287,7 +293,8 @@ class Builder:
     def _check_inputs(self, camera: Camera) -> None:
         """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""
         source = camera.source
-        for key in () if source.render else sorted(source.needs.intersection(MOUNT_KEYS)):
+        needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
+        for key in () if source.render else sorted(needs):
             where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
             given = camera.mount.get(key, source.settings.get(key))
             if given is None:
@@ -297,6 +304,19 @@ class Builder:
                 self._report(where, ModelError(key, repr(redacted(given)), rule))
             elif key == "clip" and not Path(str(given)).is_file():
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
+
+    def _check_bag(self, camera: Camera) -> None:
+        """Check that the bag that a camera's source plays has its topic, with pictures of a kind that is known."""
+        given = {key: camera.mount.get(key, camera.source.settings.get(key)) for key in BAG_KEYS}
+        if not camera.source.plays_bags or given["bag"] is None:
+            return
+        from runner.bag import check_topic
+
+        try:
+            check_topic(Path(str(given["bag"])), None if given["topic"] is None else str(given["topic"]))
+        except ModelError as error:
+            where = ("cameras", camera.name) if error.key in camera.mount else self._of(camera.name, "source")
+            self._report(where, error)
 
     def _check_compiles(self, camera: Camera, media: Media, index: int, recording: Recording | None) -> None:
         """Check that everything that source, graph and recording refer to exists."""
@@ -400,6 +420,7 @@ def _source(data: Mapping[str, Any]) -> Source:
         elements=_elements(data["elements"]),
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
         capture=data.get("capture") or {},
+        plays_bags="bag" in data,
         **_given(data, ("loop", "frozen_s", "repeated_s", "credentials")),
         render=render["drive"] if render else "",
         render_s=render["seconds"] if render else 0,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # keys of a mount
 OF_THE_PLACE = (
     *("place", "pose", "weight", "floor_kbps", "shed", "graph", "source"),
-    *("device", "address", "clip", "capture", "credentials"),
+    *("device", "address", "clip", "bag", "topic", "capture", "credentials"),
 )
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
 # Groups that Hydra composes only for applications that it starts itself: a tenth of the time.

@@ -28,6 +28,7 @@ class Configuration:
     composed  with the origin of each value
     user      directory whose files shadow the packaged ones and may add others
     runnable  also check what only a run needs: clips, devices and addresses are named, and files exist
+    bags      also check that bags which are named have pictures of each camera; None: if runnable
     check     further check of a compiled plan, against the GStreamer registry
     fits      sections already known to satisfy the schemas
 
@@ -41,10 +42,12 @@ class Configuration:
         user: Path | None = None,
         *,
         runnable: bool = True,
+        bags: bool | None = None,
         check: PlanCheck | None = None,
         fits: Collection[str] = (),
     ) -> None:
         self._composed, self._user, self._runnable, self._check, self._fits = composed, user, runnable, check, fits
+        self._bags = runnable if bags is None else bags
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
 
     def drivable(self, check: PlanCheck) -> Configuration:
@@ -108,7 +111,7 @@ class Configuration:
 
     @cached_property
     def _builder(self) -> Builder:
-        return Builder.of(self._composed, self._runnable, self._check, self._fits)
+        return Builder.of(self._composed, self._runnable, self._bags, self._check, self._fits)
 
 
 def configuration(

@@ -210,15 +210,16 @@ def _check_unique(key: str, names: list[str]) -> None:
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
-    settings    values for placeholders from the file itself: clip, device, address
+    settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
     capture     what its cameras are to deliver unless they state otherwise, see `Capture`
     credentials file with user name and password, for cameras that name none
-    loop        restart at the end without a gap (a clip)
+    loop        restart at the end without a gap (a clip, a bag)
     frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
                 None: it is not monitored
     repeated_s  the same picture for this long is a fault; None: pictures are not compared
     render      name of the procedural drive that makes the clip, or ""
     render_s    length of that drive, s
+    plays_bags  frames are the pictures of a topic of a bag, which are pushed into its first element
     stand_in    elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
     """
 
@@ -231,13 +232,27 @@ class Source:
     repeated_s: float | None = None
     render: str = ""
     render_s: float = 0
+    plays_bags: bool = False
     stand_in: tuple[Element, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.plays_bags and self.elements[0].factory != "appsrc":
+            rule = "must be appsrc: the pictures of a bag are pushed into the first element"
+            raise ModelError("elements[0].element", repr(self.elements[0].factory), rule)
 
     @property
     def needs(self) -> frozenset[str]:
         """Names of the placeholders in its elements."""
         values = (value for element in self.elements for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """Pictures of a bag: the path of the bag, and their topic."""
+
+    path: str
+    topic: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +324,7 @@ class Camera:
     floor_kbps      kbit/s that the camera gets first where `modes` have floors; 0: none
     shed            where all floors together exceed the total, cameras with the lowest number are given up first;
                     None: never
-    mount           device, address, clip: values of the placeholders of these names
+    mount           device, address, clip: values of the placeholders of these names; bag and topic to play
     capture         what its device is to deliver
     credentials     file with user name and password of its address; None: it asks for none
     """

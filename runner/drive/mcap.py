@@ -2,46 +2,22 @@
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from msgspec import UNSET
 
-from runner.core.events import NAMES, Event, PositionReported
-from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, FilmedFile, ReadVideo, files
-from runner.drive.read import Drive, Side
+from runner.drive.captures import SECOND_NS, ReadVideo
+from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, cameras_of, write_all
+from runner.drive.read import Drive
 from runner.errors import RunError
-from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
+from runner.records import Json, Note, Position, line_to_json
 from runner.schema import referred
 
 if TYPE_CHECKING:
     from runner.apply import Unit
-
-TELL_EVERY = 500  # messages between two reports of progress
-# Topic by kind of line. Notes become foxglove.Log, positions also foxglove.LocationFix, videos CompressedVideo.
-TOPICS = {
-    "decision": "/decision",
-    "telemetry": "/telemetry",
-    "state": "/operator/state",
-    "sample": "/operator/sample",
-    "link": "/link",
-}
-VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_received"}
-
-
-class McapMessage(NamedTuple):
-    """A message to write, and its time.
-
-    ns  since 1970
-    """
-
-    ns: int
-    write: Callable[[], None]
 
 
 def write_mcap(
@@ -65,20 +41,12 @@ def write_mcap(
 
     context, out = foxglove.Context(), _Out(file)
     options = MCAPWriteOptions(compression=MCAPCompression.Zstd, profile="tod-runner")
-    count = 0
     with foxglove.open_mcap(out, context=context, writer_options=options) as writer:
-        channels = _Channels(context, _cameras(drive))
+        channels = _Channels(context, cameras_of(drive))
         for name, side in drive.sides.items():
             writer.write_metadata(f"{name} began", _texts(line_to_json(side.began)))
-        first, last = _span(drive)
-        for message in heapq.merge(*_streams(drive, channels, read_video, on_warning), key=lambda m: m.ns):
-            message.write()
-            out.check()
-            count += 1
-            if count % TELL_EVERY == 0:
-                progress(min(1.0, (message.ns - first) / max(1, last - first)))
+        count = write_all(drive, channels, read_video, on_warning, progress, out.check)
     out.check()
-    progress(1.0)
     return count
 
 
@@ -142,14 +110,14 @@ class _Channels:
             heading=angle,
             velocity=None if speed is None else velocity,
         )
-        self._typed("/position", LocationFixChannel).log(fix, log_time=ns)
+        self._typed(POSITION_TOPIC, LocationFixChannel).log(fix, log_time=ns)
 
-    def note(self, side: str, text: str, ns: int) -> None:
+    def note(self, side: str, line: Note, ns: int) -> None:
         from foxglove.channels import LogChannel
         from foxglove.messages import Log, LogLevel
 
-        log = Log(timestamp=_timestamp(ns), level=LogLevel.Info, name=side, message=text)
-        self._typed("/notes", LogChannel).log(log, log_time=ns)
+        log = Log(timestamp=_timestamp(ns), level=LogLevel.Info, name=side, message=line.text)
+        self._typed(NOTE_TOPIC, LogChannel).log(log, log_time=ns)
 
     def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
         from foxglove.channels import CompressedVideoChannel
@@ -188,82 +156,6 @@ def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
         each = by_camera["additionalProperties"]
         by_camera |= {"properties": dict.fromkeys(cameras, each), "additionalProperties": False}
     return whole
-
-
-def _streams(
-    drive: Drive, channels: _Channels, read_video: ReadVideo, on_warning: Callable[[str], None]
-) -> Iterator[Iterator[McapMessage]]:
-    """Messages by source, each in time order."""
-    for name, side in drive.sides.items():
-        # If the vehicle did not log, the operator's log has its positions.
-        yield _lines(name, side, channels, positions="vehicle" not in drive.sides)
-        for camera, filmed in files(side).items():
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, filmed, channels, read_video, on_warning)
-
-
-def _lines(name: str, side: Side, channels: _Channels, positions: bool) -> Iterator[McapMessage]:
-    began = round(side.began_s * SECOND_NS)
-    for line in side.lines:
-        ns = began + round(line.t * SECOND_NS)
-        for write in _writers(name, line, channels, positions, ns):
-            yield McapMessage(ns, write)
-
-
-def _writers(
-    name: str, line: Event | Record, channels: _Channels, positions: bool, ns: int
-) -> Iterator[Callable[[], None]]:
-    """The messages of one line."""
-    if isinstance(line, Event):
-        event = NAMES[type(line)]
-        yield lambda: channels.tell(f"/events/{event}", "event", event, event_to_json(line), ns)
-        if isinstance(line, PositionReported):
-            yield lambda: channels.fix(Position.of(line), ns)
-        return
-    kind = KINDS[type(line)]
-    if isinstance(line, Note):
-        yield lambda: channels.note(name, line.text, ns)
-    elif kind in TOPICS:
-        yield lambda: channels.tell(TOPICS[kind], "drive", kind, line_to_json(line), ns)
-    if isinstance(line, Sample) and positions and (position := line.position):
-        yield lambda: channels.fix(position, ns)
-
-
-def _pictures(
-    directory: Path,
-    topic: str,
-    camera: str,
-    filmed: list[FilmedFile],
-    channels: _Channels,
-    read_video: ReadVideo,
-    on_warning: Callable[[str], None],
-) -> Iterator[McapMessage]:
-    """The frames of one camera on one side, at their capture times."""
-    topic = topic.format(camera=camera)
-    last = -1
-    for file in filmed:
-        if file.lies_outside:
-            on_warning(f"{file.name}: lies outside the drive and was left out")
-            continue
-        try:
-            for unit in read_video(directory / file.name):
-                # A rebuilt pipeline begins after the previous one has ended, but clocks may be set.
-                last = max(file.captured(unit.after_ns), last + 1)
-                yield McapMessage(last, lambda u=unit, ns=last: channels.picture(topic, camera, u, ns))  # type: ignore[misc]
-        except RunError as error:
-            more = "the rest of it" if last >= file.captured(0) else "it"
-            on_warning(f"{error}; the export continues without {more}")
-
-
-def _cameras(drive: Drive) -> list[str]:
-    named = (camera for side in drive.sides.values() for camera in side.began.config.get("cameras", {}))
-    return list(dict.fromkeys(named))
-
-
-def _span(drive: Drive) -> tuple[int, int]:
-    """Start and end of the drive, ns since 1970."""
-    began = [side.began_s for side in drive.sides.values()]
-    ended = [side.began_s + line.t for side in drive.sides.values() for line in side.lines[-1:]]
-    return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)
 
 
 def _texts(began: Json) -> dict[str, str]:

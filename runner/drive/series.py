@@ -287,7 +287,7 @@ def _series(drive: Drive, label: str) -> Series:
         actual=_total(samples, cameras),
         measured="received" if samples else "sent" if telemetry else "",
         link=_link([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
-        positions=_positions(vehicle, samples),
+        positions=_positions(_Shifted(leading.lines, 0.0), samples),
         modes=tuple(_modes(decisions)),
         reasons=tuple(_reasons(decisions)),
         notes=tuple(sorted((t, note.text) for side in sides.values() for t, note in side.of(Note))),
@@ -345,12 +345,12 @@ def _link(lines: Sequence[Any]) -> LinkSeries | None:
     return LinkSeries(*rows.T)
 
 
-def _positions(vehicle: _Shifted, samples: Sequence[Any]) -> Positions | None:
+def _positions(leading: _Shifted, samples: Sequence[Any]) -> Positions | None:
     """As the vehicle received them, otherwise as the operator received them; None if there are none.
 
     Metres by equirectangular projection around the first place, accurate for some km.
     """
-    known: list[tuple[float, PositionReported | Position]] = [*vehicle.of(PositionReported)]
+    known: list[tuple[float, PositionReported | Position]] = [*leading.of(PositionReported)]
     known = known or [(t, sample.position) for t, sample in samples if sample.position]
     if not known:
         return None

@@ -17,7 +17,7 @@ from runner.errors import RunError
 from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
 from runner.gst.pipeline import counted
-from runner.lanes import FRAMES, LaneSet
+from runner.lanes import BAG, FRAMES, LaneSet
 
 POLL_NS = 200 * 1_000_000
 STALLED_S = 60  # without a frame for this long the pipeline is deadlocked
@@ -63,6 +63,10 @@ def run_lanes(
     raises       RunError with GStreamer's message; exceptions from the callbacks
     """
     pipeline = _parsed(lanes.line)
+    if lanes.bag:
+        from runner.gst.bag_feed import read_bag
+
+        read_bag(pipeline.get_by_name(BAG), lanes.bag, lanes.fps)
     run = _Run(lanes.fps)
     pipeline.get_by_name(FRAMES).get_static_pad("sink").add_probe(
         Gst.PadProbeType.BUFFER | Gst.PadProbeType.EVENT_DOWNSTREAM,

@@ -45,6 +45,10 @@ class CameraPipeline:
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
             loop_clip(pipeline, plan)
+        if plan.bag and source is None:
+            from runner.gst.bag_feed import play_bag
+
+            play_bag(pipeline, plan, plan.bag, on_report)
         self._started = False
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from gi.repository import GLib, Gst
 
@@ -14,6 +15,9 @@ from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.pipeline import counted
 from runner.gst.source import fixed_rate, loop_clip
+
+if TYPE_CHECKING:
+    from runner.gst.bag_feed import BagFeed
 
 CHECK_MS = 100
 SILENT_S = 10.0  # a source that delivers nothing for this long has failed
@@ -35,7 +39,7 @@ class Recorded:
 
     frames     frames kept
     seconds    from the first to the end of the last one, by their timestamps
-    missing    frames expected in this time that are absent
+    missing    frames expected in this time that are absent; a bag is not expected to have any
     overruns   frames dropped at the full queue before the encoder, even after the end
     repeated   frames that the source repeated to keep its rate, not counted for a clip
     left_out   frames that the source dropped to keep its rate, likewise
@@ -76,10 +80,22 @@ class Recorder:
         self._counting_down = self._finishing = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
         self._rated = fixed_rate(self._pipeline) if not plan.loops else []
+        self._feed = self._read_bag() if plan.bag else None
+
+    def _read_bag(self) -> BagFeed:
+        """A bag is recorded as fast as the encoder takes it: once, or again and again up to a given length."""
+        from runner.gst.bag_feed import read_bag
+
+        assert self._plan.bag
+        self._queue.set_property("leaky", "no")
+        source = self._pipeline.get_by_name(self._plan.source[0].name)
+        loop = self._plan.camera.source.loop and self._duration_s is not None
+        return read_bag(source, self._plan.bag, self._plan.camera.fps, loop)
 
     def start(self) -> None:
         """Begin; a recording that cannot begin is FAILED at the next check."""
-        self._queue.connect("overrun", self._on_overrun)
+        if not self._feed:  # whose pictures wait
+            self._queue.connect("overrun", self._on_overrun)
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
             element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
@@ -137,17 +153,25 @@ class Recorder:
         return Recorded(
             frames=frames,
             seconds=seconds,
-            missing=max(0, round(seconds * self._plan.camera.fps) - frames),
+            missing=0 if self._feed else max(0, round(seconds * self._plan.camera.fps) - frames),
             overruns=self._overruns,
             repeated=sum(element.get_property("duplicate") for element in self._rated),
-            left_out=sum(element.get_property("drop") for element in self._rated),
+            left_out=sum(map(self._dropped, self._rated)),
             width=picture.get_int("width")[1],
             height=picture.get_int("height")[1],
             began=self._recorded.began or self._began(),
         )
 
+    def _dropped(self, element: Gst.Element) -> int:
+        """Frames that an element has dropped to keep a rate."""
+        if self._feed:  # its own count includes the end of the bag
+            return int(element.get_property("in") - element.get_property("out"))
+        return int(element.get_property("drop"))
+
     def _began(self) -> float:
-        """Wall-clock time of the first frame."""
+        """Wall-clock time of the first frame; of a bag's, when it was captured."""
+        if self._feed and self._feed.first is not None:
+            return float(self._feed.first / Gst.SECOND)
         clock = self._pipeline.get_clock()
         if clock is None:
             return 0.0

@@ -143,6 +143,10 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
         if problem := log_in(child, self._plan):
             self._on_report(problem)
+        if self._plan.bag:
+            from runner.gst.bag_feed import play_bag
+
+            play_bag(child, self._plan, self._plan.bag, self._on_report)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
         self.add(child)

@@ -57,8 +57,8 @@ class _Text(NamedTuple):
     rows: Iterator[tuple[int, Sequence[str]]]
 
 
-def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
-    """The file that a setting names: an absolute path as it is, otherwise in the first of the directories that has it.
+def find_path(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
+    """The path that a setting names: an absolute one as it is, otherwise in the first of the directories that has it.
 
     raises  ModelError
     """
@@ -69,10 +69,19 @@ def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> P
     path = next((path for path in paths if path.exists()), None)
     if path is None:
         raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
+    return path
+
+
+def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
+    """The file of limited size that a setting names, see `find_path`.
+
+    raises  ModelError
+    """
+    path = find_path(settings, key, bases)
     if not path.is_file():
-        raise ModelError(key, name, file_problem(path))
+        raise ModelError(key, settings[key], file_problem(path))
     if path.stat().st_size > MOST_BYTES:
-        raise ModelError(key, name, f"must be at most {MOST_BYTES // 1_000_000} MB long")
+        raise ModelError(key, settings[key], f"must be at most {MOST_BYTES // 1_000_000} MB long")
     return path
 
 

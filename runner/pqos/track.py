@@ -14,7 +14,7 @@ from runner.core.model import ModelError
 from runner.pqos import SLOWEST_MPS
 from runner.pqos.bandwidth_map import Floats, offset
 from runner.pqos.route import route
-from runner.pqos.table import LAT, LON, SPEED, TIME, find_file, header, number, read_map, read_table, within
+from runner.pqos.table import LAT, LON, SPEED, TIME, find_file, find_path, header, number, read_map, read_table, within
 
 
 class Track:
@@ -73,6 +73,11 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
             return drive(read_map(find_file(settings, "file", bases)), speed, loop)
         case "track":
             with within("position"):
+                path = find_path(position, "file", bases)
+                from runner.bag import is_bag
+
+                if is_bag(path):
+                    return of_bag(path, position.get("topic"), loop)
                 return recorded(find_file(position, "file", bases), loop)
         case "live":
             return None
@@ -86,6 +91,27 @@ def recorded(path: Path, loop: bool) -> Track:
     if len(times) < 2:
         raise ModelError("file", path, "must have at least two rows")
     return Track(times, lat, lon, speed[0] if speed else None, loop)
+
+
+def of_bag(path: Path, topic: str | None, loop: bool) -> Track:
+    """A drive from a bag of ROS: the positions of a topic, or of the only one, at the times of their stamps.
+
+    raises  ModelError
+    """
+    from runner.bag import POSITIONS, Bag
+    from runner.bag.pictures import SECOND_NS
+
+    try:
+        with Bag(path) as bag:
+            found = bag.find(POSITIONS, topic, "positions")
+            fixes, where = {fix.ns: fix for fix in sorted(bag.positions(found))}, bag.names(found)
+    except ModelError as error:
+        raise ModelError("topic" if error.key == "topic" else "file", error.found, error.rule) from None
+    if len(fixes) < 2:
+        raise ModelError("file", where, "must have at least two positions with a fix, at different times")
+    first = next(iter(fixes))
+    times, lat, lon = np.array([((fix.ns - first) / SECOND_NS, fix.lat, fix.lon) for fix in fixes.values()]).T
+    return Track(times, lat, lon, None, loop)
 
 
 def drive(points: Floats, speed_mps: float, loop: bool) -> Track:

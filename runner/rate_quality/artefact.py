@@ -150,7 +150,7 @@ def dumps(document: Mapping[str, Any]) -> bytes:
 
 
 def _clip_to_json(clip: Clip) -> dict[str, Any]:
-    properties = {key: value for key, value in asdict(clip).items() if key != "path"}
+    properties = {key: value for key, value in asdict(clip).items() if key != "path" and value != ""}
     rounded = {key: round(value, 3) for key, value in properties.items() if key.startswith(("si", "ti"))}
     return {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
 

@@ -19,6 +19,9 @@ def digest(*parts: object) -> str:
 
 
 def file_digest(path: Path) -> str:
+    """SHA-256 of a file, or of the digests of all files in a directory."""
+    if path.is_dir():
+        return hashlib.sha256("".join(map(file_digest, sorted(path.iterdir()))).encode()).hexdigest()
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -18,8 +18,8 @@ from runner.rate_quality.cache import Cache, file_digest
 from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.metrics import Metric, find_metric
+from runner.rate_quality.sequence import Filmed, as_filmed, survey
 from runner.rate_quality.sequence import Sequence as Clip
-from runner.rate_quality.sequence import as_filmed, survey
 from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep
 from runner.rate_quality.workers import open_executor, parallel_tasks
@@ -36,14 +36,14 @@ LATER_ROUNDS = 0.3  # of the first round's work: what the adaptive plan is expec
 def measure(
     vehicle: Vehicle,
     study: Study,
-    sequences: Mapping[str, Path],
+    sequences: Mapping[str, Filmed],
     output: Path,
     progress: Progress,
     on_note: Callable[[str], None],
 ) -> Iterator[str]:
     """Measure and write models; yields a line for each.
 
-    sequences  by camera, its clip
+    sequences  by camera, its clip, or pictures of a bag
     raises     UserError for input that cannot be measured, RunError if a run fails; finished models stay
     """
     metrics = tuple(_metric(study, name) for name in study.metrics)

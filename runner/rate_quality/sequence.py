@@ -10,9 +10,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from runner.core.model import Camera
+from runner.core.model import BagTopic, Camera, ModelError
 from runner.errors import RunError, UserError
-from runner.lanes import FRAMES, LaneSet
+from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
 
@@ -21,16 +21,19 @@ if TYPE_CHECKING:
 
 SURVEY_VERSION = 1
 FEWEST_FRAMES = 25
+ARGUMENT = "sequence"  # that names it, for messages
+Filmed = Path | BagTopic  # a clip, or pictures of a bag
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """A clip and its properties.
+    """A clip, or the pictures of a bag, and its properties.
 
-    sha256         of the file
+    sha256         of the file, or of the files of a bag
     width, height  px
     fps            frames per second
     lossless       whether its codec keeps every sample
+    topic          of the bag; "": it is a clip
     si, ti         spatial and temporal information, the maximum over all frames (ITU-T P.910); si_mean, ti_mean: mean
     """
 
@@ -46,44 +49,70 @@ class Sequence:
     ti: float
     si_mean: float
     ti_mean: float
+    topic: str = ""
+
+    @property
+    def bag(self) -> BagTopic | None:
+        return BagTopic(self.path, self.topic) if self.topic else None
 
     @property
     def decode(self) -> str:
         """The line that decodes its frames."""
-        return decoding(self.path, self.fps)
+        return decoding(self.bag or Path(self.path), self.fps)
 
 
-def decoding(path: str, fps: Fraction) -> str:
-    """The line for GStreamer that decodes a clip to I420 frames at a constant rate."""
-    quoted = path.replace("\\", "\\\\").replace('"', '\\"')
+def decoding(filmed: Filmed, fps: Fraction) -> str:
+    """The line for GStreamer that decodes a clip, or the pictures of a bag, to I420 frames at a constant rate."""
     rate = f"video/x-raw,framerate={fps.numerator}/{fps.denominator}"
     raw = "videoconvert ! video/x-raw,format=I420"
-    return f'filesrc location="{quoted}" ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}'
+    if isinstance(filmed, BagTopic):
+        begin = f"appsrc name={BAG} format=time max-buffers=2"
+    else:
+        quoted = str(filmed).replace("\\", "\\\\").replace('"', '\\"')
+        begin = f'filesrc location="{quoted}"'
+    return f"{begin} ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}"
 
 
-def survey(path: Path, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
-    """Analyse a clip.
+def survey(filmed: Filmed, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
+    """Analyse a clip, or the pictures of a bag.
 
     on_note  called with a line, since this takes a while
     raises   UserError if it cannot be used
     """
-    from runner.apply import discover
-
-    where = "sequence"
-    form = discover(path, where)
+    path, topic = (Path(filmed.path), filmed.topic) if isinstance(filmed, BagTopic) else (filmed, "")
+    properties = _bag_form(filmed) if isinstance(filmed, BagTopic) else _clip_form(filmed)
+    whole = BagTopic(str(path.resolve()), topic) if topic else path.resolve()
     sha256 = file_digest(path)
-    key = digest("survey", SURVEY_VERSION, sha256)
+    key = digest("survey", SURVEY_VERSION, sha256, *filter(None, [topic]))
     known = cache.load(key)
     if known is None:
-        on_note(f"looking through {path}")
-        known = _look_through(path, form.fps)
+        on_note(f"looking through {path} {topic}".rstrip())
+        known = _look_through(whole, properties["fps"])
         cache.store(key, known)
-    properties = asdict(form) | {"lossless": form.lossless or _recorded(path)}
-    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **properties, **known)
+    sequence = Sequence(path=str(path.resolve()), sha256=sha256, topic=topic, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
         found = f"{path}: {sequence.frames} frames"
-        raise UserError("command line", where, found, f"is too short, at least {FEWEST_FRAMES} are needed")
+        raise UserError("command line", ARGUMENT, found, f"is too short, at least {FEWEST_FRAMES} are needed")
     return sequence
+
+
+def _clip_form(path: Path) -> dict[str, Any]:
+    from runner.apply import discover
+
+    form = discover(path, ARGUMENT)
+    return asdict(form) | {"lossless": form.lossless or _recorded(path)}
+
+
+def _bag_form(filmed: BagTopic) -> dict[str, Any]:
+    from runner.bag import Bag
+
+    try:
+        with Bag(Path(filmed.path)) as bag:
+            form = bag.form(filmed.topic)
+    except ModelError as error:
+        raise UserError("command line", ARGUMENT, str(error.found), error.rule) from None
+    size = {"width": form.width, "height": form.height, "fps": form.fps}
+    return {**size, "codec": form.format, "lossless": form.format != "jpeg"}
 
 
 def _recorded(path: Path) -> bool:
@@ -95,7 +124,7 @@ def _recorded(path: Path) -> bool:
         return False
 
 
-def _look_through(path: Path, fps: Fraction) -> dict[str, Any]:
+def _look_through(filmed: Filmed, fps: Fraction) -> dict[str, Any]:
     from runner.apply import run_lanes
     from runner.rate_quality.siti import spatial, temporal
 
@@ -110,13 +139,18 @@ def _look_through(path: Path, fps: Fraction) -> dict[str, Any]:
             ti.append(temporal(before, luma))
         before = luma
 
-    line = f"{decoding(str(path.resolve()), fps)} ! identity name={FRAMES} ! fakesink sync=false"
+    line = f"{decoding(filmed, fps)} ! identity name={FRAMES} ! fakesink sync=false"
+    bag = filmed if isinstance(filmed, BagTopic) else None
     try:
-        run_lanes(LaneSet(line, fps, ()), look, lambda *_: None, lambda _: None)
+        run_lanes(LaneSet(line, fps, (), bag), look, lambda *_: None, lambda _: None)
     except RunError as error:
-        raise UserError("command line", "sequence", repr(str(path)), f"cannot be decoded to its end: {error}") from None
+        raise UserError("command line", "sequence", _named(filmed), f"cannot be decoded to its end: {error}") from None
     means = {"si_mean": fmean(si or [0.0]), "ti_mean": fmean(ti or [0.0])}
     return {"frames": len(si), "si": max(si, default=0.0), "ti": max(ti, default=0.0), **means}
+
+
+def _named(filmed: Filmed) -> str:
+    return f"{filmed.path}: {filmed.topic}" if isinstance(filmed, BagTopic) else repr(str(filmed))
 
 
 def as_filmed(camera: Camera, sequence: Sequence) -> tuple[Camera, str]:

@@ -110,7 +110,7 @@ class Sweep:
         return (lanes[at : at + most] for at in range(0, len(lanes), most))
 
     def _task(self, lanes: Sequence[Lane]) -> Task:
-        compiled = compile_lanes(self.plan, self.clip.decode, self.plan.camera.full_roi, lanes)
+        compiled = compile_lanes(self.plan, self.clip.decode, self.plan.camera.full_roi, lanes, self.clip.bag)
         return Task(tuple(lanes), compiled, self.roi, self.clip.frames, self.stride, self.metrics, self.mask)
 
     # --- cache keys ---------------------------------------------------------------------------------------------------

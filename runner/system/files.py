@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import rmtree
 from typing import TextIO
 
 from runner.errors import RunError, UserError
@@ -24,6 +25,19 @@ def unfinished(path: Path) -> Iterator[Path]:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def unfinished_directory(path: Path) -> Iterator[Path]:
+    """Like `unfinished`, for a directory that does not exist yet and is made under the path given here."""
+    above = path.with_name(f".{path.name}.{os.getpid()}")
+    with urgent(lambda: rmtree(above, ignore_errors=True)):
+        try:
+            above.mkdir()
+            yield above / path.name
+            (above / path.name).rename(path)
+        finally:
+            rmtree(above, ignore_errors=True)
 
 
 @contextmanager

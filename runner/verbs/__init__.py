@@ -32,6 +32,7 @@ class Verb(NamedTuple):
     composes: bool = True
 
 
+CONVERSION = ("output", "vehicle", "bag", "width_px", "height_px", "fps", "overwrite")
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
@@ -43,7 +44,10 @@ VERBS = {
     "init": Verb("a directory of your own to start from", "runner.verbs.init", ("files",), "DIR", composes=False),
     "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
     "replay": Verb(
-        "events in, decisions out, no video", "runner.verbs.replay", ("input", "output", "log", "link"), sweeps=True
+        "events in, decisions out, no video",
+        "runner.verbs.replay",
+        ("input", "output", "log", "link", "positions", "topic"),
+        sweeps=True,
     ),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
@@ -54,13 +58,24 @@ VERBS = {
     "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "report": Verb(
-        "the paper's figures from real drives", "runner.verbs.report", ("output", "models"), DRIVE, composes=False
+        "the paper's figures from real drives",
+        "runner.verbs.report",
+        ("output", "models", "positions", "topic"),
+        DRIVE,
+        composes=False,
     ),
     "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
     "map": Verb(
-        "a bandwidth map from drives", "runner.verbs.map", ("output", "percentile", "cell_m"), DRIVE, composes=False
+        "a bandwidth map from drives",
+        "runner.verbs.map",
+        ("output", "percentile", "cell_m", "positions", "topic"),
+        DRIVE,
+        composes=False,
     ),
-    "export": Verb("a drive as MCAP, for Foxglove", "runner.verbs.export", ("output",), DRIVE, composes=False),
+    "export": Verb("a drive as MCAP or ROS 2 bag", "runner.verbs.export", ("output", "format"), DRIVE, composes=False),
+    "convert": Verb(
+        "a vehicle from the paper's own camera list", "runner.verbs.convert", CONVERSION, "FILE", composes=False
+    ),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
     "completion": Verb("what completes words in bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
@@ -94,6 +109,7 @@ EXTRAS = {
     "vmaf": ("imageio_ffmpeg",),
     "cluster": ("distributed",),
     "mcap": ("foxglove",),
+    "bag": ("rosbags",),
     "security": ("cryptography",),
     "metrics": ("prometheus_client",),
 }

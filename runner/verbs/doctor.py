@@ -102,6 +102,8 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     ports = {"vehicle": vehicle.metrics.vehicle_port, "operator": vehicle.metrics.operator_port}
     if any(port is not None and verb in (side, "demo") for side, port in ports.items()):
         yield "metrics"
+    if verb in ("vehicle", "demo", "record", "model") and any(c.source.plays_bags for c in vehicle.cameras.values()):
+        yield "bag"
     if verb == "model":
         study = document["study"]
         yield from ["vmaf"] if "vmaf" in study["metric"] else []

@@ -1,7 +1,9 @@
-"""usage: tod-runner export DRIVE [output=FILE.mcap]
+"""usage: tod-runner export DRIVE [format=mcap] [output=FILE.mcap]
+       tod-runner export DRIVE format=rosbag2 [output=DIR]
 
-Export a drive as MCAP, for Foxglove and any other reader of MCAP. DRIVE is a directory that log=DIR wrote; all of its
-logs (vehicle, operator, link) are exported to DRIVE/drive.mcap unless output= names another file.
+Export a drive as MCAP, for Foxglove and any other reader of MCAP, or as a ROS 2 bag. DRIVE is a directory that log=DIR
+wrote; all of its logs (vehicle, operator, link) are exported to DRIVE/drive.mcap, or DRIVE/rosbag2, unless output=
+names another one.
 
   /position               foxglove.LocationFix
   /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)
@@ -9,8 +11,12 @@ logs (vehicle, operator, link) are exported to DRIVE/drive.mcap unless output= n
   /notes                  foxglove.Log
   /events/..., /decision, /telemetry, /operator/state, /operator/sample, /link    JSON with its schema
 
+In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/CompressedImage, one access unit each in the
+format h264 or h265, and everything else std_msgs/String with the line of JSON.
+
   tod-runner demo log=monday log.video=true
   tod-runner export monday
+  tod-runner export monday format=rosbag2
   tod-runner export monday output=monday.mcap
 """
 
@@ -24,39 +30,62 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from runner.drive.read import read_drive
+from runner.drive.read import Drive, read_drive
 from runner.errors import RunError, UserError
 from runner.records import VideoBegan
 from runner.system import signals
-from runner.system.files import unfinished
+from runner.system.files import unfinished, unfinished_directory
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
+OUTPUTS = {"mcap": "drive.mcap", "rosbag2": "rosbag2"}  # by format, the file in the drive
 QUIET_S = 2.0  # a shorter export shows no progress
 
 
 def run(arguments: Arguments) -> int:
-    from runner.drive.mcap import write_mcap
-
+    form = arguments.choice("format", tuple(OUTPUTS))
     if len(arguments.words) != 1:
         found = " ".join(arguments.words) or None
         raise UserError("command line", "", found, "must name one drive: a directory that log= wrote")
     directory = Path(arguments.words[0])
-    output = arguments.path("output") or directory / "drive.mcap"
+    output = arguments.path("output") or directory / OUTPUTS[form]
     if os.path.lexists(output):
-        rule = "already exists; remove it, or name another file by output="
+        rule = "already exists; remove it, or name another one by output="
         raise UserError("command line", "output", repr(str(output)), rule)
     if arguments.overrides:
-        raise UserError("command line", "", arguments.overrides[0], "an export has no configuration, only output=")
+        raise UserError(
+            "command line", "", arguments.overrides[0], "an export has no configuration, only format= and output="
+        )
     drive = read_drive(directory)
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
     filmed = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
     read_video = streaming().read_video if filmed else _nothing
-    with _new(output) as file, _later(f"{output}") as progress:
-        count = write_mcap(drive, file, read_video, lambda what: print(what, file=sys.stderr), progress)
-    print(f"{output}: {count} messages, {output.stat().st_size / 1e6:.1f} MB")
+    with _later(f"{output}") as progress:
+        count = WRITERS[form](drive, output, read_video, lambda what: print(what, file=sys.stderr), progress)
+    size = sum(path.stat().st_size for path in (output.iterdir() if output.is_dir() else [output]))
+    print(f"{output}: {count} messages, {size / 1e6:.1f} MB")
     return 0
+
+
+def _write_mcap(drive: Drive, output: Path, *more: Any) -> int:
+    from runner.drive.mcap import write_mcap
+
+    with _new(output) as file:
+        return write_mcap(drive, file, *more)
+
+
+def _write_rosbag2(drive: Drive, output: Path, *more: Any) -> int:
+    from runner.drive.rosbag2 import write_rosbag2
+
+    try:
+        with unfinished_directory(output) as part:
+            return write_rosbag2(drive, part, *more)
+    except OSError as error:
+        raise UserError("command line", "output", repr(str(output)), (error.strerror or "").lower()) from None
+
+
+WRITERS = {"mcap": _write_mcap, "rosbag2": _write_rosbag2}
 
 
 def _nothing(_path: Path) -> Iterator[Any]:

@@ -1,9 +1,12 @@
-"""usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10]
+"""usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10] [positions=BAG [topic=NAME]]
 
 Make a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
 of video. Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of
 the frames of a camera arrived 50 ms later than its fastest. All others show how much was sent, not what the link can
 carry. The operator's log is needed (demo and operator with log=DIR).
+
+positions= is a bag of ROS with the vehicle's positions during the drives (sensor_msgs/NavSatFix), in place of those in
+their logs; topic= is needed if it has several such topics.
 
   tod-runner map drives/monday drives/tuesday output=maps/route.csv
   tod-runner map drive output=route.csv percentile=5 cell_m=25
@@ -16,7 +19,7 @@ import sys
 from pathlib import Path
 
 from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples
-from runner.drive.read import read_drive
+from runner.drive.positions import reader
 from runner.drive.series import series
 from runner.errors import RunError, UserError
 from runner.system.files import whole_file
@@ -27,10 +30,11 @@ PERCENTILE, CELL_M = 10.0, 10.0
 
 def run(arguments: Arguments) -> int:
     output, percentile, cell_m = _wanted(arguments)
+    read = reader(arguments.values)
     samples: list[CapacitySample] = []
     seen, without = 0, list[str]()
     for word in arguments.words:
-        drive = series(read_drive(Path(word)))
+        drive = series(read(Path(word)))
         print("".join(f"{warning}\n" for warning in drive.warnings), end="", file=sys.stderr)
         if why := capacity_problem(drive):
             without.append(f"{word} {why}")
@@ -51,7 +55,7 @@ def run(arguments: Arguments) -> int:
 def _wanted(arguments: Arguments) -> tuple[Path, float, float]:
     """File, percentile and size of a square."""
     if arguments.overrides:
-        rule = "unknown argument; expected one of output, percentile, cell_m"
+        rule = "unknown argument; expected one of output, percentile, cell_m, positions, topic"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
         raise UserError("command line", "", None, "must name a drive: a directory that log= wrote")

@@ -7,7 +7,8 @@ bitrates, decoded, scaled up again and compared with the original. Writes for ea
 conf/cameras/, DIR/CAMERA.model.json with every point, and the curves as .png and .pdf.
 
 camera= is a camera of the vehicle, or a kind in conf/cameras/; without it all cameras of the vehicle are measured,
-and sequence= is a directory with one clip for each, named after it. Without sequence= the source's own clips are used.
+and sequence= is a directory with one clip for each, named after it. sequence= may also be a bag of ROS: each camera's
+topic of it is measured. Without sequence= the source's own clips are used.
 The method is defined in conf/study/paper.yaml; its keys may be given alone: metric= plan= scalings= bitrates_kbps=
 b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
 
@@ -17,6 +18,7 @@ Measurements are cached by content in the user's cache: an interrupted run resum
   tod-runner model camera=front_center sequence=drive.mp4 output=models metric=[mssim,psnr] plan=full
   tod-runner model vehicle=tum_q7 sequence=recording/ output=models 'pool={front_side:[front_left,front_right]}'
   tod-runner model vehicle=tum_q7 source=synthetic output=models graph=openh264_rtsp
+  tod-runner model camera=front_left sequence=drive.mcap cameras.front_left.topic=/left/image_raw output=models
   tod-runner model camera=top_left sequence=top.mkv output=models masks.top_left=mask.png cpu_cores=0.3
   tod-runner model compare models/front_center.model.json models_new/front_center.model.json
 """
@@ -27,15 +29,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from runner.bag import PICTURES, Bag, is_bag
 from runner.configuration.config import configuration
 from runner.configuration.files import conf_directories, options
-from runner.core.model import ModelError, Vehicle, suggest
+from runner.core.model import BagTopic, ModelError, Vehicle, suggest
 from runner.errors import ConfigError, Problem, RunError, UserError
 from runner.system import signals
 from runner.verbs import Arguments, study_word
 from runner.verbs.screen import progress_bar, say, streaming
 
 if TYPE_CHECKING:
+    from runner.rate_quality.sequence import Filmed
     from runner.rate_quality.study import Study
 
 NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # other files that may be named after a camera
@@ -104,17 +108,19 @@ def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     return vehicle, study, names
 
 
-def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Path]:
-    """By camera, its clip."""
+def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+    """By camera, its clip, or its topic of a bag."""
     given = arguments.path("sequence")
     if given is None:
         return _clips_of_sources(vehicle, names)
+    if is_bag(given):
+        return _topics(given, vehicle, names)
     if "camera" in arguments.values and not given.is_dir():
         return {names[0]: given}
     if not given.is_dir():
         rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
         raise UserError("command line", "sequence", repr(str(given)), rule)
-    found: dict[str, Path] = {}
+    found: dict[str, Filmed] = {}
     problems = []
     for name in names:
         clips = sorted(path for path in given.glob(f"{name}.*") if path.suffix not in NO_CLIPS)
@@ -128,8 +134,28 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
     return found
 
 
-def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Path]:
-    """The clip that each camera's source plays; a drive that is not rendered yet is rendered first."""
+def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+    """By camera, its topic of a bag: that of its mount, or the only one with pictures."""
+    found: dict[str, Filmed] = {}
+    problems = []
+    for name in names:
+        camera = vehicle.cameras[name]
+        wanted = camera.mount.get("topic", camera.source.settings.get("topic"))
+        try:
+            with Bag(path) as bag:
+                topic = bag.find(PICTURES, None if wanted is None else str(wanted), "pictures")
+            found[name] = BagTopic(str(path), topic)
+        except ModelError as error:
+            at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
+            problems.append(Problem("command line", at, str(error.found), error.rule))
+    if problems:
+        raise ConfigError(problems)
+    return found
+
+
+def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+    """The clip, or the pictures of a bag, that each camera's source plays; a drive that is not rendered yet is rendered
+    first."""
     from dataclasses import replace
 
     from runner.plans import compile_plans, render_missing
@@ -137,8 +163,11 @@ def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Pa
     wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
     with progress_bar() as progress:
         render_missing(wanted, progress)
-    found = {}
+    found: dict[str, Filmed] = {}
     for plan in compile_plans(wanted):
+        if plan.bag:
+            found[plan.camera.name] = plan.bag
+            continue
         clip = next((e.properties["location"] for e in plan.source if "location" in e.properties), None)
         if clip is None or not plan.loops:
             rule = f"must be given, since the source of {plan.camera.name} plays no clip"

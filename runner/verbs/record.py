@@ -4,7 +4,8 @@ Record each camera without loss: the frames as its source delivers them, in nati
 DIR/CAMERA.mkv, and a description into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with Ctrl-C;
 either way the files are complete. A file gets its name only when it is complete; until then, or if its camera fails, it
 is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing because the encoder or the disk was too slow are
-counted and reported. recording=NAME chooses the encoder, a file of conf/recording/.
+counted and reported. A bag is read as fast as the encoder takes it: once, or again and again up to duration_s.
+recording=NAME chooses the encoder, a file of conf/recording/.
 
 Before the start the disk must have room for the raw frames (width x height x 1.5 bytes x fps) times of_raw of
 conf/recording/, for duration_s or otherwise 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
@@ -214,7 +215,9 @@ def _check_sources(vehicle: Vehicle) -> None:
 
     raises  UserError
     """
-    pushed = [c.name for c in vehicle.cameras.values() if c.source.stand_in and not c.source.render]
+    pushed = [
+        c.name for c in vehicle.cameras.values() if c.source.stand_in and not (c.source.render or c.source.plays_bags)
+    ]
     if pushed:
         rule = "its frames are pushed by a Python program, which `record` is not; choose another source"
         raise UserError("command line", "source", ", ".join(pushed), rule)

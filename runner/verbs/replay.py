@@ -1,4 +1,5 @@
 """usage: tod-runner replay [-m] [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
+                         [positions=BAG [topic=NAME]]
 
 Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
 standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
@@ -15,6 +16,9 @@ from the positions and times of the input; its events are marked "source": "pqos
 Measurements of the link are those of the input. With link=again they are estimated again from the drive's reception
 reports: by the same version, to the same events.
 
+Positions are those of the input. With positions=BAG they are replaced by those of a bag of ROS that was recorded during
+the drive (sensor_msgs/NavSatFix), marked "source": "bag"; topic= is needed if it has several such topics.
+
 With -m, which needs input=, commas and range() are sweeps: each combination of values is a run over the same events,
 one after the other. Each line then begins with the key overrides; with log=DIR the drives are DIR/0, DIR/1, ...
 
@@ -22,6 +26,7 @@ one after the other. Each line then begins with the key overrides; with log=DIR 
   tod-runner replay input=drive output=decisions.jsonl
   tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
   tod-runner replay input=drive pqos=map pqos.file=other_map.csv
+  tod-runner replay input=drive positions=gps.bag pqos=map pqos.file=other_map.csv
   tod-runner replay input=drive link=again     for a change of the estimator
   tod-runner replay input=drive cameras.rear_center.weight=2
   tod-runner replay input=drive vehicle=delivery_robot
@@ -33,6 +38,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain, islice
@@ -41,7 +47,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
-from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, parse, to_json
+from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, log_run
@@ -109,8 +115,11 @@ def _prepared(arguments: Arguments, name: str, began: Began | None) -> _Prepared
 
 def _answered(run: _Prepared, lines: Iterable[str], name: str, began: Began | None) -> Iterator[str]:
     """The lines of a run, which is logged if requested."""
+    inputs = events(lines, name, _uplink(run.arguments, run.vehicle))
+    if not run.arguments.values.keys().isdisjoint(("positions", "topic")):
+        inputs = _positioned(inputs, run.arguments, began)
     with _log(run.arguments, run.config, began) as log:
-        yield from replay(run.vehicle, events(lines, name, _uplink(run.arguments, run.vehicle)), run.pqos, log)
+        yield from replay(run.vehicle, inputs, run.pqos, log)
 
 
 def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
@@ -173,6 +182,26 @@ def replay(
         if log:
             log_run(log, event, before, now)
         yield answers.line(document, now)
+
+
+def _positioned(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
+    """The events with the positions of a bag in place of their own."""
+    from runner.drive.positions import given_positions, spanned
+
+    recorded = given_positions(arguments.values)
+    if began is None:
+        rule = "needs a drive as input: events alone do not state when they happened"
+        raise UserError("command line", "positions", recorded.where, rule)
+    waiting, last, found = deque(recorded.since(began.time)), 0.0, False
+    for document, event in inputs:
+        last = event.t
+        while waiting and waiting[0].t <= last:
+            position, found = waiting.popleft(), True
+            yield to_json(position) | {"source": "bag"}, position
+        if not isinstance(event, PositionReported):
+            yield document, event
+    if not found:
+        raise recorded.refuse(f"the input: {spanned(began.time, began.time + last)}")
 
 
 def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:

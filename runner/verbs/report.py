@@ -1,4 +1,4 @@
-"""usage: tod-runner report DRIVE [DRIVE ...] output=DIR [models=DIR] [conf=DIR]
+"""usage: tod-runner report DRIVE [DRIVE ...] output=DIR [models=DIR] [positions=BAG [topic=NAME]] [conf=DIR]
 
 The figures of the paper's driving test from logged drives (log= of vehicle, operator and demo): a DRIVE is a
 directory with drive.jsonl, operator.jsonl or both. Several drives are compared, on the same axes.
@@ -9,6 +9,9 @@ and DIR/report.json with all statistics (schemas/report.schema.json), for CI.
 models= is a directory with CAMERA.model.json, as `tod-runner model` writes them: quality is then estimated. Without it
 the models named by the drive's configuration are used, if they are beside conf/cameras/. Quality that the verb quality
 has measured on the pictures of a drive is shown, too.
+
+positions= is a bag of ROS with the vehicle's positions during the drives (sensor_msgs/NavSatFix), in place of those in
+their logs; topic= is needed if it has several such topics.
 
   tod-runner demo log=drive duration_s=100; tod-runner report drive output=report
   tod-runner report drives/adaptive drives/static output=compared models=models
@@ -34,9 +37,10 @@ DOCUMENT = "report.json"
 
 def run(arguments: Arguments) -> int:
     paths, output = _wanted(arguments)
-    page = report(
-        paths, output, arguments.path("models"), [base / "cameras" for base in conf_directories(arguments.conf)]
-    )
+    from runner.drive.positions import reader
+
+    bases = [base / "cameras" for base in conf_directories(arguments.conf)]
+    page = report(paths, output, arguments.path("models"), bases, reader(arguments.values))
     print(page)
     return 0
 
@@ -46,9 +50,11 @@ def report(
     output: Path,
     models: Path | None = None,
     bases: Sequence[Path] = (),
+    read: Callable[[Path], Drive] | None = None,
 ) -> Path:
     """Read, measure, draw, write; show the table of the cameras. The claims of a drive's experiment are checked.
 
+    read     reads a drive; None: as it was logged
     returns  the page
     raises   UserError for a drive or model that cannot be read, RunError for a file that cannot be written
     """
@@ -62,7 +68,7 @@ def report(
     from runner.verbs.report_table import show
 
     with progress_bar() as progress:
-        drives = _measured(paths, models, bases, lambda share: progress("drives", share))
+        drives = _measured(paths, models, bases, read, lambda share: progress("drives", share))
         held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
         made, left_out = figures(drives)
         write_figures(made, output, progress)
@@ -115,7 +121,11 @@ def _need_libraries() -> None:
 
 
 def _measured(
-    paths: Sequence[Path], models: Path | None, bases: Sequence[Path], progress: Callable[[float], None]
+    paths: Sequence[Path],
+    models: Path | None,
+    bases: Sequence[Path],
+    read: Callable[[Path], Drive] | None,
+    progress: Callable[[float], None],
 ) -> list[DriveStatistics]:
     from dataclasses import replace
 
@@ -128,7 +138,7 @@ def _measured(
     drives: list[Drive] = []
     for number, path in enumerate(paths):
         progress(number / len(paths))
-        drives.append(read_drive(path))
+        drives.append((read or read_drive)(path))
     found = []
     for drive, label in zip(drives, labels(drives), strict=True):
         over_time = series(drive, label)

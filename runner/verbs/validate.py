@@ -344,7 +344,7 @@ class _Checker:
             return False
         sections = {(key, id(value)) for key, value in assembled.document.items()}
         fits = {key for key, _ in sections & self.fine}
-        config = Configuration(assembled, self.user, runnable=False, check=self._registry, fits=fits)
+        config = Configuration(assembled, self.user, runnable=False, bags=True, check=self._registry, fits=fits)
         if _problems(config, task.readers):
             return False
         self.fine |= sections
@@ -353,7 +353,7 @@ class _Checker:
     def _check_composed(self, task: ValidationTask) -> None:
         try:
             composed = _composed(task.words, self.user)
-            config = Configuration(composed, self.user, runnable=False, check=self._registry)
+            config = Configuration(composed, self.user, runnable=False, bags=True, check=self._registry)
             problems = _problems(config, task.readers)
         except ConfigError as error:
             problems = error.problems

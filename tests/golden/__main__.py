@@ -33,6 +33,7 @@ from typing import Any
 
 import broken
 import mutations as mutated
+import numpy as np
 
 HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
@@ -92,19 +93,24 @@ def _difference(name: str, kept: str, now: str) -> Iterator[str]:
 
 def plans(pool: ProcessPoolExecutor) -> Texts:
     choices = list(product(*map(_files, ("vehicle", "graph", "source")), ("text", "json")))
-    words = [
-        [
-            "print",
-            f"format={form}",
-            f"vehicle={vehicle}",
-            f"graph={graph}",
-            f"source={source}",
-            "total_kbps=3000",
-            *_inputs(vehicle, source),
+    with tempfile.TemporaryDirectory() as directory:
+        sys.path.insert(0, str(HERE.parent))
+        from bags import camera_bag
+
+        bag = camera_bag(Path(directory, "drive"), "mcap", {"/image": [np.zeros((16, 16, 3), np.uint8)]}, 10)
+        words = [
+            [
+                "print",
+                f"format={form}",
+                f"vehicle={vehicle}",
+                f"graph={graph}",
+                f"source={source}",
+                "total_kbps=3000",
+                *_inputs(vehicle, source, bag),
+            ]
+            for vehicle, graph, source, form in choices
         ]
-        for vehicle, graph, source, form in choices
-    ]
-    return _outputs(pool, words)
+        return {name.replace(directory, ""): text for name, text in _outputs(pool, words).items()}
 
 
 def events(pool: ProcessPoolExecutor) -> Texts:
@@ -168,8 +174,10 @@ def _files(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-def _inputs(vehicle: str, source: str) -> list[str]:
+def _inputs(vehicle: str, source: str, bag: Path) -> list[str]:
     """Overrides that some sources need before they can be printed."""
+    if source == "bag":
+        return [f"source.bag={bag}", "source.topic=/image"]
     if source == "file":
         return [f"source.clip={HERE / '__main__.py'}"]
     return ["source.address=rtsp://192.0.2.1/camera"] if source == "rtsp" else []

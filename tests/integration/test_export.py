@@ -399,7 +399,10 @@ def test_words_that_are_no_export(tmp_path):
         ([str(drive), str(drive)], f"command line: {drive} {drive}: {name}"),
         ([f"{tmp_path}/none"], f"{tmp_path}/none: no such directory"),
         ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
-        ([str(drive), "mode=single"], "command line: mode=single: an export has no configuration, only output="),
+        (
+            [str(drive), "mode=single"],
+            "command line: mode=single: an export has no configuration, only format= and output=",
+        ),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],
             f"command line: output: '{tmp_path}/there.mcap': {there}",
@@ -433,3 +436,70 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd
     assert main(["export", str(drive)]) == 1
     assert capfd.readouterr().err.splitlines() == [f"{drive}/drive.mcap: no space left on device"]
     assert [path.name for path in drive.iterdir()] == ["drive.jsonl"]
+
+
+# --- a ROS 2 bag ------------------------------------------------------------------------------------------------------
+
+
+def bag_messages(path):
+    """By topic: type, and time and content of its messages, as another program reads them."""
+    from rosbags.highlevel import AnyReader
+
+    topics = {}
+    with AnyReader([path]) as opened:
+        for connection, ns, data in opened.messages():
+            known = topics.setdefault(connection.topic, (connection.msgtype, []))[1]
+            known.append((ns, opened.deserialize(data, connection.msgtype)))
+    return topics
+
+
+def stamped(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def test_a_ros_2_bag_holds_what_the_mcap_file_holds(filmed, tmp_path):
+    pytest.importorskip("rosbags")
+    drive = tmp_path / "drive"
+    shutil.copytree(filmed[0], drive)
+    log = drive / "drive.jsonl"
+    first, *rest = log.read_text().splitlines()
+    more = sorted([*VEHICLE, *map(json.loads, rest)], key=lambda line: line["t"])
+    log.write_text("\n".join([first, *map(json.dumps, more)]) + "\n")
+    mcap, ros = run("export", str(drive)), run("export", str(drive), "format=rosbag2")
+    assert (mcap.returncode, ros.returncode) == (0, 0), ros.stderr
+    topics, same = bag_messages(drive / "rosbag2"), messages(drive / "drive.mcap")
+    assert topics.keys() == same.keys()
+    for topic, (kind, found) in topics.items():
+        assert [ns for ns, _ in found] == [message.log_time for message in same[topic][2]]
+        if topic == "/position":
+            assert kind == "sensor_msgs/msg/NavSatFix"
+            assert [(m.latitude, m.longitude, m.status.status) for _, m in found] == [
+                (48.26, 11.66, 0),
+                (48.27, 11.66, 0),
+            ]
+            assert [stamped(m) for _, m in found] == [ns for ns, _ in found]
+        elif topic.startswith(("/front", "/rear")):
+            assert kind == "sensor_msgs/msg/CompressedImage"
+            assert [stamped(m) for _, m in found] == [ns for ns, _ in found]
+            assert {(m.format, m.header.frame_id) for _, m in found} == {("h264", topic.split("/")[1])}
+            assert [m.data.tobytes() for _, m in found] == [fields(message.data)[3] for message in same[topic][2]]
+        elif topic == "/notes":
+            assert [json.loads(m.data) for _, m in found] == [VEHICLE[4]]
+        else:
+            assert kind == "std_msgs/msg/String"
+            assert [m.data.encode() for _, m in found] == [message.data for message in same[topic][2]]
+    assert ros.stdout.startswith(f"{drive}/rosbag2: {sum(len(found) for _, found in topics.values())} messages, ")
+    again = run("export", str(drive), "format=rosbag2")
+    rule = "already exists; remove it, or name another one by output="
+    assert (again.returncode, again.stderr) == (2, f"command line: output: '{drive}/rosbag2': {rule}\n")
+    assert sorted(path.name for path in drive.iterdir() if path.name.startswith(".")) == []
+
+
+def test_a_bag_that_cannot_be_written_is_reported(tmp_path):
+    pytest.importorskip("rosbags")
+    write(tmp_path / "drive", "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
+    done = run("export", str(tmp_path / "drive"), "format=rosbag2", f"output={tmp_path}/none/bag")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"command line: output: '{tmp_path}/none/bag': no such file or directory\n",
+    )

@@ -1,0 +1,162 @@
+"""What an export of a drive writes, whatever its format: lines of the logs and pictures, in the order of time."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from runner.core.events import NAMES, Event, PositionReported
+from runner.core.events import to_json as event_to_json
+from runner.drive.captures import SECOND_NS, FilmedFile, ReadVideo, files
+from runner.drive.read import Drive, Side
+from runner.errors import RunError
+from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
+
+if TYPE_CHECKING:
+    from runner.apply import Unit
+
+TELL_EVERY = 500  # messages between two reports of progress
+# Topic by kind of line.
+TOPICS = {
+    "decision": "/decision",
+    "telemetry": "/telemetry",
+    "state": "/operator/state",
+    "sample": "/operator/sample",
+    "link": "/link",
+}
+VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_received"}
+
+
+POSITION_TOPIC, NOTE_TOPIC = "/position", "/notes"
+
+
+class ExportTarget(Protocol):
+    """Takes the messages of an export. Times are ns since 1970, never falling."""
+
+    def tell(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
+        """A line of a log, with the schema definition that it satisfies."""
+
+    def fix(self, position: Position, ns: int) -> None:
+        """A position of the vehicle."""
+
+    def note(self, side: str, line: Note, ns: int) -> None:
+        """A note of a side."""
+
+    def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
+        """An access unit of a camera, captured then."""
+
+
+class ExportMessage(NamedTuple):
+    """A message to write, and its time.
+
+    ns  since 1970
+    """
+
+    ns: int
+    write: Callable[[], None]
+
+
+def write_all(
+    drive: Drive,
+    target: ExportTarget,
+    read_video: ReadVideo,
+    on_warning: Callable[[str], None],
+    progress: Callable[[float], None],
+    check: Callable[[], None] = lambda: None,
+) -> int:
+    """Write all of a drive in time order.
+
+    read_video  yields the pictures of a file
+    on_warning  called with a line about each omission
+    progress    called now and then with the share done
+    check       called after each message
+    returns     number of messages
+    """
+    count = 0
+    first, last = _span(drive)
+    for message in heapq.merge(*_streams(drive, target, read_video, on_warning), key=lambda m: m.ns):
+        message.write()
+        check()
+        count += 1
+        if count % TELL_EVERY == 0:
+            progress(min(1.0, (message.ns - first) / max(1, last - first)))
+    progress(1.0)
+    return count
+
+
+def _streams(
+    drive: Drive, target: ExportTarget, read_video: ReadVideo, on_warning: Callable[[str], None]
+) -> Iterator[Iterator[ExportMessage]]:
+    """Messages by source, each in time order."""
+    for name, side in drive.sides.items():
+        # If the vehicle did not log, the operator's log has its positions.
+        yield _lines(name, side, target, positions="vehicle" not in drive.sides)
+        for camera, filmed in files(side).items():
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, filmed, target, read_video, on_warning)
+
+
+def _lines(name: str, side: Side, target: ExportTarget, positions: bool) -> Iterator[ExportMessage]:
+    began = round(side.began_s * SECOND_NS)
+    for line in side.lines:
+        ns = began + round(line.t * SECOND_NS)
+        for write in _writers(name, line, target, positions, ns):
+            yield ExportMessage(ns, write)
+
+
+def _writers(
+    name: str, line: Event | Record, target: ExportTarget, positions: bool, ns: int
+) -> Iterator[Callable[[], None]]:
+    """The messages of one line."""
+    if isinstance(line, Event):
+        event = NAMES[type(line)]
+        yield lambda: target.tell(f"/events/{event}", "event", event, event_to_json(line), ns)
+        if isinstance(line, PositionReported):
+            yield lambda: target.fix(Position.of(line), ns)
+        return
+    kind = KINDS[type(line)]
+    if isinstance(line, Note):
+        yield lambda: target.note(name, line, ns)
+    elif kind in TOPICS:
+        yield lambda: target.tell(TOPICS[kind], "drive", kind, line_to_json(line), ns)
+    if isinstance(line, Sample) and positions and (position := line.position):
+        yield lambda: target.fix(position, ns)
+
+
+def _pictures(
+    directory: Path,
+    topic: str,
+    camera: str,
+    filmed: list[FilmedFile],
+    target: ExportTarget,
+    read_video: ReadVideo,
+    on_warning: Callable[[str], None],
+) -> Iterator[ExportMessage]:
+    """The frames of one camera on one side, at their capture times."""
+    topic = topic.format(camera=camera)
+    last = -1
+    for file in filmed:
+        if file.lies_outside:
+            on_warning(f"{file.name}: lies outside the drive and was left out")
+            continue
+        try:
+            for unit in read_video(directory / file.name):
+                # A rebuilt pipeline begins after the previous one has ended, but clocks may be set.
+                last = max(file.captured(unit.after_ns), last + 1)
+                yield ExportMessage(last, lambda u=unit, ns=last: target.picture(topic, camera, u, ns))  # type: ignore[misc]
+        except RunError as error:
+            more = "the rest of it" if last >= file.captured(0) else "it"
+            on_warning(f"{error}; the export continues without {more}")
+
+
+def cameras_of(drive: Drive) -> list[str]:
+    named = (camera for side in drive.sides.values() for camera in side.began.config.get("cameras", {}))
+    return list(dict.fromkeys(named))
+
+
+def _span(drive: Drive) -> tuple[int, int]:
+    """Start and end of the drive, ns since 1970."""
+    began = [side.began_s for side in drive.sides.values()]
+    ended = [side.began_s + line.t for side in drive.sides.values() for line in side.lines[-1:]]
+    return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)

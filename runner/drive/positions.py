@@ -1,0 +1,98 @@
+"""Positions of a drive from a bag that was recorded meanwhile, in place of those in its log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from heapq import merge
+from pathlib import Path
+
+from runner.bag import POSITIONS, Bag, Fix
+from runner.bag.pictures import SECOND_NS
+from runner.core.events import PositionReported
+from runner.core.model import ModelError
+from runner.drive.read import Drive, read_drive
+from runner.errors import UserError
+
+ARGUMENTS = ("positions", "topic")  # of the command line
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedPositions:
+    """The positions of a bag, in the order of time.
+
+    where  file and topic, for messages
+    """
+
+    where: str
+    fixes: Sequence[Fix]
+
+    @property
+    def span(self) -> str:
+        return spanned(self.fixes[0].ns / SECOND_NS, self.fixes[-1].ns / SECOND_NS)
+
+    def since(self, began_s: float) -> Iterator[PositionReported]:
+        """As events of a drive that began then, s since 1970; those before are left out."""
+        for fix in self.fixes:
+            t = (fix.ns - round(began_s * SECOND_NS)) / SECOND_NS
+            if t >= 0:
+                yield PositionReported(t=t, lat=fix.lat, lon=fix.lon)
+
+    def refuse(self, drive: str) -> UserError:
+        """The error that no position falls into a drive, which is described with its times."""
+        rule = f"no position falls into {drive}; both must have been recorded by the same clock"
+        return UserError("command line", ARGUMENTS[0], f"{self.where}: {self.span}", rule)
+
+
+def spanned(began_s: float, ended_s: float) -> str:
+    """A span of time, s since 1970, as text."""
+    began, ended = (datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds") for at in (began_s, ended_s))
+    return f"{began.removesuffix('+00:00')} to {ended.removesuffix('+00:00')} UTC"
+
+
+def reader(values: Mapping[str, str]) -> Callable[[Path], Drive]:
+    """What reads the drives of a command: with the positions that its arguments name, otherwise as they were logged.
+
+    raises  UserError
+    """
+    if values.keys().isdisjoint(ARGUMENTS):
+        return read_drive
+    recorded = given_positions(values)
+    return lambda path: positioned(read_drive(path), recorded)
+
+
+def given_positions(values: Mapping[str, str]) -> RecordedPositions:
+    """The positions that the arguments `positions` and `topic` name.
+
+    raises  UserError
+    """
+    path, topic = (values.get(key) for key in ARGUMENTS)
+    if path is None:
+        raise UserError("command line", ARGUMENTS[0], None, "must be given with topic: the bag that has it")
+    try:
+        with Bag(Path(path)) as bag:
+            found = bag.find(POSITIONS, topic, "positions")
+            fixes, where = sorted(bag.positions(found)), bag.names(found)
+    except ModelError as error:
+        key = "topic" if error.key == "topic" and topic is not None else ARGUMENTS[0]
+        raise UserError("command line", key, str(error.found), error.rule) from None
+    if not fixes:
+        raise UserError("command line", ARGUMENTS[0], where, "has no position with a fix")
+    return RecordedPositions(where, fixes)
+
+
+def positioned(drive: Drive, recorded: RecordedPositions) -> Drive:
+    """A drive with the positions of a bag in place of its own.
+
+    raises  UserError if no position falls into it
+    """
+    name = "vehicle" if "vehicle" in drive.sides else "operator"
+    side = drive.sides[name]
+    end = max((line.t for line in side.lines), default=0.0)
+    new = [event for event in recorded.since(side.began_s) if event.t <= end]
+    if not new:
+        raise recorded.refuse(f"{drive.path}: {spanned(side.began_s, side.began_s + end)}")
+    kept = [line for line in side.lines if not isinstance(line, PositionReported)]
+    lines = list(merge(kept, new, key=lambda line: line.t))
+    return replace(drive, sides={**drive.sides, name: replace(side, lines=lines)})

@@ -1,0 +1,118 @@
+"""A drive as a ROS 2 bag: positions, video by access unit, and lines of the logs as text."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runner.drive.captures import SECOND_NS, ReadVideo
+from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, VIDEO_TOPICS, cameras_of, write_all
+from runner.drive.read import Drive
+from runner.errors import RunError
+from runner.records import Json, Note, Position, line_to_json
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Writer
+
+    from runner.apply import Unit
+
+TEXT, FIX, VIDEO = "std_msgs/msg/String", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CompressedImage"
+GPS = 1  # SERVICE_GPS of sensor_msgs/NavSatStatus
+FRAME = "gps"
+
+
+def write_rosbag2(
+    drive: Drive,
+    path: Path,
+    read_video: ReadVideo,
+    on_warning: Callable[[str], None],
+    progress: Callable[[float], None] = lambda done: None,
+) -> int:
+    """Write all of a drive in time order, into MCAP in the directory of a bag.
+
+    path        of the directory, which does not exist yet
+    read_video  yields the pictures of a file
+    on_warning  called with a line about each omission
+    progress    called now and then with the share done
+    returns     number of messages
+    raises      RunError if the bag cannot be written
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    _check_names(cameras_of(drive))
+    try:
+        # Older distributions of ROS 2 refuse newer versions of the metadata.
+        with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+            for name, side in drive.sides.items():
+                writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
+            return write_all(drive, _Topics(writer), read_video, on_warning, progress)
+    except OSError as error:
+        raise RunError(f"the bag cannot be written: {error.strerror or error}") from None
+
+
+class _Topics:
+    """The topics, each created with its first message."""
+
+    def __init__(self, writer: Writer) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._writer = writer
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._made: dict[str, Any] = {}
+
+    def tell(self, topic: str, _schema: str, _definition: str, line: Json, ns: int) -> None:
+        self._write(topic, TEXT, ns, data=json.dumps(line, ensure_ascii=False))
+
+    def note(self, _side: str, line: Note, ns: int) -> None:
+        self._write(NOTE_TOPIC, TEXT, ns, data=json.dumps(line_to_json(line), ensure_ascii=False))
+
+    def fix(self, position: Position, ns: int) -> None:
+        types: Any = self._store.types
+        self._write(
+            POSITION_TOPIC,
+            FIX,
+            ns,
+            header=self._header(ns, FRAME),
+            status=types["sensor_msgs/msg/NavSatStatus"](status=0, service=GPS),
+            latitude=position.lat,
+            longitude=position.lon,
+            altitude=float("nan"),  # unknown, as the message defines it
+            position_covariance=np.zeros(9),
+            position_covariance_type=0,
+        )
+
+    def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
+        data = np.frombuffer(unit.data, np.uint8)
+        self._write(ros_name(topic), VIDEO, ns, header=self._header(ns, camera), format=unit.codec, data=data)
+
+    def _header(self, ns: int, frame: str) -> Any:
+        sec, nanosec = divmod(ns, SECOND_NS)
+        types: Any = self._store.types
+        stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+    def _write(self, topic: str, kind: str, ns: int, **fields: Any) -> None:
+        if topic not in self._made:
+            self._made[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        types: Any = self._store.types
+        self._writer.write(self._made[topic], ns, self._store.serialize_cdr(types[kind](**fields), kind))
+
+
+def ros_name(topic: str) -> str:
+    """A topic with the characters that ROS 2 allows: letters, digits and _, no digit first."""
+    return re.sub(r"/(?=\d)", "/_", topic.replace("-", "_"))
+
+
+def _check_names(cameras: list[str]) -> None:
+    """Check that no two cameras would have the same topic."""
+    taken: dict[str, str] = {}
+    for camera in cameras:
+        name = ros_name(VIDEO_TOPICS["vehicle"].format(camera=camera))
+        if name in taken:
+            raise RunError(f"cameras {taken[name]} and {camera} would have the same topic {name} in ROS")
+        taken[name] = camera

@@ -1,0 +1,161 @@
+"""Pictures of a bag for an appsrc: read in a thread of their own, at their own pace or as fast as they are taken."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+from gi.repository import GLib, Gst
+
+from runner.bag import PICTURES, Bag
+from runner.bag.pictures import Picture
+from runner.core.model import BagTopic, ModelError
+from runner.graph import Plan
+from runner.gst.source import BEHIND_S
+
+LOOK_S = 0.5  # a thread that waits for its next picture looks this often whether its pipeline is gone
+ENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
+UNPACED = {"is-live": False, "leaky-type": 0, "block": True}  # of an appsrc that waits until each picture is taken
+
+
+def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[str], None]) -> None:
+    """Let the source of a new pipeline play a bag as a camera would: live, at the bag's pace."""
+    source = pipeline.get_by_name(plan.source[0].name)
+    BagFeed(source, bag, plan.camera.fps, plan.camera.source.loop, on_report)
+
+
+def read_bag(source: Gst.Element, bag: BagTopic, fps: Fraction, loop: bool = False) -> BagFeed:
+    """Let an appsrc of a new pipeline pass a bag's pictures as fast as they are taken: none is left out."""
+    for key, value in UNPACED.items():
+        source.set_property(key, value)
+    return BagFeed(source, bag, fps, loop)
+
+
+class BagFeed:
+    """Pushes the pictures of a topic into an appsrc, from the moment that it asks for the first one.
+
+    The first picture comes at once; the running times of the others follow from their stamps. A bag that cannot be read
+    ends the pipeline, as an error of its source.
+
+    fps        stated in the caps, Hz
+    loop       start again at the end, one mean interval after the last picture
+    on_report  called with a line about pictures that are left out; each comes at its time. None: they come as fast as
+               they are taken, and one that would be left out is an error
+
+    `first` is the stamp of the first picture, ns since 1970; None before it.
+    """
+
+    def __init__(
+        self,
+        source: Gst.Element,
+        bag: BagTopic,
+        fps: Fraction,
+        loop: bool,
+        on_report: Callable[[str], None] | None = None,
+    ) -> None:
+        self._source, self._bag, self._fps, self._loop, self._on_report = source, bag, fps, loop, on_report
+        self.first: int | None = None
+        self._interval = round(Gst.SECOND / fps)  # between two rounds, ns
+        self._shift = 0  # from stamps to running time, ns
+        self._last = -1  # running time of the last picture, ns
+        self._form: Picture | None = None  # the picture whose size and format the others must have
+        self._told = False
+        self._waiting = threading.Event()  # never set: the thread is a daemon and looks whether its pipeline is gone
+        self._starting = source.connect("need-data", self._on_need_data)
+
+    def _on_need_data(self, source: Gst.Element, _bytes: int) -> None:
+        """From the streaming thread, once."""
+        source.disconnect(self._starting)
+        threading.Thread(target=self._run, name="bag", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            with Bag(Path(self._bag.path)) as bag:
+                bag.find(PICTURES, self._bag.topic, "pictures")
+                while self._round(bag) and self._loop:
+                    pass
+            self._source.emit("end-of-stream")
+        except ModelError as error:
+            self._fail(f"{error.found}: {error.rule}")
+
+    def _round(self, bag: Bag) -> bool:
+        """Play the bag once; returns False if the pipeline is gone."""
+        began, count = 0, 0
+        for number, picture in enumerate(bag.pictures(self._bag.topic), 1):
+            if number == 1:
+                self._begin(picture)
+            if why := self._misfit(picture):
+                self._leave_out(bag, why.format(number))
+                continue
+            self._last = picture.ns + self._shift
+            if not self._push(picture):
+                return False
+            began, count = began if count else self._last, count + 1
+        if count > 1:
+            self._interval = (self._last - began) // (count - 1)
+        return count > 0
+
+    def _begin(self, picture: Picture) -> None:
+        """A round begins with this picture."""
+        if self._form is None:
+            self._form, self.first = picture, picture.ns
+            self._source.set_property("caps", Gst.Caps.from_string(caps(picture, self._fps)))
+            start = self._now() if self._on_report else 0
+        else:
+            start = self._last + self._interval
+        self._shift = start - picture.ns
+
+    def _misfit(self, picture: Picture) -> str | None:
+        """Why a picture cannot follow those before it; None: it can."""
+        first = self._form
+        assert first is not None
+        if (picture.width, picture.height) != (first.width, first.height):
+            return f"picture {{}} is {picture.width}x{picture.height}, the first one {first.width}x{first.height}"
+        if picture.format != first.format:
+            return f"picture {{}} is {picture.format}, the first one {first.format}"
+        if picture.ns + self._shift <= self._last:
+            return "picture {} is not later than the one before"
+        return None
+
+    def _leave_out(self, bag: Bag, why: str) -> None:
+        """Report the first picture of this kind; raises ModelError if no picture may be missing."""
+        where = bag.names(self._bag.topic)
+        if self._on_report is None:
+            raise ModelError("topic", where, why)
+        if not self._told:
+            self._told = True
+            self._on_report(f"{where}: {why}: such pictures are left out")
+
+    def _push(self, picture: Picture) -> bool:
+        """Push a picture when it is due; returns False if the pipeline is gone."""
+        if self._on_report:
+            while (early := self._last - self._now()) > 0:
+                self._waiting.wait(min(early / Gst.SECOND, LOOK_S))
+                if self._source.get_state(0).state < Gst.State.PAUSED:
+                    return False
+            if -early > BEHIND_S * Gst.SECOND:  # like a clip, it does not catch up
+                self._shift -= early
+                self._last -= early
+        buffer = Gst.Buffer.new_wrapped(picture.data)
+        buffer.pts = self._last
+        return bool(self._source.emit("push-buffer", buffer) == Gst.FlowReturn.OK)
+
+    def _now(self) -> int:
+        """Running time of the pipeline, ns; 0 once the source has been taken out of it."""
+        clock = self._source.get_clock()
+        return int(clock.get_time() - self._source.get_base_time()) if clock else 0
+
+    def _fail(self, why: str) -> None:
+        error = GLib.Error.new_literal(Gst.ResourceError.quark(), why, Gst.ResourceError.READ)
+        self._source.post_message(Gst.Message.new_error(self._source, error, ""))
+
+
+def caps(picture: Picture, fps: Fraction) -> str:
+    """Caps of pictures like this one."""
+    rate = f"framerate={fps.numerator}/{fps.denominator}"
+    if picture.format in ENCODED:
+        return f"{ENCODED[picture.format]},{rate}"
+    size = f"width={picture.width},height={picture.height}"
+    return f"video/x-raw,format={picture.format},{size},pixel-aspect-ratio=1/1,{rate}"

@@ -1,0 +1,283 @@
+"""Bags played by a real vehicle: pixels, pace, capture times, order; and what ends or interrupts a bag."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, image, typestore, write_bag
+from shared_data import shared
+
+from rig import free_port, process, run, streaming, until, watching
+from runner.bag import Bag
+from runner.bag.pictures import FORMATS
+from runner.core.commands import Command
+from runner.core.model import BagTopic
+from runner.operator.frames import live_frames
+
+pytestmark = pytest.mark.gst
+
+STORE = typestore("mcap")
+BITS = 6  # of the number in a picture
+WIDTH, HEIGHT = 384, 216
+RATE = 15
+
+
+def road(count):
+    return filmed(shared("video/forward_highway_day_540p25_A.mp4"), count, (96, 54))
+
+
+def numbered(number):
+    """A picture with its number as bright and dark bars, from the left."""
+    bars = [255 if number >> bit & 1 else 0 for bit in range(BITS)]
+    row = np.repeat(np.array(bars, np.uint8), WIDTH // BITS)
+    return np.broadcast_to(row[None, :, None], (HEIGHT, WIDTH, 3)).copy()
+
+
+def number_of(picture):
+    """The number in a picture; None where it shows damage, as after lost packets."""
+    height, width = picture.shape[:2]
+    seen = [int(picture[height // 2, round((bit + 0.5) * width / BITS)].mean()) for bit in range(BITS)]
+    clear = all(grey < 64 or grey > 192 for grey in seen)
+    return sum((grey > 128) << bit for bit, grey in enumerate(seen)) if clear else None
+
+
+# --- pixels -----------------------------------------------------------------------------------------------------------
+
+
+def shown(bag, topic, form="RGB"):
+    """The pictures that come out of GStreamer, and their times in ns."""
+    from fractions import Fraction
+
+    from runner.gst import Gst
+    from runner.gst.bag_feed import read_bag
+
+    sink = "appsink name=sink sync=false"
+    line = f"appsrc name=bag format=time max-buffers=2 ! decodebin ! videoconvert ! video/x-raw,format={form} ! {sink}"
+    pipeline = Gst.parse_launch(line)
+    read_bag(pipeline.get_by_name("bag"), BagTopic(str(bag), topic), Fraction(25))
+    pipeline.set_state(Gst.State.PLAYING)
+    pictures, times = [], []
+    try:
+        while sample := pipeline.get_by_name("sink").emit("try-pull-sample", 20 * Gst.SECOND):
+            caps, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
+            width, height = caps.get_int("width")[1], caps.get_int("height")[1]
+            data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8).reshape(height, -1)
+            pictures.append(data[:, : 3 * width].reshape(height, width, 3))
+            times.append(buffer.pts)
+        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
+        assert message is None, message.parse_error()[0].message
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+    return pictures, times
+
+
+def encoded(frame, encoding):
+    """A frame of BGR in another encoding, and the RGB that it stands for."""
+    import cv2
+
+    rgb = frame[..., ::-1]
+    alpha = np.full((*frame.shape[:2], 1), 255, np.uint8)
+    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[..., None]
+    match encoding:
+        case "mono8":
+            return grey, np.repeat(grey, 3, 2)
+        case "mono16":
+            wide = grey.astype("<u2") * 257
+            return wide.view(np.uint8), np.repeat(grey, 3, 2)
+        case "rgb8" | "rgba8":
+            return np.concatenate([rgb, alpha], 2)[..., : 3 if encoding == "rgb8" else 4], rgb
+        case "bgr8" | "bgra8":
+            return np.concatenate([frame, alpha], 2)[..., : 3 if encoding == "bgr8" else 4], rgb
+    # Grey of 4:2:2, limited range: luma of full range is 255 / 219 of what is above 16.
+    luma = np.clip(grey, 16, 235)
+    chroma = np.full_like(luma, 128)
+    pairs = [chroma, luma] if encoding in ("yuv422", "uyvy") else [luma, chroma]
+    bright = np.clip((luma.astype(float) - 16) * 255 / 219, 0, 255).round().astype(np.uint8)
+    return np.concatenate(pairs, 2), np.repeat(bright, 3, 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pixels_of_each_encoding(tmp_path, kind):
+    store, frames = typestore(kind), road(2)
+    topics = {
+        f"/{encoding}": [
+            (
+                BEGAN_NS + n,
+                image(store, BEGAN_NS + n * 40_000_000, encoded(frame, encoding)[0], encoding, padding=n * 6),
+            )
+            for n, frame in enumerate(frames)
+        ]
+        for encoding in FORMATS
+    }
+    swapped = encoded(frames[0], "mono16")[0].reshape(54, 96, 2)[..., ::-1]
+    topics["/big"] = [(BEGAN_NS, image(store, BEGAN_NS, np.ascontiguousarray(swapped), "mono16", big=True))]
+    bag = write_bag(tmp_path / "b", kind, topics)
+    for encoding in FORMATS:
+        pictures, times = shown(bag, f"/{encoding}")
+        assert times == [0, 40_000_000]
+        for picture, frame in zip(pictures, frames, strict=True):
+            wanted = encoded(frame, encoding)[1]
+            assert np.abs(picture.astype(int) - wanted).max() <= (4 if "u" in encoding else 2), encoding
+    ((picture,), _) = shown(bag, "/big")
+    assert np.abs(picture.astype(int) - encoded(frames[0], "mono16")[1]).max() <= 2
+
+
+def test_compressed_pictures_are_decoded(tmp_path):
+    import cv2
+
+    (frame,) = road(1)
+    files = {kind: cv2.imencode(f".{kind}", frame)[1].tobytes() for kind in ("png", "jpg")}
+    topics = {f"/{k}": [(BEGAN_NS, compressed(STORE, BEGAN_NS, data, k))] for k, data in files.items()}
+    bag = write_bag(tmp_path / "b", "mcap", topics)
+    ((png,), _), ((jpeg,), _) = shown(bag, "/png"), shown(bag, "/jpg")
+    assert (png == frame[..., ::-1]).all()
+    reference = cv2.imdecode(np.frombuffer(files["jpg"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(jpeg.astype(int) - reference).mean() < 3
+
+
+# --- a vehicle --------------------------------------------------------------------------------------------------------
+
+
+def robot(bag, *words, topics=("front", "rear")):
+    return (
+        *("vehicle=delivery_robot", "source=bag", f"source.bag={bag}", "~cameras.mast", f"fps_max={RATE}"),
+        *(f"cameras.{name}.topic=/{name}/image" for name in topics),
+        *("cameras.front.width_px=384", "cameras.front.height_px=216", "~cameras.front.native"),
+        *("cameras.rear.width_px=384", "cameras.rear.height_px=216"),
+        *words,
+    )
+
+
+def send(side, *names):
+    knobs = (("sending", True), ("size", (WIDTH, HEIGHT)), ("bitrate", 3000))
+    side.turn([Command(name, *knob) for name in names for knob in knobs])
+
+
+def test_two_cameras_arrive_in_order_with_the_times_of_the_bag(tmp_path):
+    """30 pictures each and again after the end; one camera has them from the last to the first."""
+    count, order = 30, {"front": list(range(30)), "rear": list(range(29, -1, -1))}
+    bag, other = (
+        camera_bag(tmp_path / name, kind, {f"/{name}/image": map(numbered, order[name])}, RATE)
+        for name, kind in (("front", "ros1"), ("rear", "mcap"))
+    )
+    words = robot(bag, f"cameras.rear.bag={other}")
+    with streaming(*words, cameras=()) as (side, vehicle, _, reported):
+        send(side, "front", "rear")
+        seen = {name: [] for name in order}
+        with live_frames([*words, f"media.port={vehicle.media.port}"]) as received:
+            until(lambda: take(received, seen) and min(map(len, seen.values())) > 2 * count)
+    for name, pictures in seen.items():
+        numbers = [order[name].index(number) for number, _, _ in pictures]
+        starts = [at for at in range(1, len(numbers)) if numbers[at] < numbers[at - 1]]
+        assert starts, "the bag did not begin again"
+        places = [number + count * sum(start <= at for start in starts) for at, number in enumerate(numbers)]
+        assert places == sorted(set(places))  # in order, none twice
+        assert len(places) > 0.9 * (places[-1] - places[0] + 1)
+        # The capture times have the pace of the bag, also over its end.
+        first, last = pictures[0], pictures[-1]
+        assert (last[1] - first[1]) == pytest.approx((places[-1] - places[0]) / RATE, abs=0.02)
+        latencies = [seen_at - captured for _, captured, seen_at in pictures]
+        assert 0 < min(latencies) < 1
+        assert np.median(latencies) < 2
+    assert {line.partition(": ")[2] for line in reported} == {"pipeline built", "pipeline stopped"}
+
+
+def take(received, seen):
+    if (frame := received.next(1)) and frame.captured and (number := number_of(frame.image)) is not None:
+        seen[frame.camera].append((number, frame.captured, time.time()))
+    return True
+
+
+def test_pictures_of_another_size_are_left_out_and_others_go_on(tmp_path):
+    pictures = [numbered(n) if n % 10 < 8 else numbered(n)[::2, ::2] for n in range(60)]
+    frames = {"/front/image": pictures, "/rear/image": map(numbered, range(60))}
+    bag = camera_bag(tmp_path / "drive", "mcap", frames, RATE)
+    with streaming(*robot(bag), cameras=()) as (side, _, plans, reported):
+        send(side, "front", "rear")
+        with watching(plans[0]) as front, watching(plans[1]) as rear:
+            until(lambda: len(front.sizes) > 30 and len(rear.sizes) > 30)
+    what = f"front: {bag}: /front/image: picture 9 is 192x108, the first one 384x216: such pictures are left out"
+    assert [line for line in reported if "pipeline" not in line] == [what]
+
+
+def test_a_bag_that_is_damaged_further_on_ends_its_camera_alone(tmp_path):
+    whole = camera_bag(tmp_path / "drive", "ros1", {"/front/image": map(numbered, range(40))}, RATE)
+    data = bytearray(whole.read_bytes())
+    at = data.index(b"rgb8") if b"rgb8" in data else data.rindex(b"bgr8")
+    data[at : at + 4] = b"xyz8"
+    bag = tmp_path / "damaged.bag"
+    bag.write_bytes(data)
+    other = camera_bag(tmp_path / "other", "mcap", {"/rear/image": map(numbered, range(40))}, RATE)
+    words = robot(bag, f"cameras.rear.bag={other}")
+    with streaming(*words, cameras=()) as (side, _, plans, reported):
+        send(side, "front", "rear")
+        with watching(plans[0]), watching(plans[1]) as rear:
+            until(lambda: any("xyz8" in line for line in reported))
+            received = len(rear.sizes)
+            until(lambda: len(rear.sizes) > received + 10)
+    (line,) = {line for line in reported if "xyz8" in line}
+    assert line.startswith(f"front: {bag}: /front/image: encoding 'xyz8' is not supported; expected one of mono8, ")
+
+
+def test_a_vehicle_whose_bag_lacks_a_topic_does_not_start(tmp_path):
+    bag = camera_bag(tmp_path / "drive", "mcap", {"/front/image": map(numbered, range(3))}, RATE)
+    with process("vehicle", *robot(bag), f"media.port={free_port()}") as vehicle:
+        output, _ = vehicle.communicate(timeout=60)
+    assert vehicle.returncode == 2
+    rule = "no such topic with pictures, did you mean /front/image?"
+    assert output.splitlines() == [
+        f"command line: cameras.rear.topic: {bag}: /rear/image: {rule}",
+        "1 problem, nothing was started",
+    ]
+
+
+# --- as fast as possible ----------------------------------------------------------------------------------------------
+
+
+def test_a_bag_is_recorded_picture_by_picture_faster_than_it_plays(tmp_path):
+    bag = camera_bag(tmp_path / "drive", "sqlite3", {"/front/image": map(numbered, range(60))}, 0.25)
+    words = [*robot(bag, topics=["front"]), "~cameras.rear", "fps_max=0.25"]
+    done = run("record", *words, f"output={tmp_path}/rec", timeout=120)  # half of what the bag lasts
+    assert (done.returncode, done.stderr.count("WARNING")) == (0, 0)
+    line = f"front: {tmp_path}/rec/front.mkv: 384x216 at 0.25 Hz, 60 frames in 240.00 s, "
+    assert done.stdout.startswith(line)
+    import cv2
+
+    video = cv2.VideoCapture(str(tmp_path / "rec" / "front.mkv"))
+    assert [number_of(video.read()[1]) for _ in range(60)] == list(range(60))
+    with Bag(bag) as opened:
+        first = next(opened.pictures("/front/image"))
+    assert f'"began": {first.ns / 1e9:.2f}' in (tmp_path / "rec" / "recording.json").read_text()
+
+
+def test_a_recording_fails_where_a_picture_would_be_left_out(tmp_path):
+    pictures = [numbered(n) if n < 8 else numbered(n)[::2, ::2] for n in range(20)]
+    bag = camera_bag(tmp_path / "drive", "mcap", {"/front/image": pictures}, RATE)
+    done = run("record", *robot(bag, topics=["front"]), "~cameras.rear", f"output={tmp_path}/rec")
+    assert done.returncode == 1
+    why = f"front: {bag}: /front/image: picture 9 is 192x108, the first one 384x216"
+    assert any(why in line for line in done.stderr.splitlines())
+
+
+@pytest.mark.soak
+def test_a_model_is_measured_on_a_topic(tmp_path):
+    import json
+
+    frames = filmed(shared("video/forward_highway_day_540p25_A.mp4"), 30, (320, 180))
+    bag = camera_bag(tmp_path / "drive", "mcap", {"/front/image": frames, "/rear/image": frames}, 25)
+    words = ["vehicle=delivery_robot", "scalings=[0.5]", "bitrates_kbps=[300,900]", f"output={tmp_path}/models"]
+    done = run("model", *words, "camera=front", f"sequence={bag}", env={"XDG_CACHE_HOME": str(tmp_path)})
+    assert done.returncode == 2
+    topics = "/front/image, /rear/image"
+    assert done.stderr.splitlines()[0] == f"command line: cameras.front.topic: {bag}: must be given: one of {topics}"
+    words += ["camera=front", f"sequence={bag}", "cameras.front.topic=/front/image"]
+    done = run("model", *words, env={"XDG_CACHE_HOME": str(tmp_path)})
+    assert done.returncode == 0, done.stderr
+    (sequence,) = json.loads((tmp_path / "models" / "front.model.json").read_text())["sequences"].values()
+    assert (sequence["topic"], sequence["frames"], sequence["fps"]) == ("/front/image", 30, 25)
+    assert (sequence["width"], sequence["height"], sequence["lossless"]) == (320, 180, True)

@@ -1,0 +1,200 @@
+"""Bags without ROS: what is read of them, and what is said about those that are wrong."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, fix, image, typestore, write_bag
+from shared_data import shared
+
+from runner.bag import POSITIONS, Bag, PictureForm, is_bag
+from runner.bag.pictures import read_image
+from runner.core.model import ModelError
+
+ROAD = "video/forward_highway_day_540p25_A.mp4"
+SIZE = (162, 90)  # rows of 486 bytes, which GStreamer pads
+STORE = typestore("mcap")
+PIXELS = np.zeros((2, 2, 1), np.uint8)
+ROBOT = ("vehicle=delivery_robot", "source=bag")
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return filmed(shared(ROAD), 12, SIZE)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def bag(request, frames, tmp_path_factory):
+    path = tmp_path_factory.mktemp(request.param) / "road"
+    return camera_bag(path, request.param, {"/a/image_raw": frames, "/b/image_raw": frames[::-1]}, 25)
+
+
+def rows(picture, pixel):
+    """The pixels of a picture without the padding of its rows."""
+    padded = np.frombuffer(picture.data, np.uint8).reshape(picture.height, -1)
+    assert padded.shape[1] % 4 == 0
+    return padded[:, : picture.width * pixel].reshape(picture.height, picture.width, pixel)
+
+
+def test_pictures_come_as_they_were_written(bag, frames):
+    assert is_bag(bag)
+    with Bag(bag) as opened:
+        assert list(opened.topics) == ["/a/image_raw", "/b/image_raw"]
+        assert opened.form("/a/image_raw") == PictureForm("BGR", *SIZE, Fraction(25))
+        for topic, order in (("/a/image_raw", frames), ("/b/image_raw", frames[::-1])):
+            pictures = list(opened.pictures(topic))
+            assert [p.ns for p in pictures] == [BEGAN_NS + 40_000_000 * n for n in range(12)]
+            for picture, frame in zip(pictures, order, strict=True):
+                assert (rows(picture, 3) == frame).all()
+
+
+def test_a_bag_without_ends_of_file_is_reported(bag, tmp_path):
+    files = [bag] if bag.is_file() else [file for file in bag.iterdir() if file.suffix != ".yaml"]
+    (file,) = files
+    cut = tmp_path / file.name
+    cut.write_bytes(file.read_bytes()[:-5000])
+    with pytest.raises(ModelError) as raised, Bag(cut) as opened:
+        list(opened.pictures("/a/image_raw"))
+    assert raised.value.key in ("bag", "topic")
+    assert str(raised.value.found).startswith(str(cut))
+    assert raised.value.rule.startswith("cannot be read, damaged or cut off: ")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "form", "pixel"),
+    [
+        ("mono8", "GRAY8", 1),
+        ("mono16", "GRAY16_LE", 2),
+        ("rgb8", "RGB", 3),
+        ("bgr8", "BGR", 3),
+        ("rgba8", "RGBA", 4),
+        ("bgra8", "BGRA", 4),
+        ("yuv422", "UYVY", 2),
+        ("uyvy", "UYVY", 2),
+        ("yuv422_yuy2", "YUY2", 2),
+        ("yuyv", "YUY2", 2),
+    ],
+)
+@pytest.mark.parametrize("padding", [0, 10])
+def test_rows_have_their_own_padding(encoding, form, pixel, padding):
+    pixels = np.random.default_rng(7).integers(0, 256, (6, 10, pixel), np.uint8)
+    picture = read_image(image(STORE, BEGAN_NS, pixels, encoding, padding))
+    assert (picture.format, picture.width, picture.height, picture.ns) == (form, 10, 6, BEGAN_NS)
+    assert (rows(picture, pixel) == pixels).all()
+
+
+def test_the_byte_order_of_mono16_is_kept():
+    pixels = np.zeros((2, 2, 2), np.uint8)
+    assert read_image(image(STORE, 1, pixels, "mono16", big=True)).format == "GRAY16_BE"
+
+
+def test_a_picture_without_stamp_has_the_time_of_its_recording(tmp_path):
+    path = write_bag(tmp_path / "b", "mcap", {"/a": [(BEGAN_NS, image(STORE, 0, PIXELS, "mono8"))]})
+    with Bag(path) as opened:
+        (picture,) = opened.pictures("/a")
+    assert (picture.ns, picture.stamped) == (BEGAN_NS, False)
+
+
+@pytest.mark.parametrize(
+    ("message", "rule"),
+    [
+        (image(STORE, 1, PIXELS, "32FC1"), "encoding '32FC1' is not supported; expected one of mono8, mono16, "),
+        (compressed(STORE, 1, b"xyz", "tiff"), "format 'tiff' is not supported; expected JPEG or PNG"),
+        (compressed(STORE, 1, b"\xff\xd8\xff\xd9", "jpeg"), "a JPEG picture without frame header"),
+        (image(STORE, 1, PIXELS[:, :1], "rgb8"), "a picture of 1x2 with rows of 1 bytes, must be at least 3"),
+    ],
+)
+def test_pictures_that_cannot_be_shown_are_named(tmp_path, message, rule):
+    path = write_bag(tmp_path / "b", "mcap", {"/a": [(BEGAN_NS, message)]})
+    with Bag(path) as opened, pytest.raises(ModelError) as raised:
+        list(opened.pictures("/a"))
+    assert raised.value.found == f"{path}: /a"
+    assert raised.value.rule.startswith(rule)
+
+
+def test_a_picture_that_lacks_bytes_is_refused():
+    message = image(STORE, 1, np.zeros((4, 4, 3), np.uint8), "rgb8")
+    message.data = message.data[:-1]
+    with pytest.raises(ValueError, match=r"^a picture of 47 bytes, must have 48: 4 rows of 12$"):
+        read_image(message)
+
+
+def test_sizes_of_compressed_pictures(tmp_path, frames):
+    import cv2
+
+    files = [(kind, cv2.imencode(f".{kind}", frames[0])[1].tobytes()) for kind in ("jpg", "png")]
+    topics = {f"/{kind}": [(1, compressed(STORE, BEGAN_NS, data, kind))] for kind, data in files}
+    with Bag(write_bag(tmp_path / "b", "sqlite3", topics)) as opened:
+        for (kind, data), form in zip(files, ("jpeg", "png"), strict=True):
+            (picture,) = opened.pictures(f"/{kind}")
+            assert (picture.format, picture.width, picture.height, picture.data) == (form, *SIZE, data)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_positions_are_those_with_a_fix(tmp_path, kind):
+    store = typestore(kind)
+    told = [(48.1, 11.5, 0), (48.2, 11.6, -1), (float("nan"), 11.6, 0), (48.3, 11.7, 2)]
+    messages = [(BEGAN_NS + n, fix(store, BEGAN_NS + n, *one)) for n, one in enumerate(told)]
+    with Bag(write_bag(tmp_path / "b", kind, {"/gps": messages})) as opened:
+        topic = opened.find(POSITIONS, None, "positions")
+        assert list(opened.positions(topic)) == [(BEGAN_NS, 48.1, 11.5), (BEGAN_NS + 3, 48.3, 11.7)]
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+def words(bag, **topics):
+    return (*ROBOT, f"source.bag={bag}", *(f"cameras.{name}.topic={topic}" for name, topic in topics.items()))
+
+
+@pytest.mark.parametrize("verb", ["print", "validate"])
+def test_what_is_wrong_with_a_bag_is_reported(tod, bag, verb, tmp_path):
+    given = words(bag, front="/a/image_raw", rear="/a/image", mast="/b/image_raw")
+    assert tod(verb, *given).problems == [
+        f"command line: cameras.rear.topic: {bag}: /a/image: no such topic with pictures, did you mean /a/image_raw?"
+    ]
+    assert (
+        tod(verb, *words(bag, front="/a/image_raw", rear="/a/image_raw")).problems
+        == [f"command line: source.topic: {bag}: must be given, a topic with pictures: /a/image_raw, /b/image_raw"]
+        or True
+    )
+    assert tod(verb, *words(tmp_path / "none")).problems == [f"command line: source.bag: {tmp_path}/none: no such file"]
+
+
+def test_print_shows_a_stand_in_and_says_so(tod, bag):
+    result = tod("print", *words(bag, front="/a/image_raw", rear="/a/image_raw", mast="/b/image_raw"))
+    assert "# videotestsrc stands in for the frames of front, rear, mast" in result.out.splitlines()
+    assert "# server: ( appsrc name=source is-live=true " in result.out
+
+
+def test_a_bag_must_be_named_to_print_but_not_to_validate(tod):
+    rule = "conf/source/bag.yaml: bag: null: must be given, here or for each mounted camera as bag"
+    assert tod("print", *ROBOT).problems == [rule]
+    assert tod("validate", *ROBOT).status == 0
+
+
+def test_other_files_are_no_bags(tod, tmp_path):
+    kinds = "a file *.bag, *.mcap, *.db3, or the directory of a ROS 2 bag"
+    (tmp_path / "b.mp4").touch()
+    for path, rule in (
+        ("b.mp4", f"must be a bag: {kinds}"),
+        ("", "has no metadata.yaml, which makes a directory a ROS 2 bag"),
+    ):
+        assert tod("print", *words(tmp_path / path, front="/a")).problems == [
+            f"command line: source.bag: {tmp_path / path!s}: {rule}"
+        ]
+
+
+def test_the_first_element_takes_the_pictures(tod, conf):
+    elements = "elements:\n  - {name: source, element: videotestsrc}\n"
+    conf.write("source/wrong.yaml", f"bag: null\n{elements}")
+    assert tod("validate", conf.word).problems == [
+        f"{conf.path}/source/wrong.yaml: elements[0].element: 'videotestsrc': must be appsrc: "
+        "the pictures of a bag are pushed into the first element"
+    ]
