@@ -174,8 +174,8 @@ class Receiver:
     def _is_expected(self) -> bool:
         """Whether frames should come.
 
-        While the vehicle is offline that is unknown. A caller may be gone together with its control link, though, and has
-        to find a listener that holds on to no other one: a stream that flowed is expected until it is built anew.
+        While the vehicle is offline that is unknown. A caller may be gone together with its control link, though, and
+        has to find a listener that holds on to no other one: what flowed is expected until it is built anew.
         """
         if self.should_send is None and self._is_dialled:
             return self._was_sending and self._begun
