@@ -274,7 +274,9 @@ class Station:
             sampled, newest = self.samples.get(name), self._newest.get(name)
             if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
                 return None
-            arrived_ms = latency(1000 * (wall + newest.arrived - newest.captured), clock) or 0.0
+            arrived_ms = latency(1000 * (wall + newest.arrived - newest.captured), clock)
+            if arrived_ms is None or self._clocks.was_set_since(newest.arrived - arrived_ms / 1000):
+                return None
             overdue_s = max(0.0, now - newest.arrived - 1 / float(self._vehicle.cameras[name].fps))
             found.append(max(sampled.latency_ms, arrived_ms) + 1000 * overdue_s)
         return max(found) + 1000 * clock.bound_s if found and clock else None

@@ -38,11 +38,14 @@ class ClockDifference(NamedTuple):
 
 
 def latency(apart_ms: float | None, clock: ClockDifference | None) -> float | None:
-    """A latency, ms, right to within the bound of `clock`; None if either is unknown.
+    """A latency, ms, right to within the bound of `clock`; None if either is unknown, or they contradict each other.
 
     apart_ms  time of the later event by this machine's clock minus that of the earlier by the other's, ms
     """
-    return None if apart_ms is None or clock is None else max(0.0, apart_ms + 1000 * clock.ahead_s)
+    if apart_ms is None or clock is None:
+        return None
+    found = apart_ms + 1000 * clock.ahead_s
+    return max(0.0, found) if found >= -1000 * (clock.bound_s + STEP_S) else None
 
 
 class _Interval(NamedTuple):
@@ -91,9 +94,13 @@ class ClockComparison:
             self._intervals.append(interval)
             self._asked = max(self._asked, at - (exchange.returned - exchange.sent))
 
+    def was_set_since(self, begin: float) -> bool:
+        """Whether a clock is known to have been set after a time, by the same clock."""
+        return self._set_at >= begin
+
     def held(self, begin: float, end: float) -> bool:
         """Whether no clock was set between two times, by the same clock: `difference` then holds for what was read."""
-        return self._set_at < begin and end <= self._asked
+        return not self.was_set_since(begin) and end <= self._asked
 
     @property
     def was_set(self) -> bool:
