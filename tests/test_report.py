@@ -391,7 +391,7 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
         (
             [str(drive), out, "vehicle=x"],
-            "command line: vehicle=x: unknown argument; expected one of output, models, conf",
+            "command line: vehicle=x: unknown argument; expected one of output, models, positions, topic, conf",
         ),
         ([str(drive), "--output"], "command line: --output: flags are not supported; write NAME=VALUE, or --help"),
         ([str(tmp_path), out], f"{tmp_path}: contains no drive log: neither drive.jsonl nor operator.jsonl"),

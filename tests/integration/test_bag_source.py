@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -177,11 +178,11 @@ def test_two_cameras_arrive_in_order_with_the_times_of_the_bag(tmp_path):
         assert starts, "the bag did not begin again"
         places = [number + count * sum(start <= at for start in starts) for at, number in enumerate(numbers)]
         assert places == sorted(set(places))  # in order, none twice
-        assert len(places) > 0.9 * (places[-1] - places[0] + 1)
-        # The capture times have the pace of the bag, also over its end.
-        first, last = pictures[0], pictures[-1]
-        assert (last[1] - first[1]) == pytest.approx((places[-1] - places[0]) / RATE, abs=0.02)
-        latencies = [seen_at - captured for _, captured, seen_at in pictures]
+        # The capture times have the pace of the bag; a machine that stands still loses time as with a clip.
+        captured = [at for _, at, _ in pictures]
+        steps = [(b - a) / (n - m) for (a, b), (m, n) in zip(pairwise(captured), pairwise(places), strict=True)]
+        assert np.median(steps) == pytest.approx(1 / RATE, abs=0.0005)
+        latencies = [seen_at - at for _, at, seen_at in pictures]
         assert 0 < min(latencies) < 1
         assert np.median(latencies) < 2
     assert {line.partition(": ")[2] for line in reported} == {"pipeline built", "pipeline stopped"}

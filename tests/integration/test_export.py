@@ -392,7 +392,7 @@ def test_words_that_are_no_export(tmp_path):
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     (tmp_path / "empty").mkdir()
     (tmp_path / "there.mcap").write_text("precious")
-    there = "already exists; remove it, or name another file by output="
+    there = "already exists; remove it, or name another one by output="
     name = "must name one drive: a directory that log= wrote"
     for words, expected in (
         ([], f"command line: {name}"),
