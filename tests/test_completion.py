@@ -55,7 +55,7 @@ def van(conf: UserConf) -> UserConf:
         ("print cameras.front_left.lens=", ["cameras.front_left.lens=pinhole", "cameras.front_left.lens=fisheye"]),
         ("print cameras.nobody.width", ["cameras.nobody.width_px="]),
         ("model metr", ["metric=", "metric_every=", "metrics."]),
-        ("report ", ["output=", "models="]),
+        ("report ", ["output=", "models=", "positions=", "topic="]),
         ("keys ro", ["rotate="]),
         ("doctor demo", ["demo"]),
         ("completion ", list(SCRIPTS)),

@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import keyed
-
 from rig import ROBOT, clock_ahead, free_port, run
 from runner.drive.read import read_drive
 from runner.records import Sample

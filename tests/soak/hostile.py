@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import aiohttp
-import keyed
 from system import CAMERAS, System, Watched, running
 
+import keyed
 from rtsp_client import Digest, client_hello, tls
 
 COUNT = 10_000  # of each kind

@@ -14,10 +14,10 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import keyed
 from signals import MARK, ROBOT, marked
 from system import CAMERAS, System, flowing, running
 
+import keyed
 from rig import CHECKOUT, free_port, until
 
 BACK_S = 5.0

@@ -20,10 +20,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-import keyed
 from signals import MARK, marked
 from system import CAMERAS, System, ended, newest, running
 
+import keyed
 from rig import Operator, clock_ahead, free_port, set_clock, until
 from runner.core.model import Endpoint
 from runner.link import limited_link

@@ -9,8 +9,9 @@ import random
 import time
 from contextlib import ExitStack
 
-import keyed
 from system import CAMERAS, Watched, running
+
+import keyed
 
 ALONE_S = 300  # with readers at half the rate
 

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import keyed
-
 from rig import CHECKOUT, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker

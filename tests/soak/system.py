@@ -16,10 +16,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import keyed
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+import keyed
 from rig import CHECKOUT, Operator, free_port, until
 from rtsp_client import RtspClient
 from runner.core.model import Endpoint
