@@ -1,7 +1,7 @@
 """Everything here needs GStreamer, and most of it depends on real time.
 
 `pytest -m "not gst"` leaves out the tests that need GStreamer. `make test` runs those marked `timed`, a few files at a
-time, then those marked `alone`, whose limits are tight, four files at a time. Everything else runs on the processor
+time, then those marked `alone`, whose limits are tight, three files at a time. Everything else runs on the processor
 time that these leave over.
 """
 

@@ -135,13 +135,10 @@ def test_through_wireguard_nothing_is_fragmented(path, mtu, rtp, tmp_path):
 
 @pytest.mark.parametrize(
     ("heading", "translated", "change"),
-    [
-        pytest.param(SRT, False, Mobile.move, marks=pytest.mark.alone),
-        pytest.param(SRT, True, Mobile.rebind, marks=pytest.mark.soak),
-        pytest.param(WIREGUARD, False, Mobile.move, marks=pytest.mark.soak),
-    ],
+    [(SRT, False, Mobile.move), (SRT, True, Mobile.rebind), (WIREGUARD, False, Mobile.move)],
     ids=["srt", "srt behind NAT", "wireguard"],
 )
+@pytest.mark.soak
 def test_a_vehicle_that_roams_is_back(heading, translated, change, tmp_path):
     """Twice; ten times in tests/soak."""
     with mobile(translated) as network:
