@@ -236,6 +236,17 @@ def stalls(*spans: tuple[float, float]) -> Profile:
     return delay
 
 
+def jitter(every_s: float, long_s: float, ms: float, seed: int = 3, until: float = 60.0) -> Profile:
+    """Delays that come and go, with these means: time between two, length, and size."""
+    chance, spans, t = random.Random(seed), [], 1.0
+    while t < until:
+        t += chance.expovariate(1 / every_s)
+        end = t + long_s * chance.uniform(0.5, 1.5)
+        spans.append((t, end, ms / 1000 * chance.uniform(0.5, 1.5)))
+        t = end
+    return lambda t: next((delay for begin, end, delay in spans if begin <= t < end), 0.0)
+
+
 def utilisation(done: Drive, link: Link, limit: Profile, begin: float, end: float) -> float:
     """Received over what the link and the limit allowed."""
     allowed = [min(link.kbps(t), limit(t)) for t in _times(begin, end)]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+from bisect import bisect_right
 from dataclasses import replace
 from fractions import Fraction
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from simulated_link import Link, drive, stalls, steps, utilisation
+from shared_data import shared
+from simulated_link import Link, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
@@ -124,6 +127,26 @@ def test_a_longer_path_is_no_queue() -> None:
     done = drive(Link(steps((0, 4000)), lambda t: 0.06 if t >= 5 else 0.0), steps((0, RIGHT)), 15)
     assert done.lowest(5, 15) >= 0.4 * RIGHT
     assert done.lowest(9, 15) >= 0.9 * RIGHT
+
+
+@pytest.mark.parametrize("limit", [RIGHT, HIGH])
+@pytest.mark.parametrize("fps", [15, 30])
+def test_jitter_is_no_reason_to_send_less(limit: float, fps: float) -> None:
+    """Twice a second 0.1 s in which everything is late by some 15 ms, as on many radio links and busy machines."""
+    link, total = Link(steps((0, 4000)), jitter(0.5, 0.1, 15)), steps((0, limit))
+    done = drive(link, total, 40, fps=fps)
+    assert utilisation(done, link, total, 5, 39) >= 0.85
+    assert done.lowest(5, 39) >= 0.4 * RIGHT
+
+
+@pytest.mark.parametrize("limit", [RIGHT, HIGH])
+def test_the_jitter_of_a_recorded_5g_link_is_no_reason_to_send_less(limit: float) -> None:
+    with shared("traces/tidy/cicv5g_urban_n8_v30_rtt.csv").open() as file:
+        rows = [(float(row["t_s"]), float(row["rtt_ms"]) / 1000) for row in csv.DictReader(file)]
+    times, least = [t - rows[0][0] for t, _ in rows], min(rtt for _, rtt in rows)
+    link = Link(steps((0, 4000)), lambda t: rows[bisect_right(times, t) - 1][1] - least)
+    done = drive(link, steps((0, limit)), 60, fps=15)
+    assert utilisation(done, link, steps((0, limit)), 5, 59) >= 0.85
 
 
 @pytest.mark.parametrize("fps", [5, 10, 15, 40])

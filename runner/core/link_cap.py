@@ -43,6 +43,9 @@ YIELDED = Fraction(1, 3)
 # link itself is narrower.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
+# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: where more is sent
+# than the link carries, it soon grows longer.
+JITTER_MS = 40
 SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change of cap or limit
 PROVEN = 2  # times what it then carries, as the most that arrived
 FADED = Fraction(997, 1000)  # is left of that most after each second
@@ -166,7 +169,12 @@ def advanced(
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         if cap.stall and cap.before:  # after the stall the link carries less than before
             cap = replace(cap, before=min(cap.before, link.kbps))
-        return _doubting(_cut(cap, link, t, limit, full), link, t, full, least_trust)
+        if _may_be_jitter(cap, link):
+            cap = _cut_by_jitter(cap, link, t, limit, full)
+            carried = cap.overuse.carried if cap.overuse else None
+        else:
+            cap, carried = _cut(cap, link, t, limit, full), link.kbps
+        return _doubting(cap, carried, t, full, least_trust)
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
         return _recovered(_resumed(cap, limit), link, t, limit, full)
     return cap
@@ -209,12 +217,12 @@ def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
     return limit if cap.trust.share == 1 or least_trust == 1 or cap.alone else limit * cap.trust.share
 
 
-def _doubting(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, least: Fraction) -> LinkCap:
+def _doubting(cap: LinkCap, carried: Kbps | None, t: float, limit: Kbps, least: Fraction) -> LinkCap:
     """After a cut: believe less of a limit that has been too high for some time."""
-    if cap.changed != t or link.kbps is None or cap.alone or least == 1:
+    if cap.changed != t or carried is None or cap.alone or least == 1:
         return cap
-    carried = min(Fraction(1), thousandths(BELIEVED * link.kbps / limit))
-    return replace(cap, trust=doubted(cap.trust, t, carried))
+    share = min(Fraction(1), thousandths(BELIEVED * carried / limit))
+    return replace(cap, trust=doubted(cap.trust, t, share))
 
 
 def raised(cap: LinkCap, least: Kbps) -> LinkCap:
@@ -263,6 +271,25 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
+def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
+    return link.state is LinkState.FILLING and (link.queue_ms or 0) < JITTER_MS and cap.losses.share <= LOSSY
+
+
+def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
+    """A cut for a queue that may be jitter: none where the link is known to carry more than is sent.
+
+    In jitter only as much arrives as is sent. Taken for what the link carries, it would lower the cap again and again.
+    """
+    sent = _in_force(cap, limit)
+    known = cap.overuse.carried if cap.overuse else sent
+    if cap.overuse and sent <= RESERVE * known:
+        return cap
+    cap = _cut(cap, link, t, limit, full)
+    if cap.overuse is None:
+        return cap
+    return replace(cap, overuse=cap.overuse._replace(carried=max(known, cap.overuse.carried)))
+
+
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
     """full  the limit, whether it is believed or not"""
     assert link.kbps is not None
@@ -278,7 +305,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return cap
+        return _lowered(cap, carried)
     return replace(
         cap,
         kbps=_short(target),
@@ -289,6 +316,13 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
         most=cap.most._replace(kbps=most),
         provisional=False,
     )
+
+
+def _lowered(cap: LinkCap, carried: Kbps) -> LinkCap:
+    """The cap where the link proves to carry less than at its last overuse, and no cut is due."""
+    if cap.overuse is None or carried >= cap.overuse.carried:
+        return cap
+    return replace(cap, overuse=cap.overuse._replace(carried=carried))
 
 
 def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
