@@ -177,7 +177,7 @@ def advanced(
         return _doubting(cap, carried, t, full, least_trust)
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
         return _recovered(_resumed(cap, limit), link, t, limit, full)
-    return cap
+    return _learned(cap, link, t)
 
 
 def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
@@ -283,7 +283,7 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     sent = _in_force(cap, limit)
     known = cap.overuse.carried if cap.overuse else sent
     if cap.overuse and sent <= RESERVE * known:
-        return cap
+        return _learned(cap, link, t)
     cap = _cut(cap, link, t, limit, full)
     if cap.overuse is None:
         return cap
@@ -305,7 +305,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return _lowered(cap, carried)
+        return _learned(_lowered(cap, carried), link, t)
     return replace(
         cap,
         kbps=_short(target),
@@ -323,6 +323,14 @@ def _lowered(cap: LinkCap, carried: Kbps) -> LinkCap:
     if cap.overuse is None or carried >= cap.overuse.carried:
         return cap
     return replace(cap, overuse=cap.overuse._replace(carried=carried))
+
+
+def _learned(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
+    """The cap soon after an overuse, while its queue lasts: the link carries what arrives, if more than it seemed."""
+    last = cap.overuse
+    if last is None or link.kbps is None or link.kbps <= last.carried or t - last.t > SEEN_S + _rtt_s(link):
+        return cap
+    return replace(cap, overuse=last._replace(carried=link.kbps))
 
 
 def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:

@@ -30,6 +30,7 @@ RATE_S = 0.25  # the rate is averaged over this time, or over three frame interv
 # A link whose queue is longer than the first of these has probably fallen: its rate before counts no more. It is busy,
 # so that a short time shows the new one.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
+SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
 EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
 EMPTY_S = 0.010  # a unit that waited less met no queue
 GROWN_S = 0.020  # a queue from here on may be growing
@@ -194,7 +195,8 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
     fallen = onset is not None and queue > FALLEN_S
-    kbps, since = _rate(uplink, last, FALLEN_RATE_S if fallen else max(RATE_S, 3 * frame), queue)
+    own = min(frame, SLOW_S)
+    kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
     uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
@@ -244,17 +246,21 @@ def _longest_gap(frame: float) -> float:
     return max(GAP_S, 2 * frame)
 
 
-def _rate(uplink: UplinkMemory, last: float, window: float, queue: float) -> tuple[float | None, float]:
-    """kbit/s that arrived: since the queue began or doubled where it lasts, and never across a gap. And since when."""
+def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame: float) -> tuple[float | None, float]:
+    """kbit/s that arrived: since the queue began or doubled where it lasts, and never across a gap. And since when.
+
+    A shorter time than a frame interval may lack the frame of a camera that sends most of all.
+    """
+    evidence = max(EVIDENCE_S, frame)
     # From one arrival to another: a window that begins between two would count too much or too little.
     begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-inf)
     begin = max(begin, uplink.units[0].arrived)
     began = uplink.resumed if uplink.onset is None else max(uplink.resumed, uplink.onset)
     small = (unit.arrived for unit in uplink.units if 2 * unit.queue <= queue and uplink.onset is not None)
     for since in (max(begin, began, max(small, default=began)), max(begin, began)):
-        if last - since >= EVIDENCE_S:
+        if last - since >= evidence:
             return _kbps(uplink.units, since, last), since
-    if uplink.resumed > begin or last - begin < EVIDENCE_S:
+    if uplink.resumed > begin or last - begin < evidence:
         return None, last
     return _kbps(uplink.units, begin, last), begin
 
