@@ -232,6 +232,8 @@ class Receiver:
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
         self._begun = self._inspects = False
+        for buffer in self._buffers:
+            buffer.close()
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)

@@ -36,12 +36,12 @@ class RepairBuffer:
         buffer.set_property("rtx-next-seqnum", False)
         buffer.set_property("rtx-delay", REORDER_MS)
         self._pad = buffer.get_static_pad("sink")
-        self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
+        self._probe = self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
         self.frames = ArrivingFrames()
         self._asked = False  # the next packet was requested
         self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames whose last packet came: stamp, when
         self._waited = RecentValue[float]()  # how long a frame waited here, ms
-        self._timing = False
+        self._timing, self._timer = False, 0  # whether the end of the next frame is awaited; the last probe that did
         self._counted = (0, 0)  # packets that came, and that were missing
         self._recent: tuple[float, ...] = (0.0, 0.0)  # of these, lately
         self._full = False  # nothing is requested
@@ -66,8 +66,14 @@ class RepairBuffer:
         """How long the end of a frame waited here lately; requests that of the next. A few times a second."""
         if not self._timing:
             self._timing = True
-            self._buffer.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_passed)
+            self._timer = self._buffer.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_passed)
         return self._waited.get()
+
+    def close(self) -> None:
+        """Let go of a buffer whose pipeline has ended: its pads hold this object, which holds them, for ever."""
+        self._pad.remove_probe(self._probe)
+        if self._timing:
+            self._buffer.get_static_pad("src").remove_probe(self._timer)
 
     def _on_passed(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         buffer, now = info.get_buffer(), time.monotonic()

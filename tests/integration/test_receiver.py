@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import struct
 import threading
@@ -144,6 +145,25 @@ def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
         seen = side.sample(SENDING)["front"]
         assert seen.damaged > 0, messages
         until(lambda: side.sample(SENDING) and not receiver.is_damaged, every_s=0.1)
+
+
+def test_receivers_that_are_rebuilt_leave_nothing():
+    """Python cannot free an object that holds a pad whose probe holds the object."""
+    from runner.gst.repair import RepairBuffer
+
+    def buffers():
+        gc.collect()
+        return sum(isinstance(each, RepairBuffer) for each in gc.get_objects())
+
+    vehicle, plans = compiled()
+    with sending(vehicle, plans), receiving(plans[:1]) as (side, _, more):
+        more()
+        before, receiver = buffers(), side._receivers["front"]
+        for number in range(1, 4):
+            side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+            until(lambda n=number: side.sample(SENDING)["front"].rebuilt == n, every_s=0.1)
+            more()
+        until(lambda: buffers() == before, every_s=0.2)
 
 
 @pytest.mark.alone
