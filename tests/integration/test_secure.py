@@ -411,8 +411,8 @@ def captured(address):
                 packets.append(tap.recv(65_536))
 
 
-# With keys and SRT a text of RTSP was captured once beside other tests, never alone: soak, which runs nothing beside it,
-# until the packet that a failure shows is explained.
+# With keys and SRT a text of RTSP was captured once beside other tests, never alone: in the soak, where nothing runs
+# beside it, until the packet that a failure shows is explained.
 @needs_root
 @pytest.mark.parametrize(
     ("graph", "encrypted"),
