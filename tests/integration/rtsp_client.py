@@ -164,17 +164,7 @@ class RtspClient:
 
     def ended(self, seconds: float = 10) -> bool:
         """Whether the server closes the connection within a time; discards incoming data."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self.tcp.settimeout(left)
-            try:
-                if not self.tcp.recv(65536):
-                    return True
-            except TimeoutError:
-                return False
-            except OSError:
-                return True
-        return False
+        return is_closed(self.tcp, time.monotonic() + seconds)
 
     def close(self) -> None:
         for sock in (self.tcp, *self._rtp):
@@ -252,3 +242,17 @@ class RtspClient:
                 self._keep(self._rtp[0].recv(2048))
         except OSError:
             return
+
+
+def is_closed(sock: socket.socket, until: float) -> bool:
+    """Whether the other side closes a connection by a time of the monotonic clock; discards incoming data."""
+    while (left_s := until - time.monotonic()) > 0:
+        sock.settimeout(left_s)
+        try:
+            if not sock.recv(65_536):
+                return True
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
+    return False

@@ -25,7 +25,7 @@ import aiohttp
 from system import CAMERAS, System, Watched, running
 
 import keyed
-from rtsp_client import Digest, client_hello, tls
+from rtsp_client import Digest, client_hello, is_closed, tls
 
 COUNT = 10_000  # of each kind
 GROWTH_MB = 60.0
@@ -202,21 +202,7 @@ def handshakes(system: System, dice: random.Random, count: int) -> None:
     for port, sock in silent:
         with closing(sock):
             if port == system.media:
-                assert _closed(sock, began + SILENT_S), f"a client was silent for {SILENT_S:g} s and is connected"
-
-
-def _closed(sock: socket.socket, until: float) -> bool:
-    """Whether the other side closes a connection by a time."""
-    while (left_s := until - time.monotonic()) > 0:
-        sock.settimeout(left_s)
-        try:
-            if not sock.recv(65_536):
-                return True
-        except TimeoutError:
-            return False
-        except OSError:
-            return True
-    return False
+                assert is_closed(sock, began + SILENT_S), f"a client was silent for {SILENT_S:g} s and is connected"
 
 
 def http(system: System, dice: random.Random, count: int) -> None:
