@@ -105,7 +105,9 @@ class VideoFile:
         """From any thread, before the pipeline receives it."""
         if message.type != Gst.MessageType.ERROR or not concerns_file(message):
             return Gst.BusSyncReply.PASS
-        self._fail(message.src.get_parent(), message.parse_error()[0].message)
+        # A bin that fails to start resets all its elements, locked ones too, and a file without a name refuses that.
+        if self._begun or message.src.get_name() != f"{_MARK}file":
+            self._fail(message.src.get_parent(), message.parse_error()[0].message)
         return Gst.BusSyncReply.DROP
 
     def _fail(self, parts: Gst.Bin, why: str) -> None:

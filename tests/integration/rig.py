@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -152,14 +152,26 @@ next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  #
 WAIT_S = 60.0  # a demo starts in 3 s, and in 15 where five such tests run beside each other
 
 
-def free_port() -> int:
-    """A port that nothing is bound to, UDP or TCP, and that this process has not handed out."""
-    for port in _PORTS:
-        with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp, suppress(OSError):
+def free_port(count: int = 1) -> int:
+    """The first of so many ports in a row that nothing is bound to, UDP or TCP, and that were not handed out before.
+
+    "Before" is as far as this process knows; others start elsewhere.
+    """
+    ports: list[int] = []
+    while len(ports) < count:
+        port = next(_PORTS)
+        ports = [*ports, port] if _is_free(port) and port - len(ports) == (ports or [port])[0] else []
+    return ports[0]
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+        try:
             tcp.bind(("127.0.0.1", port))
             udp.bind(("127.0.0.1", port))
-            return port
-    raise AssertionError("unreachable")
+        except OSError:
+            return False
+    return True
 
 
 def answers(port: int, host: str = "127.0.0.1") -> bool:

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 
-from rig import CLIPS, run, streaming, until
+from rig import CLIPS, free_port, run, streaming, until
 
 GRAPHS = ["h264_rtsp", "openh264_rtsp", "h264_srt"]
 
@@ -34,7 +34,9 @@ def end(process):
 
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(graph):
-    camera = printed("source=test", f"graph={graph}", "vehicle=delivery_robot")["rear"]
+    camera = printed("source=test", f"graph={graph}", f"graph.first_port={free_port(3)}", "vehicle=delivery_robot")[
+        "rear"
+    ]
     operator = start(camera["operator"])
     vehicle = start(camera["vehicle"])
     size = f"width=(int){camera['decision']['width']}, height=(int){camera['decision']['height']}"

@@ -214,6 +214,7 @@ def seconds_short_of_frames(graph, tmp_path):
         "fps_max=15",
         "page.serve=false",
         f"graph={graph}",
+        f"graph.first_port={free_port(3)}",
         f"media.port={free_port()}",
         f"control.port={free_port()}",
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import re
 import resource
+import socket
 import subprocess
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -32,7 +33,8 @@ class Sides:
 
     def __init__(self, directory, *words, cameras=CAMERAS, conf=None):
         self.first_frames, self.reported = [], []
-        overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", f"media.port={free_port()}", *words]
+        ports = [f"media.port={free_port()}", f"graph.first_port={free_port(3)}"]
+        overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", *ports, *words]
         vehicle = configuration(overrides, conf, check=check_plan).vehicle()
         self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
         self.plans = compile_plans(self.vehicle)
@@ -110,6 +112,21 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
         assert found == sizes or (not whole and found == sizes[1:])
         assert received[name].decoded - 2 <= count <= received[name].decoded + 40
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
+
+
+def test_a_side_that_cannot_start_blames_no_file(tmp_path):
+    """A pipeline that fails to start resets the element that writes the file before it has a name."""
+    with ExitStack() as stack:
+        sides = Sides(tmp_path, "graph=h264_srt", cameras=("front",))
+        stack.callback(sides.stop)
+        taken = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+        port = next(element for element in sides.plans[0].operator if element.name == "listener")
+        taken.bind(("127.0.0.1", Gst.Uri.from_string(port.properties["uri"]).get_port()))
+        with sides.receiving():
+            until(lambda: any("Could not open" in line for line in sides.reported))
+            taken.close()
+            until(lambda: any("operator" in file for _, file, _ in sides.first_frames))
+        assert not [line for line in sides.reported if "kept" in line]
 
 
 def test_the_first_frame_of_a_file_is_reported_with_its_capture_time(sides):
