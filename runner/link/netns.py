@@ -13,6 +13,7 @@ import errno
 import ipaddress
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -134,22 +135,44 @@ def _inside(identity: int) -> Iterator[int]:
 def _claimed(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     """A name and addresses that are not in use elsewhere.
 
-    The claim is a bound abstract socket: the kernel releases it with the process, so anything that still bears a
-    claimed name was left behind by a run that was killed, and is removed.
+    The search begins anywhere: connections of an earlier link, whose other end no longer exists, send to its addresses
+    for minutes, and would enter a new link that has the same ones.
     """
-    for number, network in enumerate(NETWORK.subnets(new_prefix=30)):
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
-            try:
-                claim.bind(f"\0tod-runner/{network}")
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
-                continue
-            _remove(ip, f"tod-{number}")
-            if not any(address in network for address in _addresses(ip)):
-                yield f"tod-{number}", network
+    networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=30))}
+    _remove_left_behind(ip, networks)
+    names = [*networks]
+    first = random.randrange(len(names))
+    for name in names[first:] + names[:first]:
+        with _claim(networks[name]) as is_free:
+            if is_free and not any(address in networks[name] for address in _addresses(ip)):
+                yield name, networks[name]
                 return
     raise RunError(f"link=netns: every address of {NETWORK} is in use; end other runs, {OTHERWISE}")
+
+
+def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) -> None:
+    """Remove the namespaces of runs that were killed: those that bear a name which nobody claims."""
+    for name in networks.keys() & {path.name for path in RUN.glob("tod-*")}:
+        with _claim(networks[name]) as is_free:
+            if is_free:
+                _remove(ip, name)
+
+
+@contextmanager
+def _claim(network: ipaddress.IPv4Network) -> Iterator[bool]:
+    """Claim addresses, and the name that belongs to them, for all processes; whether nobody else had.
+
+    The claim is a bound abstract socket, which the kernel releases with the process.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+        try:
+            claim.bind(f"\0tod-runner/{network}")
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            yield False
+        else:
+            yield True
 
 
 def _addresses(ip: str) -> list[ipaddress.IPv4Address]:

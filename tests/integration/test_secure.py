@@ -298,7 +298,10 @@ def watching(plans, holder, vehicle=NAME):
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
 def test_pictures_come_to_who_has_keys(keys, graph):
-    with sending(keys, f"graph={graph}") as (plans, _), watching(plans, keys / "bob") as (seen, messages):
+    with (
+        sending(keys, f"graph={graph}", f"graph.first_port={free_port(3)}") as (plans, _),
+        watching(plans, keys / "bob") as (seen, messages),
+    ):
         until(lambda: min(seen().values()) > 10, every_s=0.1)
         assert not messages, messages
 
@@ -411,22 +414,20 @@ def captured(address):
                 packets.append(tap.recv(65_536))
 
 
-# With keys and SRT a text of RTSP was captured once beside other tests, never alone: in the soak, where nothing runs
-# beside it, until the packet that a failure shows is explained.
 @needs_root
 @pytest.mark.parametrize(
     ("graph", "encrypted"),
     [
         ("h264_rtsp", True),
         ("h264_rtsp", False),
+        ("h264_srt", True),
         ("h264_srt", False),
-        pytest.param("h264_srt", True, marks=pytest.mark.soak),
     ],
 )
 def test_nothing_on_the_wire_can_be_read(keys, encrypted, graph, tmp_path):
     media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
     limit = Limit(lambda t: 20_000, queue_ms=200, delay_ms=0)
-    words = (*WORDS, f"graph={graph}", *([] if graph == "h264_rtsp" else [f"graph.first_port={free_port()}"]))
+    words = (*WORDS, f"graph={graph}", f"graph.first_port={free_port(3)}")
     own = {name: [f"keys={keys / name}"] if encrypted else [] for name in (NAME, "alice")}
     with (
         limited_link("netns", limit, media, control, lambda line: None, dials=graph == "h264_srt") as link,
