@@ -121,6 +121,7 @@ def drive(
     queued_s: float = 0.0,
     start: Fraction = Fraction(1),
     key_frame: float = 1,
+    late: Callable[[int, float], float] = lambda camera, t: 0.0,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
@@ -130,6 +131,7 @@ def drive(
     queued_s  length of the queue before the cameras begin
     start  share of the limit until the link is measured
     key_frame  size of each camera's first frame, in multiples of the others
+    late  how late the frame that a camera captures at t is sent, s
     """
     chance, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
@@ -152,19 +154,26 @@ def drive(
         t, _, kind, what = heapq.heappop(queue)
         if kind == "frame":
             at(t + 1 / fps, "frame", what)
-            varied = chance.uniform(1 - noise, 1 + noise) * (key_frame if t < 1 / fps else 1)
+            at(t + late(what, t), "sent", (what, t))
+        elif kind == "sent":
+            camera, captured = what
+            varied = chance.uniform(1 - noise, 1 + noise) * (key_frame if captured < 1 / fps else 1)
             size = int(in_force * 1000 / 8 / fps / cameras * varied)
             came, gone = _passed(waiting, t, size, lambda: chance.random() < link.loss)
-            missing[what] += gone
-            if gone:
-                done.lost.append(t)
+            missing[camera] += gone
+            done.lost += [t] * bool(gone)
             if came:
                 last_unit = max(last_unit, came[-1] + link.one_way_s + link.delay_s(t))
                 size = min(size, len(came) * PACKET)
                 done.passed(t, came[-1] - t, last_unit, size)
-                unit = ReceivedUnit(f"camera {what}", t, last_unit, size, not gone)
-                on_the_way.append((unit, len(came), missing[what]))
-                missing[what] = 0
+                on_the_way.append(
+                    (
+                        ReceivedUnit(f"camera {camera}", captured, last_unit, size, not gone),
+                        len(came),
+                        missing[camera],
+                    )
+                )
+                missing[camera] = 0
         elif kind == "tcp":
             tcp.react(t, what)
             for when, outcome in tcp.send(t, waiting):
@@ -180,8 +189,7 @@ def drive(
             uplink, estimated = estimate(uplink, what)
             if estimated:
                 measured = _measured(t, estimated, 2 * link.one_way_s)
-                here = position(t) if position else None
-                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), here)
+                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None)
             trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
@@ -245,6 +253,28 @@ def jitter(every_s: float, long_s: float, ms: float, seed: int = 3, until: float
         spans.append((t, end, ms / 1000 * chance.uniform(0.5, 1.5)))
         t = end
     return lambda t: next((delay for begin, end, delay in spans if begin <= t < end), 0.0)
+
+
+def busy(share: float, mean_s: float, ms: float, seed: int = 1) -> Callable[[int, float], float]:
+    """Lateness of frames by a machine that is busy for a share of the time, in spans with this mean.
+
+    Then each frame of each camera is late by up to so many ms, on its own; frames of a camera keep their order.
+    """
+    chance, begun = random.Random(seed), 1.0
+    spans: list[tuple[float, float]] = []
+    while begun < 60:
+        begun += chance.expovariate(share / (mean_s * (1 - share))) if share < 1 else 0
+        spans.append((begun, begun + chance.expovariate(1 / mean_s)))
+        begun = spans[-1][1]
+    sent: dict[int, float] = {}
+
+    def late(camera: int, t: float) -> float:
+        is_busy = any(begin <= t < end for begin, end in spans)
+        after = chance.uniform(0, ms / 1000) if is_busy else 0.0
+        sent[camera] = max(t + after, sent.get(camera, 0.0) + 1e-4)
+        return sent[camera] - t
+
+    return late
 
 
 def utilisation(done: Drive, link: Link, limit: Profile, begin: float, end: float) -> float:

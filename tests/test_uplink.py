@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from shared_data import shared
-from simulated_link import Link, drive, jitter, stalls, steps, utilisation
+from simulated_link import Link, busy, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
@@ -147,6 +147,17 @@ def test_the_jitter_of_a_recorded_5g_link_is_no_reason_to_send_less(limit: float
     link = Link(steps((0, 4000)), lambda t: rows[bisect_right(times, t) - 1][1] - least)
     done = drive(link, steps((0, limit)), 60, fps=15)
     assert utilisation(done, link, steps((0, limit)), 5, 59) >= 0.85
+
+
+@pytest.mark.parametrize("limit", [RIGHT, HIGH])
+@pytest.mark.parametrize(("share", "ms", "least"), [(0.5, 60, 0.8), (0.5, 120, 0.3)])
+def test_frames_that_a_busy_machine_sends_late_do_not_starve_the_video(
+    share: float, ms: float, least: float, limit: float
+) -> None:
+    """Each is late on its own; the queue of a link would delay all that follow. It once left 2 % of the link."""
+    link, total = Link(steps((0, 4000))), steps((0, limit))
+    done = drive(link, total, 30, cameras=3, fps=15, late=busy(share, 0.5, ms))
+    assert utilisation(done, link, total, 5, 29) >= least
 
 
 @pytest.mark.parametrize("fps", [5, 10, 15, 40])

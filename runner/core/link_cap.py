@@ -46,6 +46,8 @@ TRIED_S, TRIED = 2.0, Fraction(19, 20)
 # A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: where more is sent
 # than the link carries, it soon grows longer.
 JITTER_MS = 40
+# A longer one is certain once it has lasted this long, s: frames that are late on a busy machine come and go.
+LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change of cap or limit
 PROVEN = 2  # times what it then carries, as the most that arrived
 FADED = Fraction(997, 1000)  # is left of that most after each second
@@ -115,6 +117,7 @@ class LinkCap:
     provisional whether it began at a share of the limit, and no measurement has spoken against the limit since
     losses      of packets
     limit       the last one
+    short       t at which the queue was shorter than JITTER_MS, last
     """
 
     kbps: Kbps | None = None
@@ -135,6 +138,7 @@ class LinkCap:
     provisional: bool = False
     losses: Losses = NONE_LOST
     limit: LastLimit = NO_LIMIT
+    short: float = -float("inf")
 
 
 UNCAPPED = LinkCap()
@@ -259,7 +263,8 @@ def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     loss = link.loss or 0.0
     losses = Losses(loss, t if loss > cap.losses.share else cap.losses.t)
     most = most._replace(kbps=max(most.kbps, kbps))
-    return replace(cap, most=most, passed=(cap.changed, passed), losses=losses)
+    short = t if _is_short(link) else cap.short
+    return replace(cap, most=most, passed=(cap.changed, passed), losses=losses, short=short)
 
 
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -271,18 +276,26 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
+def _is_short(link: LinkMeasured) -> bool:
+    return (link.queue_ms or 0) < JITTER_MS
+
+
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
-    return link.state is LinkState.FILLING and (link.queue_ms or 0) < JITTER_MS and cap.losses.share <= LOSSY
+    """Whether a queue may be frames that are late for another reason: it is short, or has not lasted yet."""
+    if link.state is not LinkState.FILLING or cap.losses.share > LOSSY:
+        return False
+    return _is_short(link) or (cap.stall is None and link.t - cap.short < LASTED_S)
 
 
 def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    """A cut for a queue that may be jitter: none where the link is known to carry more than is sent.
+    """A cut for a queue that may be jitter; none for a short one where the link is known to carry more than is sent.
 
-    In jitter only as much arrives as is sent. Taken for what the link carries, it would lower the cap again and again.
+    In jitter only as much arrives as is sent, or less at times. Taken for what the link carries, it would lower the cap
+    again and again.
     """
     sent = _in_force(cap, limit)
     known = cap.overuse.carried if cap.overuse else sent
-    if cap.overuse and sent <= RESERVE * known:
+    if cap.overuse and sent <= RESERVE * known and _is_short(link):
         return _learned(cap, link, t)
     cap = _cut(cap, link, t, limit, full)
     if cap.overuse is None:
