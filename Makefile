@@ -57,12 +57,7 @@ javascript: $(NODE_READY)
 	node --test --test-reporter=spec tests/js/*.test.js
 
 bench: $(TEST_READY)
-	$(BIN)/python bench/live.py
-	$(BIN)/python bench/link.py
-	$(BIN)/python bench/page.py
-	$(BIN)/python bench/replay.py
-	$(BIN)/python bench/validate.py
-	$(BIN)/python bench/pqos_map.py
+	$(BIN)/python bench bench.json
 
 # A drive over a recorded uplink, twice, as the operator's page showed it: make deadspot UPLINK=uplink.csv
 UPLINK ?= ../shared/data/traces/tidy/orange-4G-traces-A-up_uplink_1s.csv

@@ -10,16 +10,17 @@ import queue
 import socket
 import time
 
+from table import Row, show, spread
+
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, OPERATOR_GONE, MqttMessage, topic
-from runner.operator.meter import middle, percentile
 
 ROUNDS = 1000
 
 
-def main() -> None:
+def rows() -> list[Row]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         broker = Endpoint("127.0.0.1", probe.getsockname()[1])
@@ -46,8 +47,8 @@ def main() -> None:
             time.sleep(0.002)
         operator.close((request, OPERATOR_GONE))
         vehicle.close((state, OFFLINE))
-    print(f"control link, one way: median {middle(waits):.2f} ms, p95 {percentile(waits, 0.95):.2f} ms ({ROUNDS})")
+    return [spread("control link, one way", waits, "ms")]
 
 
 if __name__ == "__main__":
-    main()
+    show(rows())

@@ -19,13 +19,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from table import Row, show, spread
+
 from runner.apply import VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.core.model import Vehicle
 from runner.gst import Gst, knobs
 from runner.gst.caps import structure
-from runner.operator.meter import middle, percentile
 from runner.plans import compile_plans, render_missing
 
 PORT = 18554
@@ -38,13 +39,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=60)
     words = parser.parse_args()
     source = ["source=file", f'source.clip="{words.clip}"'] if words.clip else ["source=synthetic"]
-    command_latency(source, words.rounds)
-    size_change(source, words.rounds)
-    for fps in (15, 40):
-        bitrate_step(source, fps)
+    show(rows(source, words.rounds))
 
 
-def command_latency(source: Sequence[str], rounds: int) -> None:
+def rows(source: Sequence[str] = ("source=synthetic",), rounds: int = 60) -> list[Row]:
+    steps = (row for fps in (15, 40) for row in bitrate_step(source, fps))
+    return [*command_latency(source, rounds), *size_change(source, rounds), *steps]
+
+
+def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """From a decision for all cameras to the last encoder that applies it; eight cameras as the demo runs them."""
     vehicle = _vehicle([*source, "fps_max=15"])
     with _streaming(vehicle) as side, _operator([*source, "fps_max=15"]):
@@ -63,11 +66,11 @@ def command_latency(source: Sequence[str], rounds: int) -> None:
                 last.append(waits[-1])
                 each += waits
                 time.sleep(0.137)
-            _print(f"{what}: command to encoder", each, "ms")
-            _print(f"{what}: command to the last of {len(vehicle.cameras)} encoders", last, "ms")
+            yield spread(f"{what}: command to encoder", each, "ms")
+            yield spread(f"{what}: command to the last of {len(vehicle.cameras)} encoders", last, "ms")
 
 
-def size_change(source: Sequence[str], rounds: int) -> None:
+def size_change(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """One camera at 40 Hz: from a new size to its first decoded frame, and the longest gap between frames."""
     vehicle = _one_camera(source, 40)
     sizes = [(960, 520), (480, 260), (240, 130)]
@@ -85,12 +88,12 @@ def size_change(source: Sequence[str], rounds: int) -> None:
             time.sleep(0.31)
         times = [s[0] for s in samples[start:]]
     gaps = [(b - a) * 40 for a, b in pairwise(times)]
-    _print("first frame of a new size decoded after", waits, "frame intervals")
-    print(f"{'longest gap between frames':52} {max(gaps):8.2f} frame intervals, {len(gaps)} frames")
-    print(f"{'decoder errors':52} {len(errors):8}")
+    yield spread("first frame of a new size decoded after", waits, "intervals")
+    yield Row("longest gap between frames", max(gaps), "intervals", note=f"of {len(gaps)}")
+    yield Row("decoder errors", len(errors), "", most=0)
 
 
-def bitrate_step(source: Sequence[str], fps: int) -> None:
+def bitrate_step(source: Sequence[str], fps: int) -> Iterator[Row]:
     """4000 -> 1000 kbit/s, with and without a change of factor: bitrate on the wire, as a multiple of the new one."""
     vehicle = _one_camera(source, fps)
     for what, size in (("same factor", (960, 520)), ("factor 0.5 -> 0.25", (480, 260))):
@@ -102,8 +105,8 @@ def bitrate_step(source: Sequence[str], fps: int) -> None:
             time.sleep(4.5)
         before = _kbps(samples, began - 2, began)
         early, late = _kbps(samples, began, began + 0.5), _kbps(samples, began + 2, began + 4)
-        shares = f"first 0.5 s {early / 1000:.2f}, seconds 2 to 4 {late / 1000:.2f} of 1000 kbit/s"
-        print(f"{f'4000 -> 1000 at {fps} Hz, {what}':52} {before:8.0f} kbit/s before, {shares}")
+        note = f"seconds 2 to 4 {late / 1000:.2f}; {before:.0f} kbit/s before"
+        yield Row(f"4000 -> 1000 at {fps} Hz, {what}: first 0.5 s", early / 1000, "of 1000", note=note)
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
@@ -209,10 +212,6 @@ def _until(done: Any, seconds: float = 10) -> None:
 
 def _kbps(samples: Sequence[Sample], start: float, end: float) -> float:
     return sum(s[3] for s in samples if start <= s[0] < end) * 8 / 1000 / (end - start)
-
-
-def _print(what: str, values: list[float], unit: str) -> None:
-    print(f"{what:52} {middle(values):8.2f} median {percentile(values, 0.95):7.2f} p95 {max(values):7.2f} max {unit}")
 
 
 if __name__ == "__main__":

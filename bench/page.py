@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from playwright.sync_api import Browser, sync_playwright
+from table import Row, show, spread
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
-from runner.operator.meter import middle, percentile
 from runner.plans import render_missing
 
 STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
@@ -43,32 +43,41 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--show", action="store_true", help="a window instead of headless")
     words = parser.parse_args()
+    show(rows(words.seconds, headless=not words.show))
+
+
+def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=shutil.which("chromium"), headless=not words.show, args=CHROMIUM_FLAGS
-        )
-        measure(browser, "one camera 960x540 at 30 Hz, 2500 kbit/s", 1, (960, 540, 30), 2500, words.seconds)
-        measure(browser, "eight cameras 640x360 at 15 Hz, 6000 kbit/s", 8, (640, 360, 15), 6000, words.seconds)
+        flags = CHROMIUM_FLAGS
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), headless=headless, args=flags)
+        found = [
+            *measure(browser, "one camera 960x540 at 30 Hz", 1, (960, 540, 30), 2500, seconds),
+            *measure(browser, "eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000, seconds),
+        ]
         browser.close()
+    return found
 
 
-def measure(browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float) -> None:
+def measure(
+    browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float
+) -> Iterator[Row]:
     """Drive a vehicle of some equal cameras and measure its page."""
     with tempfile.TemporaryDirectory() as directory:
         words = _configuration(Path(directory), count, *form, kbps)
         render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
         rounds = [_round(browser, [*words, f"conf={directory}"], seconds / ROUNDS) for _ in range(ROUNDS)]
-    print(f"\n{what}, {ROUNDS} times {seconds / ROUNDS:g} s")
     cameras = [frames for one in rounds for frames in one.frames]
     for number, stage in enumerate(STAGES):
-        _print(stage, [frame[number + 1] - frame[number] for frames in cameras for frame in frames])
-    _print("source to screen", [frame[-1] - frame[0] for frames in cameras for frame in frames])
-    _print("between two pictures", [later[-1] - sooner[-1] for frames in cameras for sooner, later in pairwise(frames)])
-    _print("page opened: all pictures drawn", [one.opened_ms for one in rounds])
+        took = [frame[number + 1] - frame[number] for frames in cameras for frame in frames]
+        yield spread(f"{what}: {stage}", took, "ms")
+    yield spread(f"{what}: source to screen", [frame[-1] - frame[0] for frames in cameras for frame in frames], "ms")
+    between = [later[-1] - sooner[-1] for frames in cameras for sooner, later in pairwise(frames)]
+    yield spread(f"{what}: between two pictures", between, "ms")
+    yield spread(f"{what}: page opened, all drawn", [one.opened_ms for one in rounds], "ms")
     rates = [rate for one in rounds for rate in one.rates]
-    print(f"  drawn at {min(rates):.1f} to {max(rates):.1f} of {form[2]} Hz", end="; ")
-    print(f"{sum(one.errors for one in rounds)} decoder errors", end="; ")
-    print(f"operator process {sum(one.cores for one in rounds) / ROUNDS:.2f} of a core")
+    yield Row(f"{what}: drawn, slowest camera", min(rates), "Hz", note=f"of {form[2]}; fastest {max(rates):.1f}")
+    yield Row(f"{what}: decoder errors", sum(one.errors for one in rounds), "", most=0)
+    yield Row(f"{what}: operator's process", sum(one.cores for one in rounds) / ROUNDS, "cores")
 
 
 class Round(NamedTuple):
@@ -101,14 +110,6 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
     rates = [(after[name]["drawn"] - before[name]["drawn"]) / took for name in after]
     opened = max(float(camera["first_drawn_ms"] or "inf") for camera in after.values())
     return Round(frames, rates, sum(camera["errors"] for camera in after.values()), opened, cores)
-
-
-def _print(what: str, values: list[float]) -> None:
-    shares = (middle(values), percentile(values, 0.95), percentile(values, 0.99), max(values))
-    figures = "  ".join(
-        f"{name} {value:6.1f}" for name, value in zip(("median", "p95", "p99", "max"), shares, strict=True)
-    )
-    print(f"  {what:37} {figures} ms  ({len(values)})")
 
 
 def _configuration(directory: Path, count: int, width: int, height: int, fps: int, kbps: int) -> list[str]:

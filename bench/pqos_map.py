@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from table import Row, show, spread
 
 from runner.core.events import PositionReported
 from runner.pqos import build_pqos
@@ -33,12 +34,12 @@ def loop(count: int, random: np.random.Generator) -> np.ndarray:
     return degrees(radius * np.cos(angle), radius * np.sin(angle))
 
 
-def spread(count: int, random: np.random.Generator) -> np.ndarray:
+def scattered(count: int, random: np.random.Generator) -> np.ndarray:
     """Anywhere in 100 km by 100 km."""
     return degrees(*random.uniform(0, 100_000, (2, count)))
 
 
-def measure(name: str, places: np.ndarray, random: np.random.Generator, file: Path) -> None:
+def measure(name: str, places: np.ndarray, random: np.random.Generator, file: Path) -> list[Row]:
     rates = random.uniform(1000, 9000, len(places)).round()
     np.savetxt(file, np.column_stack([places, rates]), "%.7f,%.7f,%.0f", header="lon,lat,kbps", comments="")
     start = time.perf_counter()
@@ -52,19 +53,19 @@ def measure(name: str, places: np.ndarray, random: np.random.Generator, file: Pa
         start = time.perf_counter()
         pqos.observe(event)
         spent.append(1000 * (time.perf_counter() - start))
-    print(
-        f"{name:8} {len(places)} points: read and built in {built:.2f} s, "
-        f"look-up median {np.median(spent):.3f} ms, p99 {np.percentile(spent, 99):.3f} ms"
-    )
+    what = f"bandwidth map of {name}, {len(places)} points"
+    return [Row(f"{what}: built", built, "s"), spread(f"{what}: look-up", spent, "ms")]
 
 
-def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+def rows(count: int = 1_000_000) -> list[Row]:
     random = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
-        measure("2 km", loop(count, random), random, Path(folder) / "map.csv")
-        measure("100 km", spread(count, random), random, Path(folder) / "map.csv")
+        file = Path(folder) / "map.csv"
+        return [
+            *measure("2 km", loop(count, random), random, file),
+            *measure("100 km", scattered(count, random), random, file),
+        ]
 
 
 if __name__ == "__main__":
-    main()
+    show(rows(*map(int, sys.argv[1:])))

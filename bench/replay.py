@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from table import Row, show
+
 WANTED = 7000  # events per second
 RUNS = 3
 
@@ -55,17 +57,17 @@ def seconds(modes: str, events: Path) -> float:
     return min(times)
 
 
-def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 50_000
+def rows(count: int = 50_000) -> list[Row]:
+    found = []
     with tempfile.TemporaryDirectory() as directory:
         for story in (predictions, drive):
             events = Path(directory) / f"{story.__name__}.jsonl"
             events.write_text("".join(json.dumps(event) + "\n" for event in story(count)))
             for modes in ("paper", "safe", "steady"):
                 rate = count / seconds(modes, events)
-                verdict = "" if rate >= WANTED else f"  below the wanted {WANTED}"
-                print(f"{story.__name__:12} modes={modes:7} {rate:8.0f} events/s{verdict}")
+                found.append(Row(f"replay of {story.__name__}, modes={modes}", rate, "events/s", least=WANTED))
+    return found
 
 
 if __name__ == "__main__":
-    main()
+    show(rows(*map(int, sys.argv[1:])))

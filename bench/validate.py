@@ -14,6 +14,8 @@ import time
 from pathlib import Path
 from statistics import median
 
+from table import Row, show
+
 FLEET = Path(__file__).resolve().parents[1] / "tests/fleet"
 MOST_S = {"": 1.5, "all=true": 6.0}  # by argument
 
@@ -25,16 +27,16 @@ def seconds(*words: str) -> float:
     return time.monotonic() - began
 
 
-def main() -> int:
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    slow = 0
+def rows(runs: int = 5) -> list[Row]:
+    found = []
     for words, most in MOST_S.items():
         taken = sorted(seconds(*words.split()) for _ in range(runs))
-        slow += median(taken) > most
-        print(f"validate {words or 'of a directory'}: median {median(taken):.2f} s of {runs} runs, {taken[0]:.2f} to "
-              f"{taken[-1]:.2f} s; at most {most:g} s")  # fmt: skip
-    return 1 if slow else 0
+        note = f"{taken[0]:.2f} to {taken[-1]:.2f} in {runs} runs"
+        found.append(Row(f"validate {words or 'of a directory'}", median(taken), "s", most=most, note=note))
+    return found
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    found = rows(*map(int, sys.argv[1:]))
+    show(found)
+    sys.exit(not all(row.is_acceptable for row in found))

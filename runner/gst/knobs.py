@@ -94,17 +94,17 @@ class KnobPanel:
         """Set one property and read it back; returns the fault, None if there is none."""
         name, key, value = turned
         element = self._by_name[name]
-        wanted = _property(turned)
         if self._differs(turned):
-            element.set_property(key, wanted)
-            held = element.get_property(key)
-            if not (held.is_equal(wanted) if key == "caps" else held == wanted):
-                return f"{self._camera.name}: {name}.{key} is {text(str(held))} after it was set to {text(value)}"
+            element.set_property(key, _property(turned))
+            if self._differs(turned):
+                held = text(str(element.get_property(key)))
+                return f"{self._camera.name}: {name}.{key} is {held} after it was set to {text(value)}"
         return None
 
     def _differs(self, turned: Assignment) -> bool:
         name, key, _ = turned
-        return bool(self._by_name[name].get_property(key) != _property(turned))
+        held, wanted = self._by_name[name].get_property(key), _property(turned)
+        return not held.is_equal(wanted) if key == "caps" else bool(held != wanted)
 
 
 def _property(turned: Assignment) -> Any:

@@ -1,0 +1,234 @@
+"""What the vehicle's side costs beside a bare GStreamer RTSP server with the same launch lines, in pairs.
+
+  python bench/cost.py                                    three cameras, five pairs of 15 s: three minutes
+  python bench/cost.py --pairs 3 vehicle=tum_q7 fps_max=0 Table I in full
+
+Rows: processor time and memory of the vehicle's process, latency from capture to the client's parser, time from the
+start until every camera has a picture, and from the request for a new size until the first picture of that size has
+arrived. Words are overrides of the vehicle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import IO, Any, NamedTuple
+
+from table import Row, show
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+from rig import Operator, answers, free_port, until
+from runner.apply import check_plan
+from runner.configuration.config import configuration
+from runner.core.commands import wanted
+from runner.core.model import Endpoint, Vehicle
+from runner.graph import assignments, launch, turn_elements
+from runner.mqtt.broker import private_broker
+from runner.plans import compile_plans
+from runner.verbs.print import decide
+
+WORDS = ("vehicle=delivery_robot", "source=test", "mode=single", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
+SETTLE_S = 3.0
+SIZES = (0.5, 0.75)  # scaling factors that alternate, for the time until a new size arrives
+RESIZE_S = 0.7
+WAIT_S = 30.0
+HERE = Path(__file__).parent
+
+
+class Cost(NamedTuple):
+    """Of one run of one server.
+
+    cores     processor time per time
+    memory    resident, MB
+    latency   from capture to the client, ms, median
+    start     until each camera has a picture, s
+    reaction  until a new size has arrived, ms, median
+    frames    received of those that were due
+    """
+
+    cores: float
+    memory: float
+    latency: float
+    start: float
+    reaction: float
+    frames: float
+
+
+class Frame(NamedTuple):
+    """As the client received it; see bench/bare.py."""
+
+    stream: int
+    t: float
+    age_ms: float | None
+    width: int
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=15)
+    parser.add_argument("words", nargs="*")
+    given = parser.parse_args()
+    show(rows(given.pairs, given.seconds, given.words))
+
+
+def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list[Row]:
+    """Medians of the pairs."""
+    costs = [(_bare([*WORDS, *words], seconds), _own([*WORDS, *words], seconds)) for _ in range(pairs)]
+
+    def row(what: str, unit: str, key: str) -> Row:
+        bare, own = (median(getattr(pair[side], key) for pair in costs) for side in (0, 1))
+        return Row(what, own, unit, bare)
+
+    return [
+        row("vehicle: processor", "cores", "cores"),
+        row("vehicle: memory", "MB", "memory"),
+        row("capture to client", "ms", "latency"),
+        row("start to all pictures", "s", "start"),
+        row("new size to its first picture", "ms", "reaction"),
+        row("frames received", "of those due", "frames"),
+    ]
+
+
+# --- the two servers --------------------------------------------------------------------------------------------------
+
+
+def _bare(words: Sequence[str], seconds: float) -> Cost:
+    port = free_port()
+    vehicle = _vehicle([*words, f"media.port={port}"])
+    decision = decide(vehicle, None)
+    lines = {}
+    for plan in compile_plans(vehicle):
+        knobs = wanted(decision.settings[plan.camera.name])
+        lines[plan.camera.name] = f"( {launch(turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs))} )"
+    began = time.time()
+    with _running([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
+        assert server.stdin
+        _write(server.stdin, lines)
+
+        def resize(name: str, scaling: float) -> None:
+            camera = vehicle.cameras[name]
+            size = (_even(camera.width * scaling), _even(camera.height * scaling))
+            for element, key, value in assignments(camera, "size", size):
+                _write(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
+
+        return _measured(vehicle, server.pid, began, seconds, resize)
+
+
+def _own(words: Sequence[str], seconds: float) -> Cost:
+    media, broker = free_port(), Endpoint("127.0.0.1", free_port())
+    words = [*words, f"media.port={media}", f"control.port={broker.port}"]
+    vehicle = _vehicle(words)
+    with private_broker(broker):
+        began = time.time()
+        with _running(["-m", "runner", "vehicle", *words]) as side:
+            operator = Operator(broker)
+            operator.state(lambda state: state["online"])
+            asked = iter(range(10**9))
+
+            def resize(name: str, scaling: float) -> None:
+                reply = operator.ask(f"{next(asked)}", event="camera_configured", camera=name, scaling=scaling)
+                assert reply["result"] == "applied", reply
+
+            return _measured(vehicle, side.pid, began, seconds, resize)
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+
+
+def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: Any) -> Cost:
+    names = list(vehicle.cameras)
+    urls = [f"rtsp://127.0.0.1:{vehicle.media.port}/{name}" for name in names]
+    frames: list[Frame] = []
+    until(lambda: answers(vehicle.media.port), WAIT_S, every_s=0.005)
+    with _running([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
+        threading.Thread(target=_read, args=(client.stdout, frames), daemon=True).start()
+        until(lambda: {frame.stream for frame in list(frames)} == set(range(len(names))), WAIT_S, every_s=0.005)
+        first = {frame.stream: frame.t for frame in reversed(list(frames))}
+        time.sleep(SETTLE_S)
+        used, at = _cpu_s(pid), time.time()
+        time.sleep(seconds)
+        took, cores = time.time() - at, (_cpu_s(pid) - used) / (time.time() - at)
+        seen = [frame for frame in list(frames) if at <= frame.t < at + took]
+        memory = _memory_mb(pid)
+        reaction = _reaction(names, frames, resize)
+    due = sum(float(camera.fps) for camera in vehicle.cameras.values()) * took
+    ages = [frame.age_ms for frame in seen if frame.age_ms is not None]
+    return Cost(cores, memory, median(ages), max(first.values()) - began, reaction, len(seen) / due)
+
+
+def _reaction(names: Sequence[str], frames: list[Frame], resize: Any) -> float:
+    """ms from the request for another size of the first camera until a picture of a width not seen before it came."""
+    waits = []
+    for number in range(20):
+        before = next(frame.width for frame in reversed(list(frames)) if frame.stream == 0)
+        began = time.time()
+        resize(names[0], SIZES[number % 2])
+
+        def arrived(since: float = began, old: int = before) -> Frame | None:
+            new = (frame for frame in list(frames) if frame.t > since and frame.stream == 0 and frame.width != old)
+            return next(new, None)
+
+        until(arrived, WAIT_S, every_s=0.002)
+        found = arrived()
+        assert found
+        waits.append(1000 * (found.t - began))
+        time.sleep(RESIZE_S)
+    return median(waits)
+
+
+def _read(lines: IO[str], frames: list[Frame]) -> None:
+    for line in lines:
+        frames.append(Frame(*json.loads(line)))
+
+
+def _vehicle(words: Sequence[str]) -> Vehicle:
+    return configuration(words, check=check_plan).vehicle()
+
+
+@contextmanager
+def _running(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[str]]:
+    pipes = {"stdout": subprocess.DEVNULL, **pipes}
+    child = subprocess.Popen([sys.executable, *command], text=True, **pipes)
+    try:
+        yield child
+    finally:
+        child.terminate()
+        try:
+            child.wait(10)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
+def _write(pipe: IO[str], what: Any) -> None:
+    pipe.write(json.dumps(what) + "\n")
+    pipe.flush()
+
+
+def _even(px: float) -> int:
+    return 2 * round(px / 2)
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time that a process has used so far, s (proc(5))."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _memory_mb(pid: int) -> float:
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return float(status["VmRSS"].split()[0]) / 1024
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""What a frame and a change cost, as counts that do not depend on the machine."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+
+import pytest
+
+from rig import free_port, until
+from runner.apply import OperatorSide, VehicleSide, check_plan
+from runner.configuration.config import configuration
+from runner.core.commands import Command
+from runner.gst import Gst
+from runner.plans import compile_plans
+
+pytestmark = pytest.mark.gst
+ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
+FRAMES = 30
+BUFFERS = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """How often each probe of buffers was called."""
+    counted, add_probe = Counter(), Gst.Pad.add_probe
+
+    def add_counted(pad, mask, callback, *data):
+        def on_buffer(*words):
+            if words[1].type & BUFFERS:
+                counted[callback.__qualname__] += 1
+            return callback(*words)
+
+        return add_probe(pad, mask, on_buffer, *data)
+
+    monkeypatch.setattr(Gst.Pad, "add_probe", add_counted)
+    return counted
+
+
+@pytest.fixture
+def writes(monkeypatch):
+    """The properties that were set, in order."""
+    written, set_property = [], Gst.Element.set_property
+
+    def set_counted(element, key, value):
+        written.append(f"{element.get_name()}.{key}")
+        set_property(element, key, value)
+
+    monkeypatch.setattr(Gst.Element, "set_property", set_counted)
+    return written
+
+
+@pytest.fixture
+def streaming():
+    """The vehicle's side with a viewer, playing, and the vehicle."""
+    vehicle = configuration([*ROBOT, f"media.port={free_port()}"], check=check_plan).vehicle()
+    plans = compile_plans(vehicle)
+    with ExitStack() as stack:
+        side = VehicleSide(plans, vehicle.media, lambda *_: None)
+        stack.callback(side.stop)
+        side.turn(Command(name, "bitrate", 500) for name in vehicle.cameras)
+        viewer = OperatorSide(plans, lambda *_: None)
+        stack.callback(viewer.stop)
+        until(lambda: all(each.frames > FRAMES for each in viewer.sample({}).values()))
+        yield side, vehicle
+
+
+def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
+    side, _ = streaming
+    # The operator's side, in this process too, looks at each frame and each packet that arrives.
+    viewing = {name for name in calls if name.startswith(("Receiver", "RepairBuffer"))}
+    assert viewing
+    before, sent = Counter(calls), side.sent()
+    until(lambda: all(frames > sent[name][0] + FRAMES for name, (frames, _) in side.sent().items()))
+    during = calls - before
+    assert {name: count for name, count in during.items() if name not in viewing} == {}
+    assert sum(during.values()) > FRAMES  # the counting works
+
+
+def test_a_change_writes_what_differs_and_nothing_else(streaming, writes):
+    side, vehicle = streaming
+
+    def turned(knob, value):
+        """A single property is set at once, by the thread that turns the knob."""
+        writes.clear()
+        side.turn(Command(name, knob, value) for name in vehicle.cameras)
+        until(lambda: all(knobs.get(knob) == value for knobs in side.applied().values()))
+        return Counter(writes)
+
+    cameras = len(vehicle.cameras)
+    assert turned("bitrate", 540) == {"encoder.bitrate": cameras}
+    assert turned("bitrate", 540) == {}
+    assert turned("size", (320, 180)) == {"size.caps": cameras}
+    assert turned("size", (320, 180)) == {}
