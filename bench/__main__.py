@@ -1,6 +1,6 @@
 """All figures in one table and one JSON, with machine and date.
 
-  python bench                       about ten minutes on an otherwise idle machine; rows go to bench.json
+  python bench                       twenty minutes on an otherwise idle machine; rows go to bench.json
   python bench OUT.json cost link    some of them
 
 What bare GStreamer does as well is measured in pairs beside it, with a ratio: bench/cost.py.

@@ -1,6 +1,6 @@
 """What the vehicle's side costs beside a bare GStreamer RTSP server with the same launch lines, in pairs.
 
-  python bench/cost.py                                    three cameras, five pairs of 15 s: three minutes
+  python bench/cost.py                                    three cameras, five pairs of 15 s: six minutes
   python bench/cost.py --pairs 3 vehicle=tum_q7 fps_max=0 Table I in full
 
 Rows: processor time and memory of the vehicle's process, latency from capture to the client's parser, time from the
