@@ -122,7 +122,7 @@ def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
     def kbps_at(t):
         return 5000 if t < 1 else 1000 if t < 8 else 1500
 
-    with driving(kind, kbps_at, sent_kbps=2500) as drive:
+    with driving(kind, kbps_at, sent_kbps=4000) as drive:
         until(lambda: drive.lines[-1].t > 1)
         drive.settle()
         first, last, _ = drive.measure()
