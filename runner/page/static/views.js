@@ -1,0 +1,80 @@
+/**
+ * The two views of the page, Drive and Configure. Only the operator changes the view: it outlasts a reload, and Drive is
+ * offered once, when this tab first gets control.
+ */
+
+import { inControl, listen, publish, store } from "./store.js";
+import { by, write } from "./format.js";
+
+const VIEW = "tod-view";
+const OFFERED = "tod-drive-offered";
+let controlled = false;
+
+/** @param {"configure"|"drive"} view */
+function choose(view) {
+  store.view = view;
+  sessionStorage.setItem(VIEW, view);
+  by("offer").hidden = true;
+  show();
+  publish("view", view);
+}
+
+function show() {
+  const drive = store.view === "drive";
+  document.body.dataset.view = store.view;
+  by("drive").hidden = !drive;
+  if (!drive) setDrawer(false);
+}
+
+export const toggleView = () => choose(store.view === "drive" ? "configure" : "drive");
+
+// --- the drawer: all that is not a picture ----------------------------------------------------------------------------
+
+export function toggleDrawer() {
+  if (store.view === "drive") setDrawer(document.body.dataset.drawer === undefined);
+}
+
+function setDrawer(open) {
+  if (open) document.body.dataset.drawer = "open";
+  else delete document.body.dataset.drawer;
+  by("drawer").setAttribute("aria-expanded", String(open));
+  publish("drawer", open);
+}
+
+// --- full screen ------------------------------------------------------------------------------------------------------
+
+export async function toggleFullScreen() {
+  try {
+    if (document.fullscreenElement) await document.exitFullscreen();
+    else await document.documentElement.requestFullscreen({ navigationUI: "hide" });
+  } catch (error) {
+    publish("toast", { text: `no full screen: ${error instanceof Error ? error.message : error}`, level: "problem" });
+  }
+}
+
+const showFullScreen = () => write(by("full-screen"), document.fullscreenElement ? "Leave full screen" : "Full screen");
+
+// --- the offer --------------------------------------------------------------------------------------------------------
+
+function refreshOffer() {
+  const now = inControl();
+  if (!now) by("offer").hidden = true;
+  else if (!controlled && store.view !== "drive" && !sessionStorage.getItem(OFFERED)) {
+    sessionStorage.setItem(OFFERED, "yes");
+    by("offer").hidden = false;
+  }
+  controlled = now;
+}
+
+export function startViews() {
+  store.view = sessionStorage.getItem(VIEW) === "drive" ? "drive" : "configure";
+  for (const id of ["to-drive", "to-configure"]) by(id).addEventListener("click", toggleView);
+  by("drawer").addEventListener("click", toggleDrawer);
+  by("full-screen").addEventListener("click", toggleFullScreen);
+  document.addEventListener("fullscreenchange", showFullScreen);
+  by("offer-drive").addEventListener("click", () => choose("drive"));
+  by("offer-no").addEventListener("click", () => (by("offer").hidden = true));
+  listen("control socket", refreshOffer);
+  show();
+  showFullScreen();
+}
