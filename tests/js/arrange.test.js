@@ -7,7 +7,7 @@ import { test } from "node:test";
 import { arrange, rolesOf } from "../../runner/page/static/arrange.js";
 
 const camera = (name, yaw_deg = null, pitch_deg = 0, width = 1920, height = 1080) =>
-  ({ name, width, height, pose: yaw_deg === null ? null : { yaw_deg, pitch_deg } });
+  ({ name, width, height, framing: null, pose: yaw_deg === null ? null : { yaw_deg, pitch_deg } });
 
 const named = (roles) => ({ ...Object.fromEntries(["front", "left", "right", "rear"].map((role) => [role, roles[role]?.name ?? null])), others: roles.others.map(({ name }) => name) });
 
@@ -82,6 +82,14 @@ test("neighbours are cropped to their inner part, which touches the front camera
   const { pictures } = arrange(VEHICLES.tum_q7, 1920, 1080);
   assert.deepEqual(pictures.get("front_left").view, { fit: "cover", align: 1, mirrored: false });
   assert.deepEqual(pictures.get("front_right").view, { fit: "cover", align: 0, mirrored: false });
+});
+
+test("a camera may state that it fits, or fills its box", () => {
+  const cameras = VEHICLES.tum_q7.map((each) => ({ ...each, framing: { front_left: "fit", top_left: "fill" }[each.name] ?? null }));
+  const { pictures } = arrange(cameras, 1920, 1080);
+  const fit = (name) => pictures.get(name).view.fit;
+  assert.deepEqual(["front_left", "front_right", "top_left", "top_right"].map(fit), ["contain", "cover", "cover", "contain"]);
+  assert.equal(pictures.get("front_left").view.align, 0.5);
 });
 
 test("only what looks back is mirrored, and no top view", () => {

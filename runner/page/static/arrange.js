@@ -16,7 +16,14 @@ const MIRROR = 0.3; // most of the width
 /** @typedef {import("./framing.js").View} View */
 /** @typedef {{x: number, y: number, width: number, height: number}} Box */
 /** @typedef {Box & {view: View}} Framed a picture's box and how the picture lies in it */
-/** @typedef {{name: string, width: number, height: number, pose: {yaw_deg: number, pitch_deg: number}|null}} Camera */
+/**
+ * @typedef {object} Camera
+ * @property {string} name
+ * @property {number} width
+ * @property {number} height
+ * @property {{yaw_deg: number, pitch_deg: number}|null} pose
+ * @property {"fit"|"fill"|null} framing
+ */
 /** @typedef {{front: Camera|null, left: Camera|null, right: Camera|null, rear: Camera|null, others: Camera[]}} Roles */
 
 /** To the left, from -180 to 180. */
@@ -90,9 +97,9 @@ function withStrip(roles, width, height) {
   const side = sides ? Math.floor((width - wide) / sides) - GAP : 0;
   const at = left ? side + GAP : sides ? 0 : Math.floor((width - wide) / 2);
   const pictures = band.pictures;
-  if (left) pictures.set(left.name, { x: 0, ...middle, width: side, view: cropped(1) });
+  if (left) pictures.set(left.name, { x: 0, ...middle, width: side, view: viewOf(left, "fill", 1) });
   if (front) pictures.set(front.name, { x: at, y: middle.y + Math.floor((middle.height - high) / 2), width: wide, height: high, view: viewOf(front) });
-  if (right) pictures.set(right.name, { x: at + wide + GAP, ...middle, width: side, view: cropped(0) });
+  if (right) pictures.set(right.name, { x: at + wide + GAP, ...middle, width: side, view: viewOf(right, "fill", 0) });
   const total = Math.ceil(sum(others.map((camera) => row * aspectOf(camera) + GAP)) - GAP);
   let x = Math.max(0, Math.floor((width - total) / 2));
   for (const camera of others) {
@@ -153,7 +160,12 @@ function bandOf({ rear }, width, height) {
 
 const aspectOf = ({ width, height }) => width / height;
 const sum = (values) => values.reduce((a, b) => a + b, 0);
-/** @returns {View} */
-const viewOf = (camera) => ({ fit: "contain", align: 0.5, mirrored: looksBack(camera) });
-/** @returns {View} */
-const cropped = (align) => ({ fit: "cover", align, mirrored: false });
+
+/**
+ * @param {Camera} camera  @param {"fit"|"fill"} usual unless the camera states it  @param {number} align of what is cropped
+ * @returns {View}
+ */
+function viewOf(camera, usual = "fit", align = 0.5) {
+  const fills = (camera.framing ?? usual) === "fill";
+  return { fit: fills ? "cover" : "contain", align: fills ? align : 0.5, mirrored: looksBack(camera) };
+}

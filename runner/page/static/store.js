@@ -13,6 +13,7 @@ const listeners = new Map();
  * @property {number} fps
  * @property {{row: number, column: number}|null} place on the page
  * @property {{yaw_deg: number, pitch_deg: number}|null} pose to the left, and down
+ * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: by its place
  * @property {string|null} codec
  * @property {number} weight
  * @property {number[]} scaling factors, rising
