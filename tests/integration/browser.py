@@ -97,13 +97,15 @@ BOXES = """() => {
   const isOutside = ({ x, y, width, height }) =>
     Math.min(x, y, innerWidth - x - width, innerHeight - y - height) < -1;
   const isCut = ({ scrollWidth, clientWidth }) => clientWidth && scrollWidth > clientWidth + 1;
+  const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
   const { scrollWidth, scrollHeight } = document.scrollingElement;
   return [
     Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
     {
       outside: find(".tile, .picture, #header > *, #side, #drive *").filter((each) => isOutside(box(each))).map(named),
-      cut: find("#drive *, .tile .head, .tile .head *, #header *").filter(isCut).map(named),
+      cut: find("#drive *, .tile .head *, #header *").filter(isCut).map(named),
+      low: find("#drive > *").filter(isLow).map(named),
       scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
     },
   ];

@@ -10,11 +10,13 @@ import { by, latency, mark, spoken, whole, write } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
 const ALARMS = ["lost", "frozen", "unsupported", "damaged", "late"]; // the worst first
+const WORDS = { unsupported: "NO PICTURE" };
 const STANDING = ["lost", "frozen", "unsupported"];
 const KMH = 3.6; // of 1 m/s
 
 const attention = new Attention();
 let focused = document.hasFocus();
+const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const current = () => store.connected && store.state?.online;
 
 function refresh() {
@@ -29,11 +31,11 @@ function refresh() {
 /** The worst latency of all pictures. A picture that stands still has none, and is worse than any. */
 function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf(store.ages, store.status, store.hello?.late_ms ?? 0);
-  const standing = Object.keys(store.status).filter((name) => STANDING.includes(store.status[name]));
+  const standing = names().filter((name) => STANDING.includes(store.status[name]));
   const from = camera === null ? "no picture moves" : `${level === "unknown" ? "unknown" : "worst"}: ${spoken(camera)}`;
   mark(by("latency"), "data-level", standing.length ? "late" : level);
   write(by("worst"), latency(age_ms, bound_ms));
-  write(by("worst-of"), standing.length ? `${standing.length} of ${Object.keys(store.status).length} pictures stand still` : from);
+  write(by("worst-of"), standing.length ? `${standing.length} of ${names().length} pictures stand still` : from);
 }
 
 function refreshSpeed() {
@@ -61,16 +63,15 @@ function linkWords() {
 
 /** By word, which pictures are not as they should be: FROZEN front left, rear. */
 function refreshAlarms() {
-  const cameras = Object.keys(store.status);
-  const found = ALARMS.map((status) => [status, cameras.filter((name) => store.status[name] === status)]).filter(([, names]) => names.length);
-  const words = found.map(([status, names]) => `${SHAPES[`${status}`]} ${status === "unsupported" ? "NO PICTURE" : `${status}`.toUpperCase()} ${[...names].map(spoken).join(", ")}`);
+  const found = ALARMS.map((status) => ({ status, cameras: names().filter((name) => store.status[name] === status) })).filter(({ cameras }) => cameras.length);
+  const words = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(spoken).join(", ")}`);
   write(by("alarms"), words.join("  "));
-  mark(by("alarms"), "data-level", found.some(([status]) => STANDING.includes(`${status}`)) ? "late" : "near");
+  mark(by("alarms"), "data-level", found.some(({ status }) => STANDING.includes(status)) ? "late" : "near");
 }
 
 function refreshControl() {
   const button = by("drive-control", HTMLButtonElement);
-  write(button, store.holder === "you" ? "Release control" : "Take control");
+  write(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
 }

@@ -83,7 +83,7 @@ function tile({ name }) {
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, reason, refused, ...parts });
   giveCanvas(name, canvas);
-  dragRegion(name, parts.box, () => parts.view);
+  dragRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
   return element;
 }

@@ -4,7 +4,7 @@
  */
 
 import { inControl, listen, publish, store } from "./store.js";
-import { by, write } from "./format.js";
+import { by } from "./format.js";
 
 const VIEW = "tod-view";
 const OFFERED = "tod-drive-offered";
@@ -38,7 +38,6 @@ function setDrawer(open) {
   if (open) document.body.dataset.drawer = "open";
   else delete document.body.dataset.drawer;
   by("drawer").setAttribute("aria-expanded", String(open));
-  publish("drawer", open);
 }
 
 // --- full screen ------------------------------------------------------------------------------------------------------
@@ -52,7 +51,7 @@ export async function toggleFullScreen() {
   }
 }
 
-const showFullScreen = () => write(by("full-screen"), document.fullscreenElement ? "Leave full screen" : "Full screen");
+const showFullScreen = () => by("full-screen").setAttribute("aria-pressed", String(document.fullscreenElement !== null));
 
 // --- the offer --------------------------------------------------------------------------------------------------------
 
