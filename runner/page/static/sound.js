@@ -18,8 +18,9 @@ let context = null;
 
 const muted = () => localStorage.getItem(KEY) === "yes";
 
-/** Create or resume the sound; without a click or key so far it stays blocked. */
+/** Create or resume the sound where it is wanted; without a click or key so far it stays blocked. */
 function unlock() {
+  if (store.view !== "drive") return void context?.suspend();
   if (!inControl()) return;
   if (!context) {
     context = new AudioContext();
@@ -62,7 +63,7 @@ function refresh() {
 export function startSound() {
   by("sound").addEventListener("click", () => (context?.state === "running" || muted()) && toggleSound());
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, unlock);
-  listen("control", unlock);
+  listen("control view", unlock);
   listen("control socket", refresh);
   listen("status", heard);
   refresh();
