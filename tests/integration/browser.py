@@ -104,7 +104,7 @@ BOXES = """() => {
     Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
     {
       outside: find(".tile, .picture, #header > *, #side, #drive *").filter((each) => isOutside(box(each))).map(named),
-      cut: find("#drive *, .tile .head *, #header *").filter(isCut).map(named),
+      cut: find("#drive *, .tile .head, .tile .head *, .tile .caption, #header *").filter(isCut).map(named),
       low: find("#drive > *").filter(isLow).map(named),
       scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
     },

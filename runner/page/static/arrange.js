@@ -11,6 +11,7 @@ const BAND_WITHOUT_MIRROR = { least: 0.1, usual: 0.1, most: 0.12 };
 const STRIP = { least: 0.1, usual: 0.17 };
 const SIDE = { least: 0.07, usual: 0.12, most: 0.16 };
 const COLUMN = 0.14;
+const NARROW = 1.3; // width of a height
 const MIRROR = 0.3; // most of the width
 
 /** @typedef {import("./framing.js").View} View */
@@ -110,13 +111,16 @@ function withStrip(roles, width, height) {
   return { ...band, pictures };
 }
 
-/** The front camera's width: its share of the area first, then as large as the height allows within what the sides give. */
+/**
+ * The front camera's width: its share of the area first, then as large as the height allows within what the sides give.
+ * In a narrow area, beside the open drawer, the sides need their part more.
+ */
 function frontWidth(aspect, width, height, sides, least, usual, gaps) {
   const share = Math.sqrt(FRONT * width * height * aspect);
   const roomy = (height * (1 - usual) - gaps) * aspect;
   const low = sides ? width * (1 - sides * SIDE.most) : 0;
   const high = width * (1 - sides * SIDE.usual);
-  const wish = Math.max(share, Math.min(Math.max(roomy, low), high));
+  const wish = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
   return Math.floor(Math.min(wish, (height * (1 - least) - gaps) * aspect, width * (1 - sides * SIDE.least)));
 }
 

@@ -3,7 +3,7 @@
  * after a click or a key, such as those that take control; until then, and while muted, the page says so.
  */
 
-import { inControl, listen, store } from "./store.js";
+import { listen, store } from "./store.js";
 import { Alarm } from "./alarm.js";
 import { by, mark, write } from "./format.js";
 
@@ -15,13 +15,14 @@ const VOLUME = 0.3;
 const alarm = new Alarm();
 /** @type {AudioContext|null} */
 let context = null;
+let drives = false; // whether this page has control, also while the connection is lost: that is when to sound
 
 const muted = () => localStorage.getItem(KEY) === "yes";
 
 /** Create or resume the sound where it is wanted; without a click or key so far it stays blocked. */
 function unlock() {
   if (store.view !== "drive") return void context?.suspend();
-  if (!inControl()) return;
+  if (!drives) return;
   if (!context) {
     context = new AudioContext();
     context.onstatechange = refresh;
@@ -41,7 +42,7 @@ function play(kind) {
 }
 
 function heard({ status }) {
-  if (!inControl() || store.view !== "drive" || muted()) return;
+  if (!drives || store.view !== "drive" || muted()) return;
   const kind = alarm.due(status, performance.now());
   if (kind) play(kind);
 }
@@ -54,7 +55,7 @@ export function toggleSound() {
 function refresh() {
   const blocked = context?.state !== "running";
   const words = muted() ? "✕ Muted" : blocked ? "✕ Sound blocked" : "Sound on";
-  by("sound").hidden = !inControl();
+  by("sound").hidden = !drives;
   write(by("sound"), words);
   mark(by("sound"), "data-level", muted() || blocked ? "near" : "fine");
   by("sound").title = muted() || !blocked ? "tones for lost, frozen and late pictures, or none (b)" : "the browser allows no sound before a click or a key";
@@ -63,8 +64,11 @@ function refresh() {
 export function startSound() {
   by("sound").addEventListener("click", () => (context?.state === "running" || muted()) && toggleSound());
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, unlock);
-  listen("control view", unlock);
-  listen("control socket", refresh);
+  listen("control view", () => {
+    drives = store.holder === "you" || (drives && !store.connected);
+    unlock();
+    refresh();
+  });
   listen("status", heard);
   refresh();
 }

@@ -18,7 +18,7 @@ export const STILL = [...SILENT, "frozen"]; // what is on show has another age t
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency that may be wrong by more is marked
-const CHROME = 66; // header and caption of a tile, as in the style sheet
+const HEAD = 28; // header and border of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
 const area = by("tiles");
@@ -46,8 +46,12 @@ function build({ cameras }) {
   refreshAll();
 }
 
-/** Header and caption grow with the text. */
-const chrome = () => CHROME * Number(getComputedStyle(document.documentElement).getPropertyValue("--text-scale"));
+/** Height of a tile without its picture, as in the style sheet. */
+function chrome() {
+  const style = getComputedStyle(document.documentElement);
+  const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
+  return (HEAD + below) * scale;
+}
 
 function sayNoVideo() {
   const text = "Video needs a browser with WebCodecs: Chromium, Chrome or Edge 94 or newer, on localhost or over TLS.";
@@ -191,6 +195,7 @@ function refreshStatus(name, { element, status, refused }) {
   refused.hidden = !why;
   write(refused, why ?? "");
   mark(element, "data-status", word);
+  mark(status, "data-quiet", word === "live" ? "" : null);
   write(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
 }
 

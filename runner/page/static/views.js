@@ -8,13 +8,13 @@ import { by } from "./format.js";
 
 const VIEW = "tod-view";
 const OFFERED = "tod-drive-offered";
-let controlled = false;
+let offered = false; // whether the offer waits for an answer
 
 /** @param {"configure"|"drive"} view */
 function choose(view) {
   store.view = view;
   sessionStorage.setItem(VIEW, view);
-  by("offer").hidden = true;
+  answer();
   show();
   publish("view", view);
 }
@@ -55,14 +55,18 @@ const showFullScreen = () => by("full-screen").setAttribute("aria-pressed", Stri
 
 // --- the offer --------------------------------------------------------------------------------------------------------
 
+/** The offer is for who is in control; it waits for an answer, also while the connection is lost. */
 function refreshOffer() {
-  const now = inControl();
-  if (!now) by("offer").hidden = true;
-  else if (!controlled && store.view !== "drive" && !sessionStorage.getItem(OFFERED)) {
+  if (inControl() && store.view !== "drive" && !sessionStorage.getItem(OFFERED)) {
     sessionStorage.setItem(OFFERED, "yes");
-    by("offer").hidden = false;
+    offered = true;
   }
-  controlled = now;
+  by("offer").hidden = !(offered && inControl());
+}
+
+function answer() {
+  offered = false;
+  refreshOffer();
 }
 
 export function startViews() {
@@ -72,7 +76,7 @@ export function startViews() {
   by("full-screen").addEventListener("click", toggleFullScreen);
   document.addEventListener("fullscreenchange", showFullScreen);
   by("offer-drive").addEventListener("click", () => choose("drive"));
-  by("offer-no").addEventListener("click", () => (by("offer").hidden = true));
+  by("offer-no").addEventListener("click", answer);
   listen("control socket", refreshOffer);
   show();
   showFullScreen();
