@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import inspect
 import json
@@ -16,6 +17,8 @@ from helpers import vehicle
 from runner.h264.access_unit import AccessUnit
 
 pytest.importorskip("aiohttp")
+import aiohttp
+
 from runner.page.control import KEPT_S, Control
 from runner.page.history import KEPT, History
 from runner.page.server import PageServer
@@ -46,13 +49,13 @@ def sent(viewer):
 
 
 @contextmanager
-def served():
+def served(*overrides):
     """Port of a page."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     station = SimpleNamespace(state=None, note=print, answer_s=1.0)
-    page = PageServer(vehicle(f"page.port={port}"), station)
+    page = PageServer(vehicle(f"page.port={port}", *overrides), station)
     page.start()
     try:
         yield port
@@ -101,6 +104,18 @@ def test_no_viewer_is_waited_for_once_the_page_has_stopped():
             assert line.recv(12) == b"HTTP/1.1 101"
         waiting = [it.__qualname__ for it in gc.get_objects() if inspect.iscoroutine(it) and it.cr_frame]
     assert waiting == []
+
+
+def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_is_framed():
+    async def hello(port):
+        own = f"http://localhost:{port}"
+        async with aiohttp.ClientSession() as session, session.ws_connect(f"{own}/live?viewer=me", origin=own) as ws:
+            return await ws.receive_json(timeout=5)
+
+    with served("+cameras.front_left.framing=fit") as port:
+        cameras = {camera["name"]: camera for camera in asyncio.run(hello(port))["cameras"]}
+    assert cameras["front_left"]["pose"] == {"yaw_deg": 55, "pitch_deg": 5}
+    assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():

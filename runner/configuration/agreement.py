@@ -8,7 +8,7 @@ from typing import Any
 from runner.schema import Path, dotted, shown
 
 SECTIONS = ("name", "fps_max", "cameras", "graph")
-# Camera keys that concern one side only: the source of its frames, the place of its tile.
+# Camera keys that concern one side only: the source of its frames, the place of its picture.
 OWN = (
     "source",
     "device",
@@ -20,6 +20,7 @@ OWN = (
     "credentials",
     "place",
     "pose",
+    "framing",
     "fov_deg",
     "lens",
 )

@@ -233,7 +233,7 @@ class Builder:
         fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens", "shed"))
+        options = _given(data, ("fov_deg", "lens", "shed", "framing"))
         options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,

@@ -327,6 +327,7 @@ class Camera:
     mount           device, address, clip: values of the placeholders of these names; bag and topic to play
     capture         what its device is to deliver
     credentials     file with user name and password of its address; None: it asks for none
+    framing         fit: the page's Drive view shows the whole picture; fill: it fills its box; None: by its place
     """
 
     name: str
@@ -348,6 +349,7 @@ class Camera:
     pose: Pose | None = None
     fov_deg: float = 90.0
     lens: str = "pinhole"
+    framing: str | None = None
     full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:

@@ -405,6 +405,8 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "height": camera.height,
             "fps": float(camera.fps),
             "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
+            "pose": {"yaw_deg": camera.pose.yaw_deg, "pitch_deg": camera.pose.pitch_deg} if camera.pose else None,
+            "framing": camera.framing,
             "codec": video_codec(camera.graph) or None,
             "weight": plain(camera.weight),
             "scaling": [plain(factor) for factor in camera.rate_quality.scaling],

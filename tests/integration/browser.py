@@ -87,6 +87,36 @@ def luma(page, camera):
     return data.reshape(height, width), picture["captured"]
 
 
+BOXES = """() => {
+  const box = (element) => {
+    const { x, y, width, height } = element.getBoundingClientRect();
+    return { x, y, width, height };
+  };
+  const isSeen = (element) => element.checkVisibility() && box(element).width > 0;
+  const find = (selector) => [...document.querySelectorAll(selector)].filter(isSeen);
+  const isOutside = ({ x, y, width, height }) =>
+    Math.min(x, y, innerWidth - x - width, innerHeight - y - height) < -1;
+  const isCut = ({ scrollWidth, clientWidth }) => clientWidth && scrollWidth > clientWidth + 1;
+  const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
+  const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
+  const { scrollWidth, scrollHeight } = document.scrollingElement;
+  return [
+    Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
+    {
+      outside: find(".tile, .picture, #header > *, #side, #drive *").filter((each) => isOutside(box(each))).map(named),
+      cut: find("#drive *, .tile .head, .tile .head *, .tile .caption, #header *").filter(isCut).map(named),
+      low: find("#drive > *").filter(isLow).map(named),
+      scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
+    },
+  ];
+}"""
+
+
+def boxes(page):
+    """By camera, its picture on the screen; and what is outside the window, text cut off, whether it scrolls."""
+    return page.evaluate(BOXES)
+
+
 def shot(page, name):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     page.screenshot(path=SCREENSHOTS / f"{name}.png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import io
 import json
 import re
 import shutil
@@ -17,12 +18,13 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from browser import all_live, luma, measure, opened, send, shot, state, state_when, take_control, until
+from browser import all_live, boxes, luma, measure, opened, send, shot, state, state_when, take_control, until
 from rig import WAIT_S, answers, free_port, process
 from runner.page.server import EVENTS
 
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
 aiohttp = pytest.importorskip("aiohttp")
+image = pytest.importorskip("PIL.Image")
 
 
 SIZES = {  # half of each side: the processor has time to spare for the tests
@@ -69,6 +71,7 @@ def page(chromium, demo):
         if page.evaluate("tod.control") != "you":
             take_control(page)
         yield page
+        viewing(page, "configure")
         choose(page, "automatic")
 
 
@@ -91,6 +94,13 @@ def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
     with suppress(AssertionError):
         until(lambda: not waiting(), seconds)
     assert waiting() == {}
+
+
+def viewing(page, view):
+    """Choose a view by its key."""
+    if page.evaluate("tod.view") != view:
+        page.locator("body").press("v")
+    assert page.evaluate("tod.view") == view
 
 
 def choose(page, mode):
@@ -454,6 +464,172 @@ def test_keys_choose_modes_cameras_and_help(page):
     shot(page, "help")
     page.keyboard.press("Escape")
     page.wait_for_selector("dialog[open]", state="hidden")
+
+
+SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
+
+
+def sized(page, width, height):
+    page.set_viewport_size({"width": width, "height": height})
+    until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height])
+    laid_out(page)
+
+
+def laid_out(page):
+    page.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+
+
+def overlap(a, b):
+    return all(a[at] < b[at] + b[of] - 1 and b[at] < a[at] + a[of] - 1 for at, of in (("x", "width"), ("y", "height")))
+
+
+def whole(page):
+    """Boxes of the pictures, of which none overlaps another; nothing is cut off."""
+    pictures, wrong = boxes(page)
+    assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}, page.viewport_size
+    assert set(pictures) == set(TUM)
+    assert [(a, b) for a in TUM for b in TUM if a < b and overlap(pictures[a], pictures[b])] == []
+    return pictures
+
+
+def test_drive_the_front_camera_is_large_and_nothing_is_cut_off_at_any_size(page):
+    page.locator("#offer-drive").click()
+    assert page.locator("#offer").is_hidden()
+    assert page.evaluate("tod.view") == "drive"
+    for width, height in SCREENS:
+        sized(page, width, height)
+        front = whole(page)["front_center"]
+        assert front["width"] * front["height"] >= 0.4 * width * height, (width, height)
+        page.locator("body").press("d")
+        laid_out(page)
+        assert page.locator("#side").is_visible()
+        whole(page)
+        page.locator("body").press("d")
+        laid_out(page)
+        assert not page.locator("#side").is_visible()
+    sized(page, 1920, 1080)
+    shot(page, "drive")
+
+
+def test_drive_shows_what_a_driver_must_not_miss(page):
+    viewing(page, "drive")
+    until(lambda: re.fullmatch(r"\d+ ± \d+ ms", page.inner_text("#worst")))
+    until(lambda: page.inner_text("#worst-of").removeprefix("worst: ").replace(" ", "_") in TUM)
+    until(lambda: page.inner_text("#driven") == "115 km/h")  # 32 m/s
+    assert page.inner_text("#advised") == "no speed advised"
+    until(lambda: re.match(r"Automatic · \d+( of \d+)? kbit/s · \w+", page.inner_text("#line")))
+    page.evaluate("dispatchEvent(new Event('blur'))")
+    assert page.inner_text("#attention") == "OUT OF FOCUS: keys do not reach this page; click it"
+    time.sleep(0.6)  # nobody is told of a shorter absence
+    page.evaluate("dispatchEvent(new Event('focus'))")
+    assert page.locator("#attention").is_hidden()
+    assert "No key reached this page for 1 s" in page.inner_text("#toasts")
+
+
+def test_pictures_that_stand_still_are_named_and_heard_in_the_drive_view(chromium, demo):
+    with opened(chromium, demo) as page:
+        all_live(page)
+        take_control(page)
+        viewing(page, "drive")  # its key lets the page sound
+        count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
+        page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
+        until(lambda: page.inner_text("#sound") == "Sound on")
+        page.evaluate("boot.worker.terminate()")
+        until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures stand still")
+        assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
+        assert page.inner_text("#worst") == "– ms"
+        assert page.get_attribute("#latency", "data-level") == "late"
+        until(lambda: page.evaluate("globalThis.tones >= 4"))
+
+
+def test_drive_is_offered_once_and_only_the_driver_changes_the_view(page):
+    offer = page.locator("#offer")
+    offer.wait_for(state="visible")
+    page.locator("#offer-no").click()
+    assert offer.is_hidden()
+    for holder in ("nobody", "you"):
+        page.locator("body").press("t")
+        until(lambda holder=holder: page.evaluate("tod.control") == holder)
+    assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "configure")
+    page.keyboard.down("v")
+    page.keyboard.down("v")  # held: a repeated key
+    page.keyboard.up("v")
+    assert page.evaluate("tod.view") == "drive"
+    page.locator("#drive-control").click()
+    until(lambda: page.evaluate("tod.control") == "nobody")
+    page.reload()
+    until(lambda: page.evaluate("window.tod?.control") == "you")  # nobody had it
+    assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "drive")
+    page.locator("#to-configure").click()
+    assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "configure")
+
+
+def test_keys_of_the_drive_view(page):
+    viewing(page, "drive")
+    box = {name: page.locator(f"[data-camera={name}]").bounding_box() for name in TUM}
+
+    def selected_by(key):
+        page.keyboard.press(key)
+        return page.locator(".tile.selected").get_attribute("data-camera")
+
+    keys = ("ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown")
+    assert [selected_by(key) for key in keys] == ["front_left", "front_center", "front_right", "rear_center"]
+    page.keyboard.press("Enter")
+    assert page.locator("[data-camera=rear_center]").bounding_box() == box["front_center"]
+    assert page.locator("[data-camera=front_center]").bounding_box() == box["rear_center"]
+    page.keyboard.press("Escape")
+    assert page.locator("[data-camera=rear_center]").bounding_box() == box["rear_center"]
+    page.keyboard.press("Shift+F")
+    until(lambda: page.evaluate("document.fullscreenElement !== null"))
+    page.keyboard.press("Shift+F")
+    until(lambda: page.evaluate("document.fullscreenElement === null"))
+
+
+def test_regions_dragged_in_mirrored_and_cropped_pictures_are_where_they_are_in_the_image(page):
+    choose(page, "single")
+    viewing(page, "drive")
+    sized(page, 1920, 1080)
+    until(lambda: likeness(page, "rear_center", mirrored=True) > 0.8 > likeness(page, "rear_center", mirrored=False))
+    assert drag(page, "rear_center", (0.1, 0.2), (0.4, 0.7)) == pytest.approx([576, 120, 288, 300], abs=12)
+    box = page.locator("[data-camera=front_left] .picture").bounding_box()
+    part = 520 * box["width"] / box["height"]  # of the image's 960 px, the right ones
+    assert page.inner_text("[data-camera=front_left] .shown") == f"right {part / 9.6:.0f} % shown"
+    expected = [960 - 0.75 * part, 130, part / 2, 260]
+    assert drag(page, "front_left", (0.25, 0.25), (0.75, 0.75)) == pytest.approx(expected, abs=12)
+    plain, mirrored = (lost_words(page, is_mirrored) for is_mirrored in ("false", "true"))
+    assert np.abs(plain - mirrored[:, ::-1]).mean() < 0.1 * np.abs(plain - mirrored).mean()
+
+
+def likeness(page, camera, mirrored):
+    """Correlation of what the screen shows of a camera with its picture; low if that has changed meanwhile."""
+    picture, _ = luma(page, camera)
+    png = page.locator(f"[data-camera={camera}] canvas").screenshot()
+    seen = np.asarray(image.open(io.BytesIO(png)).convert("L").resize(picture.shape[::-1]), float)
+    return np.corrcoef(seen.ravel(), (picture[:, ::-1] if mirrored else picture).ravel())[0, 1]
+
+
+def drag(page, camera, begin, end):
+    """Drag a region between two points of the box, in shares of its sides; returns it, and undoes it."""
+    box = page.locator(f"[data-camera={camera}] .picture").bounding_box()
+    a, b = ((box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in (begin, end))
+    page.mouse.move(*a)
+    page.mouse.down()
+    page.mouse.move(*b, steps=4)
+    page.mouse.up()
+    full = dict(zip(("width", "height"), SIZES[camera], strict=True))
+    roi = state_when(page, lambda now: now["cameras"][camera]["roi"]["width"] < full["width"])["cameras"][camera]["roi"]
+    assert send(page, event="roi_set", camera=camera, x=0, y=0, **full)["result"] == "applied"
+    return [roi[side] for side in ("x", "y", "width", "height")]
+
+
+def lost_words(page, mirrored):
+    """An alarm as it is drawn into a canvas that is mirrored on the screen, or is not."""
+    found = page.evaluate(f"""import("/static/overlay.js").then(({{ drawOverlay }}) => {{
+      const context = new OffscreenCanvas(600, 300).getContext("2d", {{ willReadFrequently: true }});
+      drawOverlay(context, {{ x: 0, y: 0, width: 600, height: 300 }}, {mirrored}, "lost", "LOST 7 s");
+      return Array.from(context.getImageData(0, 0, 600, 300).data.filter((_, i) => i % 4 === 1));
+    }})""")
+    return np.reshape(found, (300, 600)).astype(float)
 
 
 def test_a_viewer_that_answers_no_ping_is_dropped(demo):

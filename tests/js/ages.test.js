@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { ageOf, skewOf } from "../../runner/page/static/ages.js";
+import { ageOf, skewOf, worstOf } from "../../runner/page/static/ages.js";
 
 const picture = (captured, ...later) => [captured, ...later];
 
@@ -39,4 +39,29 @@ test("the skew is between moving pictures only", () => {
   ];
   assert.equal(skewOf(shown), 60);
   assert.equal(skewOf(shown.slice(0, 1)), null);
+});
+
+const age = (age_ms, bound_ms = 5) => ({ age_ms, bound_ms });
+const live = (...names) => Object.fromEntries(names.map((name) => [name, "live"]));
+
+test("the worst latency counts what the clocks may hide", () => {
+  const ages = { front: age(90, 5), rear: age(80, 30) };
+  assert.deepEqual(worstOf(ages, live("front", "rear"), 200), { camera: "rear", age_ms: 80, bound_ms: 30, level: "fine" });
+});
+
+test("its level follows the limit, at which a picture is not late yet", () => {
+  const level = (age_ms) => worstOf({ front: age(age_ms, 10) }, live("front"), 200).level;
+  assert.deepEqual([140, 141, 190, 191].map(level), ["fine", "near", "near", "late"]);
+});
+
+test("late and damaged pictures move, frozen and lost ones have no latency", () => {
+  const ages = { front: age(10), rear: age(40), left: age(9000), right: age(8000) };
+  const statuses = { front: "damaged", rear: "late", left: "frozen", right: "lost" };
+  assert.equal(worstOf(ages, statuses, 200).camera, "rear");
+  assert.deepEqual(worstOf(ages, { ...statuses, front: "off", rear: "synchronising" }, 200), { camera: null, age_ms: null, bound_ms: null, level: "none" });
+});
+
+test("one unknown age makes the worst one unknown", () => {
+  for (const unknown of [age(null), age(50, NaN), age(50, Infinity)])
+    assert.deepEqual(worstOf({ front: age(10), rear: unknown }, live("front", "rear"), 200), { camera: "rear", age_ms: null, bound_ms: null, level: "unknown" });
 });

@@ -2,6 +2,7 @@
 
 const LAST = 15; // pictures whose median counts
 const MOVING = ["live", "late", "damaged"];
+const NEAR = 0.75; // of the limit
 
 /** @typedef {[captured: number, arrived: number, received: number, decoded: number, drawn: number]} Times */
 
@@ -15,6 +16,25 @@ export function ageOf(pictures) {
   const age_ms = Number.isFinite(last.at(-1)?.[0]) ? median(last.map(([captured, , , , drawn]) => drawn - captured)) : null;
   const part = (from, to) => median(last.map((times) => times[to] - times[from]));
   return { age_ms: age_ms === null ? null : Math.max(0, age_ms), parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
+}
+
+/**
+ * The camera whose moving picture may be oldest: its age plus the error bound is the largest. `level` is "late" where
+ * that exceeds the limit, "near" where it exceeds 75 % of it; "unknown" if the age of any moving picture is; "none" if
+ * none moves.
+ * @param {Record<string, {age_ms: number|null, bound_ms: number}>} ages by camera
+ * @param {Record<string, string>} statuses by camera
+ * @param {number} late_ms
+ * @returns {{camera: string|null, age_ms: number|null, bound_ms: number|null, level: "fine"|"near"|"late"|"unknown"|"none"}}
+ */
+export function worstOf(ages, statuses, late_ms) {
+  const moving = Object.entries(ages).filter(([name]) => MOVING.includes(statuses[name]));
+  const unknown = moving.find(([, { age_ms, bound_ms }]) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
+  if (unknown || !moving.length) return { camera: unknown?.[0] ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
+  const most = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
+  const [camera, worst] = moving.reduce((a, b) => (most(b[1]) > most(a[1]) ? b : a));
+  const level = most(worst) > late_ms ? "late" : most(worst) > NEAR * late_ms ? "near" : "fine";
+  return { camera, age_ms: worst.age_ms, bound_ms: worst.bound_ms, level };
 }
 
 /**

@@ -5,15 +5,24 @@ import { selectMode, toggleControl } from "./header.js";
 import { focusTile, switchCamera } from "./tiles.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
+import { rolesOf } from "./arrange.js";
+import { toggleSound } from "./sound.js";
+import { toggleDrawer, toggleFullScreen, toggleView } from "./views.js";
 import { by, make } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
+const LOOKS = { ArrowLeft: "left", ArrowUp: "front", ArrowRight: "right", ArrowDown: "rear" };
 const CHORD_MS = 2500;
 const LIST = [
   ["1 … 9", "select a camera"],
   ["o", "switch the selected camera on or off"],
-  ["Enter, double click", "enlarge the selected camera"],
+  ["← ↑ → ↓", "Drive view: select the left, front, right or rear camera"],
+  ["Enter, double click", "enlarge the selected camera; in the Drive view it changes places with the front camera"],
   ["Esc", "back from the enlarged picture"],
+  ["v", "Drive or Configure view"],
+  ["d", "Drive view: open or close the drawer"],
+  ["b", "Drive view: tones for lost, frozen and late pictures, or none"],
+  ["Shift+F", "full screen"],
   ["drag on a picture", "choose the ROI (mode S)"],
   ["f", "full image of the selected camera (mode S)"],
   ["Shift+S, Shift+A, Shift+C", "mode Single, Automatic, Collective"],
@@ -31,6 +40,10 @@ const plain = {
   f: sendFull,
   t: toggleControl,
   n: toggleTheme,
+  v: toggleView,
+  d: toggleDrawer,
+  b: toggleSound,
+  F: toggleFullScreen,
   "?": () => publish("help"),
   m() {
     chord = performance.now();
@@ -40,10 +53,11 @@ const plain = {
   Enter: enlargeSelected,
 };
 
-/** Enter on a button presses the button. */
+/** Whether a key is meant for the cameras: Enter on a button presses the button, arrows move a slider. */
+const forCameras = ({ target }) => target === document.body || target.classList.contains("tile");
+
 function enlargeSelected(event) {
-  const { target } = event;
-  if (target !== document.body && !target.classList.contains("tile")) return;
+  if (!forCameras(event)) return;
   event.preventDefault();
   if (store.selected) enlarge(store.enlarged === store.selected ? null : store.selected);
 }
@@ -59,12 +73,12 @@ function pressed(event) {
   const chorded = performance.now() - chord < CHORD_MS;
   if (key !== "Shift") chord = -Infinity;
   if (mode && (event.shiftKey || chorded)) return selectMode(mode);
-  if (/^[1-9]$/.test(key)) return selectNumber(+key);
+  if (/^[1-9]$/.test(key)) return selectCamera(store.hello?.cameras[+key - 1]?.name);
+  if (key in LOOKS && store.view === "drive" && forCameras(event)) return selectCamera(rolesOf(store.hello?.cameras ?? [])[LOOKS[key]]?.name);
   plain[key]?.(event);
 }
 
-function selectNumber(number) {
-  const name = store.hello?.cameras[number - 1]?.name;
+function selectCamera(name) {
   if (name === undefined) return;
   if (store.enlarged) enlarge(name);
   select(name);

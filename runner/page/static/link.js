@@ -73,9 +73,9 @@ export function giveCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
-/** Report the size of a canvas on the screen, in CSS pixels. */
-export const tellSize = (name, width, height) =>
-  worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio });
+/** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
+export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>
+  worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view });
 
 /** Ask the worker; for tests and benchmarks. */
 export function ask(what, name) {

@@ -4,8 +4,11 @@ import { ask, send, start } from "./link.js";
 import { listen, store } from "./store.js";
 import { requests } from "./requests.js";
 import { startTheme } from "./theme.js";
+import { startViews } from "./views.js";
 import { startHeader } from "./header.js";
 import { startTiles } from "./tiles.js";
+import { startDrive } from "./drive.js";
+import { startSound } from "./sound.js";
 import { startTotal } from "./total.js";
 import { startPanel } from "./panel.js";
 import { startTabs } from "./tabs.js";
@@ -14,8 +17,11 @@ import { startCharts } from "./charts.js";
 import { startKeys } from "./keys.js";
 
 startTheme();
+startViews();
 startHeader();
 startTiles();
+startDrive();
+startSound();
 startTotal();
 startPanel();
 startTabs();
@@ -49,6 +55,9 @@ globalThis.tod = {
   },
   get history() {
     return store.series;
+  },
+  get view() {
+    return store.view;
   },
   get control() {
     return store.holder;

@@ -6,14 +6,28 @@
 const RED = "#e01b24";
 const AMBER = "#ffb000";
 
-/** Draw the alarm or notice of a status over what the canvas shows. */
-export function drawOverlay(context, status, text) {
-  const { width, height } = context.canvas;
+/**
+ * Draw the alarm or notice of a status over what the canvas shows.
+ * @param {OffscreenCanvasRenderingContext2D} context
+ * @param {{x: number, y: number, width: number, height: number}} area the part of the canvas that is on the screen
+ * @param {boolean} mirrored whether the canvas is: words are written so that they can be read there
+ * @param {string} status
+ * @param {string} text
+ */
+export function drawOverlay(context, area, mirrored, status, text) {
+  context.save();
+  if (mirrored) context.transform(-1, 0, 0, 1, area.x + area.width, area.y);
+  else context.translate(area.x, area.y);
+  drawStatus(context, area, status, text);
+  context.restore();
+}
+
+function drawStatus(context, { width, height }, status, text) {
   const side = Math.min(width, height);
   if (status === "late" || status === "damaged") return drawWarning(context, width, height, side, text);
   if (status === "frozen" || status === "lost") return drawAlarm(context, width, height, side, status, text);
   dim(context, width, height, 0.72);
-  plate(context, width / 2, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
+  plate(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
 }
 
 function drawAlarm(context, width, height, side, status, text) {
@@ -21,12 +35,12 @@ function drawAlarm(context, width, height, side, status, text) {
   if (status === "frozen") hatch(context, width, height, side);
   else cross(context, width, height, side);
   frame(context, width, height, side * 0.06, RED, []);
-  plate(context, width / 2, height / 2, side * 0.17, text, RED, "#fff");
+  plate(context, width, height / 2, side * 0.17, text, RED, "#fff");
 }
 
 function drawWarning(context, width, height, side, text) {
   frame(context, width, height, side * 0.06, AMBER, [side * 0.16, side * 0.08]);
-  plate(context, width / 2, height - side * 0.15, side * 0.13, text, AMBER, "#000");
+  plate(context, width, height - side * 0.15, side * 0.13, text, AMBER, "#000");
 }
 
 /** Desaturate and darken the last picture, so that it is not mistaken for a live one. */
@@ -71,13 +85,18 @@ function stroke(context, thick, colour, path) {
   context.stroke();
 }
 
-function plate(context, x, y, size, text, back, fore) {
-  context.font = `700 ${Math.round(size)}px system-ui, "DejaVu Sans", sans-serif`;
+/** Words in the middle of the width, smaller where they would be wider than that. */
+function plate(context, width, y, wished, text, back, fore) {
+  const set = (size) => (context.font = `700 ${Math.round(size)}px system-ui, "DejaVu Sans", sans-serif`);
+  set(wished);
+  const needed = context.measureText(text).width + wished;
+  const size = wished * Math.min(1, (0.96 * width) / needed);
+  set(size);
   context.textAlign = "center";
   context.textBaseline = "middle";
-  const width = context.measureText(text).width + size;
+  const wide = context.measureText(text).width + size;
   context.fillStyle = back;
-  context.fillRect(x - width / 2, y - size * 0.8, width, size * 1.6);
+  context.fillRect((width - wide) / 2, y - size * 0.8, wide, size * 1.6);
   context.fillStyle = fore;
-  context.fillText(text, x, y + size * 0.05);
+  context.fillText(text, width / 2, y + size * 0.05);
 }

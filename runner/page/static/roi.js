@@ -2,6 +2,7 @@
 
 import { camera, decided, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
+import { toBox, toPicture, visible } from "./framing.js";
 import { make, sameRegion } from "./format.js";
 
 const START_PX = 6; // the pointer moves less than this in a click
@@ -14,21 +15,18 @@ export const seenRegion = (name) => {
   return now?.applied.roi ?? now?.roi ?? null;
 };
 
-/** The picture's own rectangle inside its box (object-fit: contain), in pixels of the box. */
-function contentOf(box, roi) {
-  const { clientWidth: width, clientHeight: height } = box;
-  const scale = Math.min(width / roi.width, height / roi.height);
-  const shown = { width: roi.width * scale, height: roi.height * scale };
-  return { scale, x: (width - shown.width) / 2, y: (height - shown.height) / 2, ...shown };
-}
+const sizeOf = ({ clientWidth: width, clientHeight: height }) => ({ width, height });
 
-/** A region of the full image from two corners on the box, in whole pixels, inside the image and not too small. */
-export function regionOf(box, roi, full, a, b) {
-  const content = contentOf(box, roi);
-  const across = [a.x, b.x].map((x) => roi.x + (x - content.x) / content.scale).sort((p, q) => p - q);
-  const down = [a.y, b.y].map((y) => roi.y + (y - content.y) / content.scale).sort((p, q) => p - q);
-  const [x, width] = snap(across, roi.x, roi.x + roi.width, full.width);
-  const [y, height] = snap(down, roi.y, roi.y + roi.height, full.height);
+/** A region of the full image from two corners on the box, in whole pixels, inside what is visible and not too small. */
+function regionOf(box, view, roi, full, a, b) {
+  const corners = [a, b].map((corner) => toPicture(corner, sizeOf(box), roi, view));
+  const seen = visible(sizeOf(box), roi, view);
+  const along = (key, from, length, end) => {
+    const sides = corners.map((corner) => roi[key] + corner[key]).sort((p, q) => p - q);
+    return snap(sides, roi[key] + from, roi[key] + from + length, end);
+  };
+  const [x, width] = along("x", seen.x, seen.width, full.width);
+  const [y, height] = along("y", seen.y, seen.height, full.height);
   return { x, y, width, height };
 }
 
@@ -58,8 +56,11 @@ export function whyNoRegion() {
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
-/** Let the operator drag a region on a box with a picture. */
-export function dragRegion(name, box) {
+/**
+ * Let the operator drag a region on a box with a picture.
+ * @param {string} name of the camera  @param {HTMLElement} box  @param {() => import("./framing.js").View} view
+ */
+export function dragRegion(name, box, view) {
   const rectangle = make("div", { class: "roi-drag", hidden: true });
   box.append(rectangle);
   let from = null;
@@ -72,16 +73,13 @@ export function dragRegion(name, box) {
   const place = (roi) => {
     const seen = seenRegion(name);
     if (!seen) return;
-    const content = contentOf(box, seen);
+    const shown = toBox({ ...roi, x: roi.x - seen.x, y: roi.y - seen.y }, sizeOf(box), seen, view());
     Object.assign(rectangle.style, {
-      left: `${content.x + (roi.x - seen.x) * content.scale}px`,
-      top: `${content.y + (roi.y - seen.y) * content.scale}px`,
-      width: `${roi.width * content.scale}px`,
-      height: `${roi.height * content.scale}px`,
+      left: `${shown.x}px`, top: `${shown.y}px`, width: `${shown.width}px`, height: `${shown.height}px`,
     });
     rectangle.hidden = false;
   };
-  const region = (event) => regionOf(box, seenRegion(name), fullRegion(name), from, point(event));
+  const region = (event) => regionOf(box, view(), seenRegion(name), fullRegion(name), from, point(event));
   const end = () => {
     from = null;
     dragging = false;

@@ -12,11 +12,14 @@ const listeners = new Map();
  * @property {number} height px
  * @property {number} fps
  * @property {{row: number, column: number}|null} place on the page
+ * @property {{yaw_deg: number, pitch_deg: number}|null} pose to the left, and down
+ * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: by its place
  * @property {string|null} codec
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], answer_s: number}} Hello answer_s: by then the station has answered a request
+ * @typedef {{vehicle: string, cameras: Camera[], answer_s: number, late_ms: number}} Hello answer_s: by then the station has
+ *   answered a request; late_ms: an older picture is late
  * @typedef {object} Applied what was read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
@@ -44,7 +47,7 @@ const listeners = new Map();
  * @property {number|null} predicted_kbps
  * @property {number} allocated_kbps
  * @property {number} actual_kbps
- * @property {{lat: number, lon: number}|null} position
+ * @property {{lat: number, lon: number, speed_mps?: number}|null} position
  * @property {number|null} clock_bound_ms by how much latencies may be wrong; null: they are unknown
  * @property {number|null} speed_factor advised share of full speed
  * @property {Record<string, CameraSample>} cameras
@@ -69,6 +72,7 @@ const listeners = new Map();
  * @property {number|null} skew_ms
  * @property {string|null} selected
  * @property {string|null} enlarged
+ * @property {"configure"|"drive"} view
  */
 
 /** @type {Store} */
@@ -86,6 +90,7 @@ export const store = {
   skew_ms: null, // between the capture times of the oldest and of the newest picture on show
   selected: null,
   enlarged: null,
+  view: "configure",
 };
 
 /** Call `listener(payload)` for each of the kinds of message (separated by spaces). */

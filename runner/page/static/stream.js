@@ -2,6 +2,7 @@
 
 import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
+import { placed, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
 import { pictureOf } from "./picture.js";
 import { judge, words } from "./status.js";
@@ -49,7 +50,7 @@ export class Stream {
     /** @type {VideoDecoder|null} */
     this.decoder = null;
     this.sps = this.codec = null;
-    this.display = { width: 0, height: 0, ratio: 1 };
+    this.display = { width: 0, height: 0, ratio: 1, view: WHOLE };
     /** @type {Shown|null} */
     this.waiting = null; // newest decoded picture, not drawn yet
     /** @type {Shown|null} */
@@ -225,7 +226,7 @@ export class Stream {
   }
 
   async wait(frame, meta, decoder) {
-    const picture = await pictureOf(frame, this.display.width * this.display.ratio).catch(() => null);
+    const picture = await pictureOf(frame, this.widthOnScreen({ width: frame.displayWidth, height: frame.displayHeight })).catch(() => null);
     if (!picture) return void this.counts.errors++;
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
@@ -312,7 +313,7 @@ export class Stream {
     const { width, height } = canvas;
     if (this.shown && this.status !== "off" && this.status !== "unsupported") this.shown.picture.paint(context, width, height);
     else blank(context, width, height);
-    if (text) drawOverlay(context, this.status, text);
+    if (text) drawOverlay(context, this.area(canvas), this.display.view.mirrored, this.status, text);
     this.painted = text;
   }
 
@@ -324,10 +325,22 @@ export class Stream {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const own = this.shown?.picture.painted ?? box;
-    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(box.width / own.width))) : 1;
+    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const width = own.width * times;
     const height = own.height * times;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  }
+
+  /** Width of a picture on the screen, with what is cropped, in px of the screen; 0: not known yet. */
+  widthOnScreen(picture) {
+    const { ratio, view } = this.display;
+    return placed(this.display, picture, view).width * ratio;
+  }
+
+  /** The part of the canvas that is on the screen. */
+  area(canvas) {
+    const { display } = this;
+    return display.width && display.height ? visible(display, canvas, display.view) : { x: 0, y: 0, width: canvas.width, height: canvas.height };
   }
 
   // --- for tests and benchmarks ---------------------------------------------------------------------------------------

@@ -3,8 +3,10 @@
 import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
 import { giveCanvas, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
-import { dragRegion } from "./roi.js";
+import { dragRegion, seenRegion } from "./roi.js";
 import { heightsOf, rowsOf } from "./layout.js";
+import { arrange } from "./arrange.js";
+import { shownWords, WHOLE } from "./framing.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
 
@@ -16,7 +18,7 @@ export const STILL = [...SILENT, "frozen"]; // what is on show has another age t
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency that may be wrong by more is marked
-const CHROME = 66; // header and caption of a tile, as in the style sheet
+const HEAD = 28; // header and border of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
 const area = by("tiles");
@@ -27,7 +29,7 @@ let described = "";
 let hinted = false; // whether the way back from an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
-  for (const { target } of entries) tellSize(target.getAttribute("data-name"), target.clientWidth, target.clientHeight);
+  for (const { target } of entries) tellFrame(target.getAttribute("data-name"));
 });
 
 // --- building ---------------------------------------------------------------------------------------------------------
@@ -44,6 +46,13 @@ function build({ cameras }) {
   refreshAll();
 }
 
+/** Height of a tile without its picture, as in the style sheet. */
+function chrome() {
+  const style = getComputedStyle(document.documentElement);
+  const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
+  return (HEAD + below) * scale;
+}
+
 function sayNoVideo() {
   const text = "Video needs a browser with WebCodecs: Chromium, Chrome or Edge 94 or newer, on localhost or over TLS.";
   area.before(make("p", { class: "no-video", role: "alert" }, text));
@@ -52,7 +61,10 @@ function sayNoVideo() {
 function tile({ name }) {
   const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${spoken(name)}` });
   const parts = {
+    view: WHOLE,
+    canvas,
     swatch: make("span", { class: "swatch", "aria-hidden": "true" }),
+    shown: make("span", { class: "shown" }),
     status: make("span", { class: "status" }),
     on: make("button", { class: "switch", role: "switch", tabindex: "0", onclick: () => switchCamera(name) }),
     box: make("div", { class: "picture", "data-name": name }, canvas),
@@ -63,7 +75,7 @@ function tile({ name }) {
   const refused = make("p", { class: "refused", hidden: true });
   parts.box.append(reason, refused);
   if (!canShowVideo) parts.box.append(make("p", { class: "no-picture" }, "no video in this browser"));
-  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.status, parts.on);
+  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.shown, parts.status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
     "article",
@@ -75,7 +87,7 @@ function tile({ name }) {
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, reason, refused, ...parts });
   giveCanvas(name, canvas);
-  dragRegion(name, parts.box);
+  dragRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
   return element;
 }
@@ -89,7 +101,18 @@ export function switchCamera(name) {
 // --- layout -----------------------------------------------------------------------------------------------------------
 
 function lay() {
-  const heights = heightsOf(rows, area.clientWidth, area.clientHeight, CHROME);
+  if (store.view === "drive") return layDrive();
+  for (const [name, { element }] of tiles) {
+    Object.assign(element.style, { left: "", top: "" });
+    frame(name, WHOLE);
+  }
+  layRows();
+  layEnlarged();
+}
+
+/** Rows as the vehicle's mounts place them. */
+function layRows() {
+  const heights = heightsOf(rows, area.clientWidth, area.clientHeight, chrome());
   for (const [i, row] of rows.entries()) {
     for (const { camera: { name, width, height } } of row) {
       const { box, element } = tiles.get(name);
@@ -98,7 +121,43 @@ function lay() {
       box.style.height = `${heights[i]}px`;
     }
   }
-  layEnlarged();
+}
+
+/** A place for each camera by where it looks; the enlarged one has changed places with the front camera. */
+function layDrive() {
+  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged);
+  by("drive").style.height = `${band.height}px`;
+  by("drive").style.setProperty("--mirror", `${mirror.width}px`);
+  for (const [name, { x, y, width, height, view }] of pictures) {
+    const { box, element } = tiles.get(name);
+    Object.assign(element.style, { left: `${x}px`, top: `${y}px`, width: `${width}px` });
+    element.classList.remove("enlarged");
+    box.style.height = `${height}px`;
+    frame(name, view);
+  }
+  area.classList.remove("has-enlarged");
+}
+
+/** Show a camera's picture whole, cropped or mirrored. */
+function frame(name, view) {
+  const part = tiles.get(name);
+  part.view = view;
+  Object.assign(part.canvas.style, { objectFit: view.fit, objectPosition: `${100 * view.align}% 50%`, transform: view.mirrored ? "scaleX(-1)" : "" });
+  tellFrame(name);
+}
+
+function tellFrame(name) {
+  const part = tiles.get(name);
+  if (!part) return;
+  tellSize(name, part.box, part.view);
+  refreshShown(name, part);
+}
+
+/** State what is cropped. */
+function refreshShown(name, { box, shown, view }) {
+  const picture = seenRegion(name) ?? store.hello?.cameras.find((camera) => camera.name === name);
+  const laid = picture && box.clientWidth && box.clientHeight;
+  write(shown, laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "");
 }
 
 function layEnlarged() {
@@ -107,7 +166,7 @@ function layEnlarged() {
     element.classList.toggle("enlarged", large);
     if (!large) continue;
     element.style.width = "";
-    box.style.height = `${scene.clientHeight - CHROME}px`;
+    box.style.height = `${scene.clientHeight - chrome()}px`;
   }
   area.classList.toggle("has-enlarged", store.enlarged !== null);
 }
@@ -127,6 +186,7 @@ function refresh(name, index) {
   refreshStatus(name, part);
   refreshSwitch(name, part);
   refreshCaption(name, part);
+  refreshShown(name, part);
 }
 
 function refreshStatus(name, { element, status, refused }) {
@@ -135,6 +195,7 @@ function refreshStatus(name, { element, status, refused }) {
   refused.hidden = !why;
   write(refused, why ?? "");
   mark(element, "data-status", word);
+  mark(status, "data-quiet", word === "live" ? "" : null);
   write(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
 }
 
@@ -206,6 +267,7 @@ export function startTiles() {
   listen("hello", build);
   listen("state sample requests control socket theme selected", refreshAll);
   listen("status", announce);
+  listen("view", lay);
   listen("enlarged", (name) => {
     lay();
     if (name && !hinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });

@@ -32,15 +32,14 @@ function refresh() {
   write(figure, whole(total));
   write(limited, less ? ` of ${whole(asked)}` : "");
   write(prediction, whole(store.sample?.predicted_kbps));
-  write(why, less ? whyLess() : reason ?? "shared among the cameras by demand and weight");
+  write(why, less ? whyLess().join("; ") || "limited by a rule" : reason ?? "shared among the cameras by demand and weight");
   slider.update({ value: asked, max: most, why: reason });
 }
 
-/** Why the total is less than asked for: a part of the reason that concerns all cameras. */
-function whyLess() {
+/** Why the total is less than asked for: the parts of the reason that concern all cameras. */
+export function whyLess() {
   const [camera] = Object.values(store.state?.cameras ?? {}).filter(({ on }) => on);
-  const parts = camera?.reason.split("; ").filter((part) => part.startsWith("total ")) ?? [];
-  return parts.join("; ") || "limited by a rule";
+  return camera?.reason.split("; ").filter((part) => part.startsWith("total ")) ?? [];
 }
 
 export function startTotal() {

@@ -10,6 +10,7 @@ import { Stream } from "./stream.js";
 // Imported here, though used only by other modules, so that all modules are fetched at once.
 import "./codec.js";
 import "./counter.js";
+import "./framing.js";
 import "./overlay.js";
 import "./status.js";
 import "./yuv.js";

@@ -1,0 +1,132 @@
+/** The Drive view: who looks where, and that every picture has its place. */
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import { test } from "node:test";
+
+import { arrange, rolesOf } from "../../runner/page/static/arrange.js";
+
+const camera = (name, yaw_deg = null, pitch_deg = 0, width = 1920, height = 1080) =>
+  ({ name, width, height, framing: null, pose: yaw_deg === null ? null : { yaw_deg, pitch_deg } });
+
+const named = (roles) => ({ ...Object.fromEntries(["front", "left", "right", "rear"].map((role) => [role, roles[role]?.name ?? null])), others: roles.others.map(({ name }) => name) });
+
+/** The cameras of a packaged vehicle as the station describes them, from the project's own files. */
+function packaged(vehicle) {
+  const text = readFileSync(new URL(`../../conf/vehicle/${vehicle}.yaml`, import.meta.url), "utf8");
+  const mounts = [...text.matchAll(/^ {2}- \/cameras@cameras\.(\w+): (\w+)/gm)];
+  return mounts.map(([, name, kind]) => {
+    const model = readFileSync(new URL(`../../conf/cameras/${kind}.yaml`, import.meta.url), "utf8");
+    const [width, height] = ["width_px", "height_px"].map((key) => Number(model.match(new RegExp(`^${key}: (\\d+)`, "m"))[1]));
+    const pose = text.slice(text.indexOf(`  ${name}:\n`)).match(/pose: \{(.*?)\}/)[1];
+    const angle = (key) => Number(pose.match(new RegExp(`${key}: (-?[\\d.]+)`))?.[1] ?? 0);
+    return camera(name, angle("yaw_deg"), angle("pitch_deg"), width, height);
+  });
+}
+
+const VEHICLES = {
+  tum_q7: packaged("tum_q7"),
+  delivery_robot: packaged("delivery_robot"),
+  "three in front": [camera("front", 0), camera("left", 50), camera("right", -50)],
+  "one neighbour": [camera("front", 5), camera("left", 60), camera("rear", 180)],
+  "one camera": [camera("front", 0)],
+  "no poses": [camera("a"), camera("b"), camera("c")],
+  "old 4:3 cameras": [["front", 0], ["left", 70], ["right", -70], ["rear", 180]].map(([name, yaw]) => camera(name, yaw, 0, 640, 480)).concat(camera("top", 0, 60, 640, 480)),
+  "six top views": [camera("front", 0), camera("rear", 180), ...[1, 2, 3, 4, 5, 6].map((n) => camera(`top_${n}`, n * 60, 45))],
+};
+const SIZES = [[1280, 720], [1920, 1080], [2560, 1440], [3840, 2160], [1024, 768]];
+
+const overlap = (a, b) => a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
+
+test("the packaged vehicles are read", () => {
+  assert.equal(VEHICLES.tum_q7.length, 8);
+  assert.deepEqual(VEHICLES.delivery_robot.map(({ name, width, pose }) => [name, width, pose]), [
+    ["front", 1280, { yaw_deg: 0, pitch_deg: 10 }], ["rear", 848, { yaw_deg: 180, pitch_deg: 10 }], ["mast", 1600, { yaw_deg: 0, pitch_deg: 40 }],
+  ]);
+});
+
+for (const [vehicle, cameras] of Object.entries(VEHICLES)) {
+  for (const [width, height] of SIZES) {
+    test(`${vehicle} at ${width}x${height}: all pictures are inside, none overlaps, the front camera has its 40 %`, () => {
+      const { band, mirror, pictures } = arrange(cameras, width, height);
+      assert.deepEqual([...pictures.keys()].sort(), cameras.map(({ name }) => name).sort());
+      const boxes = [...pictures.entries()];
+      for (const [name, box] of boxes) {
+        assert.ok(box.x >= 0 && box.y >= 0 && box.x + box.width <= width && box.y + box.height <= height, `${name}: ${JSON.stringify(box)}`);
+        assert.ok(Math.min(box.width, box.height) >= 40, `${name}: ${JSON.stringify(box)}`);
+      }
+      for (const [i, [name, box]] of boxes.entries())
+        for (const [other, its] of boxes.slice(i + 1)) assert.ok(!overlap(box, its), `${name} and ${other}`);
+      const roles = rolesOf(cameras);
+      for (const [name, box] of boxes) assert.equal(overlap(box, band), name === roles.rear?.name, name);
+      const front = pictures.get(roles.front.name);
+      assert.ok(front.width * front.height >= 0.4 * width * height, `${(100 * front.width * front.height) / (width * height)} %`);
+      assert.ok(band.height >= 0.1 * height - 1);
+      assert.equal(mirror.width > 0, roles.rear !== null);
+    });
+  }
+}
+
+test("the paper's vehicle: neighbours at both sides, the rear view on top, top views in a row below", () => {
+  assert.deepEqual(named(rolesOf(VEHICLES.tum_q7)), {
+    front: "front_center", left: "front_left", right: "front_right", rear: "rear_center",
+    others: ["top_front", "top_left", "top_right", "top_rear"],
+  });
+  const { pictures } = arrange(VEHICLES.tum_q7, 1920, 1080);
+  const at = (name) => pictures.get(name);
+  assert.ok(at("front_left").x < at("front_center").x && at("front_center").x < at("front_right").x);
+  assert.ok(at("rear_center").y < at("front_center").y && at("front_center").y < at("top_left").y);
+});
+
+test("neighbours are cropped to their inner part, which touches the front camera", () => {
+  const { pictures } = arrange(VEHICLES.tum_q7, 1920, 1080);
+  assert.deepEqual(pictures.get("front_left").view, { fit: "cover", align: 1, mirrored: false });
+  assert.deepEqual(pictures.get("front_right").view, { fit: "cover", align: 0, mirrored: false });
+});
+
+test("a camera may state that it fits, or fills its box", () => {
+  const cameras = VEHICLES.tum_q7.map((each) => ({ ...each, framing: { front_left: "fit", top_left: "fill" }[each.name] ?? null }));
+  const { pictures } = arrange(cameras, 1920, 1080);
+  const fit = (name) => pictures.get(name).view.fit;
+  assert.deepEqual(["front_left", "front_right", "top_left", "top_right"].map(fit), ["contain", "cover", "cover", "contain"]);
+  assert.equal(pictures.get("front_left").view.align, 0.5);
+});
+
+test("only what looks back is mirrored, and no top view", () => {
+  const { pictures } = arrange(VEHICLES.tum_q7, 1920, 1080);
+  assert.deepEqual([...pictures].filter(([, { view }]) => view.mirrored).map(([name]) => name), ["rear_center"]);
+});
+
+test("angles count in either direction and beyond a turn", () => {
+  const roles = rolesOf([camera("rear", -180), camera("left", 420), camera("right", 300), camera("front", 360)]);
+  assert.deepEqual(named(roles), { front: "front", left: "left", right: "right", rear: "rear", others: [] });
+});
+
+test("the front camera is the one nearest to straight ahead, within 30 degrees", () => {
+  assert.equal(rolesOf([camera("a", 20), camera("b", -10), camera("top", 0, 40)]).front.name, "b");
+});
+
+test("else the first one that looks forward, else the first", () => {
+  assert.equal(rolesOf([camera("rear", 180), camera("a", 60), camera("b", -40)]).front.name, "a");
+  assert.equal(rolesOf([camera("top", 0, 60), camera("rear", 180)]).front.name, "top");
+  assert.equal(rolesOf([camera("x"), camera("y")]).front.name, "x");
+});
+
+test("a second rear view is in the row, mirrored too", () => {
+  const cameras = [camera("front", 0), camera("rear", 180), camera("rear_left", 150)];
+  assert.deepEqual(named(rolesOf(cameras)).others, ["rear_left"]);
+  assert.equal(arrange(cameras, 1920, 1080).pictures.get("rear_left").view.mirrored, true);
+});
+
+test("a camera may change places with the front camera; both are whole then", () => {
+  const before = arrange(VEHICLES.tum_q7, 1920, 1080).pictures;
+  const after = arrange(VEHICLES.tum_q7, 1920, 1080, "rear_center").pictures;
+  const place = ({ x, y, width, height }) => [x, y, width, height];
+  assert.deepEqual(place(after.get("rear_center")), place(before.get("front_center")));
+  assert.deepEqual(place(after.get("front_center")), place(before.get("rear_center")));
+  assert.equal(after.get("rear_center").view.mirrored, true);
+  assert.equal(after.get("front_center").view.mirrored, false);
+  assert.equal(arrange(VEHICLES.tum_q7, 1920, 1080, "front_left").pictures.get("front_left").view.fit, "contain");
+});
+
+test("no cameras, no pictures", () => assert.equal(arrange([], 1920, 1080).pictures.size, 0));

@@ -1,0 +1,42 @@
+/** An operator who looks elsewhere is told so on the return. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { Attention } from "../../runner/page/static/attention.js";
+
+const HERE = { hidden: false, focused: true };
+
+test("nobody who stays is told anything", () => {
+  const attention = new Attention();
+  assert.equal(attention.changed(HERE, 0), null);
+  assert.equal(attention.changed(HERE, 60_000), null);
+  assert.equal(attention.warning(), null);
+});
+
+test("out of focus is said at once, and for how long on the return", () => {
+  const attention = new Attention();
+  assert.equal(attention.changed({ hidden: false, focused: false }, 1000), null);
+  assert.equal(attention.warning(), "OUT OF FOCUS: keys do not reach this page; click it");
+  assert.equal(attention.changed(HERE, 4100), "No key reached this page for 3 s");
+  assert.equal(attention.warning(), null);
+});
+
+test("a hidden page cannot be read: it speaks on the return", () => {
+  const attention = new Attention();
+  attention.changed({ hidden: false, focused: false }, 1000);
+  attention.changed({ hidden: true, focused: false }, 1100);
+  assert.equal(attention.warning(), null);
+  assert.equal(attention.changed({ hidden: false, focused: false }, 9000), null);
+  assert.equal(attention.changed(HERE, 11_000), "This page was hidden for 10 s: look at every picture");
+});
+
+test("an absence counts from its own start, and a moment is not one", () => {
+  const attention = new Attention();
+  attention.changed({ hidden: true, focused: true }, 0);
+  attention.changed(HERE, 5000);
+  attention.changed({ hidden: false, focused: false }, 6000);
+  assert.equal(attention.changed(HERE, 6400), null);
+  attention.changed({ hidden: false, focused: false }, 7000);
+  assert.equal(attention.changed(HERE, 7600), "No key reached this page for 1 s");
+});

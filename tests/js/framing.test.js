@@ -1,0 +1,59 @@
+/** Points on the screen and in the picture: whole, cropped and mirrored. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { placed, shownWords, toBox, toPicture, visible, WHOLE } from "../../runner/page/static/framing.js";
+
+const PICTURE = { width: 1920, height: 1080 };
+const NARROW = { width: 270, height: 1080 };
+const cover = (align, mirrored = false) => ({ fit: "cover", align, mirrored });
+const near = (found, expected) => {
+  for (const key of Object.keys(expected)) assert.ok(Math.abs(found[key] - expected[key]) < 1e-9, `${key}: ${found[key]}, not ${expected[key]}`);
+};
+
+test("a whole picture is centred in its box", () => {
+  near(placed({ width: 960, height: 1000 }, PICTURE, WHOLE), { scale: 0.5, x: 0, y: 230, width: 960, height: 540 });
+  near(toPicture({ x: 480, y: 500 }, { width: 960, height: 1000 }, PICTURE, WHOLE), { x: 960, y: 540 });
+});
+
+test("a cropped picture keeps the part that it is aligned to", () => {
+  near(visible(NARROW, PICTURE, cover(1)), { x: 1650, y: 0, width: 270, height: 1080 });
+  near(visible(NARROW, PICTURE, cover(0)), { x: 0, y: 0, width: 270, height: 1080 });
+  near(toPicture({ x: 0, y: 0 }, NARROW, PICTURE, cover(1)), { x: 1650, y: 0 });
+  near(toPicture({ x: 270, y: 1080 }, NARROW, PICTURE, cover(1)), { x: 1920, y: 1080 });
+});
+
+test("a mirrored picture shows its right at the left", () => {
+  const mirrored = { ...WHOLE, mirrored: true };
+  near(toPicture({ x: 100, y: 20 }, { width: 960, height: 540 }, PICTURE, mirrored), { x: 1720, y: 40 });
+  near(toBox({ x: 1720, y: 40, width: 200, height: 100 }, { width: 960, height: 540 }, PICTURE, mirrored), { x: 0, y: 20, width: 100, height: 50 });
+});
+
+test("a mirrored and cropped picture shows the part that it is aligned to as well", () => {
+  near(visible(NARROW, PICTURE, cover(1, true)), { x: 1650, width: 270 });
+  near(toPicture({ x: 0, y: 0 }, NARROW, PICTURE, cover(1, true)), { x: 1920, y: 0 });
+  near(toPicture({ x: 270, y: 0 }, NARROW, PICTURE, cover(1, true)), { x: 1650, y: 0 });
+});
+
+test("from the box into the picture and back is where it was", () => {
+  for (const mirrored of [false, true])
+    for (const fit of ["contain", "cover"])
+      for (const align of [0, 0.5, 1])
+        for (const box of [NARROW, { width: 800, height: 300 }]) {
+          const view = { fit, align: fit === "cover" ? align : 0.5, mirrored };
+          const [a, b] = [{ x: 31, y: 47 }, { x: 203, y: 211 }].map((point) => toPicture(point, box, PICTURE, view));
+          const part = { x: Math.min(a.x, b.x), y: Math.min(a.y, b.y), width: Math.abs(a.x - b.x), height: Math.abs(a.y - b.y) };
+          near(toBox(part, box, PICTURE, view), { x: 31, y: 47, width: 172, height: 164 });
+        }
+});
+
+test("what is cropped or mirrored is stated, and nothing else", () => {
+  assert.equal(shownWords({ width: 960, height: 540 }, PICTURE, WHOLE), "");
+  assert.equal(shownWords({ width: 960, height: 900 }, PICTURE, WHOLE), "");
+  assert.equal(shownWords(NARROW, PICTURE, cover(1)), "right 14 % shown");
+  assert.equal(shownWords(NARROW, PICTURE, cover(0)), "left 14 % shown");
+  assert.equal(shownWords(NARROW, PICTURE, cover(0.5)), "middle 14 % shown");
+  assert.equal(shownWords({ width: 1920, height: 540 }, PICTURE, cover(0.5)), "middle 50 % of the height shown");
+  assert.equal(shownWords({ width: 960, height: 540 }, PICTURE, { ...WHOLE, mirrored: true }), "mirrored");
+});
