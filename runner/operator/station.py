@@ -192,13 +192,18 @@ class Station:
         """An event of a camera, as `OperatorSide` reports it."""
         self.note(f"{camera}: {what}")
 
-    def captured_here(self, captured: float | None) -> float | None:
-        """A capture time by the vehicle's clock, s since 1970, as this machine's clock shows it; None: unknown."""
+    def captured_here(self, name: str, captured: float | None) -> float | None:
+        """A camera's capture time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
-        if captured is None or clock is None or self._was_set():
+        if captured is None or clock is None or self._was_set() or self.untimed(name):
             return None
         here = captured - clock.ahead_s
         return here if here <= time.time() + clock.bound_s else None  # a picture of the future: a clock has been set
+
+    def untimed(self, name: str) -> bool:
+        """Whether the vehicle does not know when a camera's pictures are captured."""
+        camera = self._camera(name)
+        return camera is not None and camera.untimed is True
 
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
@@ -269,7 +274,7 @@ class Station:
         for name, camera in (state.cameras if state else {}).items():
             if not camera.sending:
                 continue
-            if camera.fault:  # it may repeat a picture, so that the age of what arrives says nothing
+            if camera.fault or self.untimed(name):  # it may repeat a picture: the age of what arrives says nothing
                 return None
             sampled, newest = self.samples.get(name), self._newest.get(name)
             if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
@@ -307,7 +312,8 @@ class Station:
         readings = self._readings[name]
         if received.latency_ms is not None and (not readings or readings[-1][0] != received.latency_at):
             readings.append((received.latency_at, received.latency_ms))
-        counters: StreamCounters = replace(received, latency_ms=self._latency_ms(readings, now))
+        latency_ms = None if self.untimed(name) else self._latency_ms(readings, now)
+        counters: StreamCounters = replace(received, latency_ms=latency_ms)
         return counters
 
     def _latency_ms(self, readings: Iterable[tuple[float, float]], now: float) -> float | None:
