@@ -34,6 +34,7 @@ from runner.core.model import (
     RateQualityModel,
     Recording,
     Roi,
+    RosPrediction,
     RosQos,
     RosSettings,
     Source,
@@ -377,7 +378,9 @@ def _media(data: Mapping[str, Any]) -> Media:
 
 
 def _ros(data: Mapping[str, Any]) -> RosSettings:
-    return RosSettings(**{**data, "qos": {topic: RosQos(**its) for topic, its in data.get("qos", {}).items()}})
+    qos = {topic: RosQos(**its) for topic, its in data.get("qos", {}).items()}
+    prediction = data.get("prediction")
+    return RosSettings(**{**data, "qos": qos, "prediction": RosPrediction(**prediction) if prediction else None})
 
 
 def _capture(source: Source, data: Mapping[str, Any]) -> Capture:

@@ -465,6 +465,14 @@ class RosQos:
 
 
 @dataclass(frozen=True, slots=True)
+class RosPrediction:
+    """Predictions of the bitrate on a topic of ROS 2, by one node alone: its full name."""
+
+    topic: str
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
 class RosSettings:
     """The node of ROS 2, which runs in a process of its own.
 
@@ -475,6 +483,8 @@ class RosSettings:
     use_sim_time  whether stamps are of the time on /clock
     discovery     whose nodes it finds: off, localhost, subnet, system_default
     qos           by topic
+    position      topic with the vehicle's position, for the verb `ros`; None: none
+    prediction    predictions, for the verb `ros`; None: none
     """
 
     python: str = ".venv-ros2/bin/python"
@@ -484,6 +494,8 @@ class RosSettings:
     use_sim_time: bool = False
     discovery: str = "localhost"
     qos: Mapping[str, RosQos] = field(default_factory=dict)
+    position: str | None = None
+    prediction: RosPrediction | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,11 +15,11 @@ from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
-    APPLY_S,
-    MAX_ROUND_TRIP_S,
     OPERATOR_GONE,
+    SILENT_S,
     JsonObject,
     MqttMessage,
+    answer_s,
     read_clock,
     read_reply,
     read_settings,
@@ -50,8 +50,6 @@ from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, Cl
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S
 
-SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
-SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
 CLOCK_S = 0.2  # between two comparisons of the clocks
 READINGS = 8  # latencies of a camera that may still turn out to be right
 MOST_VEHICLES = 100  # whose names are remembered
@@ -103,7 +101,7 @@ class Station:
         self._vehicle, self._settings = vehicle, settings
         login = Login(keyring, self.note) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]  # of this operator
-        self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
+        self.answer_s = answer_s(vehicle.expires_s)
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published

@@ -71,7 +71,7 @@ class RosCameras:
         for camera in cameras:
             if camera.topic:
                 self._streams.setdefault(camera.topic, []).append(CameraStream(camera, on_report))
-        self._node = NodeProcess(settings, self._streams, self._take, self._report)
+        self._node = NodeProcess(settings, self._take, self._report, pictures=self._streams)
 
     def start(self) -> None:
         """raises RunError if the node does not start"""

@@ -1,10 +1,12 @@
 """usage: python -P node.py SOCKET
 
-A node of ROS 2 that subscribes to topics with pictures. Run by a Python that has rclpy; apart from that it needs the
-standard library alone. SOCKET is the number of an open socket to the process that starts it (AF_UNIX, SOCK_SEQPACKET).
+A node of ROS 2 that subscribes to topics, and publishes text. Run by a Python that has rclpy; apart from that it needs
+the standard library alone. SOCKET is the number of an open socket to the process that starts it (AF_UNIX,
+SOCK_SEQPACKET), over which JSON passes.
 
-The first message on it is the node's task. The others go the other way: JSON, each with the key "kind"; a picture comes
-with a file descriptor of the memory that holds its data, see `Port.send_picture`. The node ends with its socket.
+To the node: first its task, then what it is to publish, each with topic, text and whether that is kept for late
+subscribers. From the node: messages with the key "kind"; a picture comes with a file descriptor of the memory that
+holds its data, see `Port.send_picture`. The node ends with its socket.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -23,9 +26,11 @@ if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-MAX_MESSAGE_BYTES = 65_536
+MAX_MESSAGE_BYTES = 131_072
+MAX_TEXT = 20_000  # characters, which JSON may write as six bytes each
 LOOK_S = 0.5  # how often topics are looked for
 CLOSE_NS, TRIES = 100_000, 10  # clocks read within this count as read at once, or else the closest of so many readings
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, its node not yet
 ABSENT_S = 5.0  # a topic without a picture for so long is reported
 
 
@@ -58,11 +63,11 @@ class Port:
         finally:
             os.close(memory)
 
-    def wait_closed(self) -> None:
-        """Wait until the other side closes the connection, or is gone."""
+    def orders(self) -> Iterator[dict[str, Any]]:
+        """What is to be published, until the other side closes the connection, or is gone."""
         with suppress(OSError):
-            while self._socket.recv(MAX_MESSAGE_BYTES):
-                pass
+            while order := self._socket.recv(MAX_MESSAGE_BYTES):
+                yield json.loads(order)
 
 
 class Topic:
@@ -159,39 +164,105 @@ class Topic:
             self._port.say("report", topic=self._name, text=why)
 
 
+class Input:
+    """A topic whose messages are passed on as they come.
+
+    kind  text: std_msgs/String, number: std_msgs/Float64, fix: sensor_msgs/NavSatFix. Of numbers and positions only the
+          newest counts
+    """
+
+    def __init__(self, node: Node, port: Port, name: str, kind: str) -> None:
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from sensor_msgs.msg import NavSatFix
+        from std_msgs.msg import Float64, String
+
+        self._node, self._port, self._name, self._kind = node, port, name, kind
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # is compatible with any publisher
+        message, qos = {
+            "text": (String, QoSProfile(depth=10)),
+            "number": (Float64, newest),
+            "fix": (NavSatFix, newest),
+        }[kind]
+        node.create_subscription(message, name, self._on_message, qos)
+
+    def _on_message(self, message: Any) -> None:
+        if self._kind == "fix":
+            self._pass_on(lat=message.latitude, lon=message.longitude, fixed=message.status.status >= 0)
+        elif self._kind == "number":
+            self._pass_on(number=message.data)
+        elif len(message.data) <= MAX_TEXT:
+            self._pass_on(text=message.data)
+        else:
+            self._port.say("report", topic=self._name, text=f"a text is longer than {MAX_TEXT}: left out")
+
+    def _pass_on(self, **values: Any) -> None:
+        """With the names of all nodes that publish the topic; none as long as one is unknown."""
+        publishers = self._node.get_publishers_info_by_topic(self._name)
+        nodes = {f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers}
+        known = not any(UNKNOWN_NODE in name for name in nodes)
+        self._port.say(self._kind, topic=self._name, nodes=sorted(nodes) if known else [], **values)
+
+
+class Outputs:
+    """Publishers of std_msgs/String, made with the first text for their topics."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._publishers = node, dict[str, Any]()
+
+    def publish(self, order: dict[str, Any]) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_msgs.msg import String
+
+        topic, kept = order["topic"], order["kept"]
+        if topic not in self._publishers:
+            durability = DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE
+            qos = QoSProfile(depth=1 if kept else 10, durability=durability)
+            self._publishers[topic] = self._node.create_publisher(String, topic, qos)
+        self._publishers[topic].publish(String(data=order["text"]))
+
+
 def run(port: Port, task: dict[str, Any]) -> None:
     """Be the node until the other side of the port closes it."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
 
-    words = [word for pair in task["remap"].items() for word in ("-r", ":=".join(pair))]
-    simulated = ["-p", f"use_sim_time:={str(task['use_sim_time']).lower()}"]
-    rclpy.init(args=["--ros-args", *words, *simulated], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node(task["node"], namespace=task["namespace"])
-    topics = [Topic(node, port, name, asked) for name, asked in task["topics"].items()]
+    node = new_node(task)
+    topics = [Topic(node, port, name, asked) for name, asked in task["pictures"].items()]
+    for name, kind in task["inputs"].items():
+        Input(node, port, name, kind)
+    outputs = Outputs(node)
 
     def look() -> None:
         for topic in topics:
             topic.look()
 
     node.create_timer(LOOK_S, look, clock=rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME))
-    port.say("ready")
-
     executor, closed = SingleThreadedExecutor(), threading.Event()
     executor.add_node(node)
 
-    def end() -> None:
-        port.wait_closed()
+    def obey() -> None:
+        for order in port.orders():
+            executor.create_task(outputs.publish, order)
         closed.set()
         executor.wake()
 
-    threading.Thread(target=end, daemon=True).start()
+    port.say("ready")
+    threading.Thread(target=obey, daemon=True).start()
     look()
     while not closed.is_set():
         executor.spin_once(timeout_sec=LOOK_S)
     node.destroy_node()
     rclpy.try_shutdown()
+
+
+def new_node(task: dict[str, Any]) -> Node:
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    words = [word for pair in task["remap"].items() for word in ("-r", ":=".join(pair))]
+    simulated = ["-p", f"use_sim_time:={str(task['use_sim_time']).lower()}"]
+    rclpy.init(args=["--ros-args", *words, *simulated], signal_handler_options=SignalHandlerOptions.NO)
+    return rclpy.create_node(task["node"], namespace=task["namespace"])
 
 
 def main(number: int) -> int:

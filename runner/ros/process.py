@@ -25,6 +25,7 @@ END_S = 2.0
 LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
 
 Message = Mapping[str, Any]
+NOTHING: Mapping[str, str] = {}
 
 
 def check_discovery(settings: RosSettings, insecure: bool) -> None:
@@ -41,10 +42,11 @@ def check_discovery(settings: RosSettings, insecure: bool) -> None:
 class NodeProcess:
     """A node in a process of its own, from `start` until `close`.
 
-    topics      with pictures, to subscribe to
-    on_picture  called with what is known about a picture, and a file descriptor of its memory, which is then the
-                callee's to close
+    on_message  called with a message of a topic; of a picture with what is known about it, and a file descriptor of its
+                memory, which is then the callee's to close
     on_report   called with a topic and one line about it; "" stands for the node itself
+    pictures    topics with pictures, to subscribe to
+    inputs      other topics to subscribe to, with the kind of their messages: text, number, fix
 
     Both are called from one thread.
     """
@@ -52,14 +54,17 @@ class NodeProcess:
     def __init__(
         self,
         settings: RosSettings,
-        topics: Iterable[str],
-        on_picture: Callable[[Message, int], None],
+        on_message: Callable[[Message, int], None],
         on_report: Callable[[str, str], None],
+        *,
+        pictures: Iterable[str] = (),
+        inputs: Mapping[str, str] = NOTHING,
     ) -> None:
-        self._settings, self._on_picture, self._on_report = settings, on_picture, on_report
-        asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in topics}
+        self._settings, self._on_message, self._on_report = settings, on_message, on_report
+        asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
         own = {key: getattr(settings, key) for key in ("node", "namespace", "use_sim_time")}
-        self._task = {**own, "remap": dict(settings.remap), "topics": asked}
+        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, "inputs": dict(inputs)}
+        self._kept: dict[str, str] = {}  # text by topic
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None  # while there is a process
         self._closing, self._tried = threading.Event(), threading.Event()
@@ -81,6 +86,23 @@ class NodeProcess:
         if self._fault:
             self.close()
             raise RunError(f"the ROS node does not start: {self._fault}")
+
+    def publish(self, topic: str, text: str, *, kept: bool = False) -> None:
+        """Publish a text as std_msgs/String, from any thread. While there is no node, only what is kept comes later.
+
+        kept  for subscribers that come later
+        """
+        with self._lock:
+            if kept:
+                self._kept[topic] = text
+            self._send(topic, text, kept)
+
+    def _send(self, topic: str, text: str, kept: bool) -> None:
+        """Under the lock."""
+        order = json.dumps({"topic": topic, "text": text, "kept": kept}).encode()
+        if self._socket and self._is_ready and len(order) <= node.MAX_MESSAGE_BYTES:
+            with suppress(OSError):  # the node is behind, or has just ended
+                self._socket.send(order, socket.MSG_DONTWAIT)
 
     def close(self) -> None:
         self._closing.set()
@@ -148,15 +170,18 @@ class NodeProcess:
 
     def _take(self, message: Message, memory: list[int]) -> None:
         match message["kind"]:
-            case "picture":
-                self._on_picture(message, memory[0])
             case "report":
                 self._on_report(message["topic"], message["text"])
             case "fatal":
                 self._fatal = message["text"]
             case "ready":
-                self._is_ready = True
+                with self._lock:
+                    self._is_ready = True
+                    for topic, text in self._kept.items():
+                        self._send(topic, text, True)
                 if self._fault:
                     self._fault = ""
                     self._on_report("", "the ROS node works again")
                 self._tried.set()
+            case _:
+                self._on_message(message, memory[0] if memory else -1)

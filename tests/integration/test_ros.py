@@ -21,7 +21,7 @@ from bags import filmed
 from numbered import BITS, HEIGHT, WIDTH, encoded, number_of
 from shared_data import shared
 
-from rig import CHECKOUT, free_port, run, streaming, until, watching
+from rig import CHECKOUT, children_named, free_port, run, streaming, until, watching
 from runner.bag.pictures import FORMATS
 from runner.core.commands import Command
 from runner.core.model import RosSettings
@@ -290,21 +290,14 @@ def goes_on(client):
 
 def test_a_node_that_dies_is_started_again():
     with publishing(front={}, rear={}), subscribing() as (_, plans, reported), watched(plans, reported) as (front, _):
-        (node,) = children_named("node.py")
+        (node,) = children_named(os.getpid(), "node.py")
         os.kill(node, signal.SIGKILL)
         until(lambda: told(reported, "the ROS node ended: killed by SIGKILL; starting it again"))
         until(lambda: told(reported, "the ROS node works again"))
         goes_on(front)
-        (again,) = children_named("node.py")
+        (again,) = children_named(os.getpid(), "node.py")
         assert again != node
     until(lambda: not Path(f"/proc/{again}").exists())
-
-
-def children_named(name):
-    """Processes that this one has started, by a word of their command lines."""
-    own = Path(f"/proc/{os.getpid()}/task").glob("*/children")
-    found = [int(word) for file in own for word in file.read_text().split()]
-    return [pid for pid in found if name in Path(f"/proc/{pid}/cmdline").read_text()]
 
 
 def test_incompatible_qos_and_a_topic_of_another_type():
