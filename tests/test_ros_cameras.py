@@ -146,3 +146,10 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
         check_discovery(open_to_all, insecure=False)
     monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
     check_discovery(open_to_all, insecure=False)
+
+
+def test_doctor_names_what_makes_the_environment(tod):
+    done = tod("doctor", "ros", "ros.python=no/python")
+    assert done.status == 1
+    why = "[Errno 2] No such file or directory: 'no/python'; `make ros2` makes .venv-ros2, see docs/ros.md"
+    assert f"MISSING rclpy for ros.python no/python: {why}" in done.out.splitlines()

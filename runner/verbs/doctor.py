@@ -34,6 +34,7 @@ NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
     "latency": ("live", "page"),
+    "ros": ("live",),
     "demo": ("live",),
     "record": ("live",),
     "model": ("model",),
@@ -90,7 +91,9 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield from _devices(vehicle)
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
-        yield from _ros(vehicle)
+    subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
+    if verb == "ros" or (subscribes and verb in ("vehicle", "demo")):
+        yield _rclpy(vehicle.ros.python)
 
 
 def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[str]:
@@ -113,11 +116,8 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield from ["cluster"] if study["workers"] == "dask" else []
 
 
-def _ros(vehicle: Vehicle) -> Iterator[Diagnosis]:
-    """Another Python with rclpy, if a camera subscribes to a topic."""
-    if not any(camera.source.subscribes for camera in vehicle.cameras.values()):
-        return
-    python = vehicle.ros.python
+def _rclpy(python: str) -> Diagnosis:
+    """Another Python, which must have rclpy."""
     try:
         command = [python, "-c", "import rclpy, sensor_msgs.msg"]
         done = subprocess.run(command, capture_output=True, timeout=IMPORT_S, check=False)
@@ -125,7 +125,7 @@ def _ros(vehicle: Vehicle) -> Iterator[Diagnosis]:
     except (OSError, subprocess.TimeoutExpired) as error:
         why = str(error)
     hint = f": {why}; `make ros2` makes .venv-ros2, see docs/ros.md" if why is not None else ""
-    yield Diagnosis(why is None, f"rclpy for ros.python {python}{hint}")
+    return Diagnosis(why is None, f"rclpy for ros.python {python}{hint}")
 
 
 def _bindings() -> Iterator[Diagnosis]:
