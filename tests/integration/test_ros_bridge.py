@@ -143,6 +143,7 @@ def offline(operator):
 
 def test_a_request_that_the_vehicle_does_not_answer_times_out(lines):
     with bridged(lines) as (_, _, (vehicle, _)), client("interface", *HEARD) as operator:
+        operator.newest("telemetry")
         assert operator.ask(id="one", event="mode_selected", mode="collective")["result"] == "applied"
         vehicle.send_signal(signal.SIGSTOP)
         reply = operator.ask(id="two", event="mode_selected", mode="single")
@@ -153,7 +154,7 @@ def test_a_request_that_the_vehicle_does_not_answer_times_out(lines):
 
 def test_a_node_that_dies_is_started_again_with_what_late_subscribers_need(lines):
     with bridged(lines) as (_, _, (_, bridge)), client("interface", *HEARD) as operator:
-        until(lambda: operator.texts("url/front"))
+        until(lambda: operator.texts("url/front") and operator.texts("telemetry"))
         (node,) = children_named(bridge.pid, "node.py")
         os.kill(node, signal.SIGKILL)
         until(lambda: told(lines, "the ROS node works again"))
