@@ -5,16 +5,18 @@
 # make soak   long repeats of what a drive must survive, an hour and a half; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot  two drives over a recorded uplink: the picture of the README
 # make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
+# make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+ROS2 := .venv-ros2
 TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
 # Tests start hundreds of processes; each would compile the project again where the environment forbids keeping bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak clean
+.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -70,6 +72,13 @@ soak: $(TEST_READY) $(NODE_READY)
 
 setup: $(READY)
 
+# The vehicle's tests with ROS run where this has been made.
+ros2: $(ROS2)/.ready
+
+$(ROS2)/.ready: scripts/setup-ros2 scripts/packages-ros2.txt
+	scripts/setup-ros2 $(ROS2)
+	touch $@
+
 $(READY): pyproject.toml scripts/setup scripts/packages.apt
 	scripts/setup $(VENV)
 	touch $@
@@ -84,4 +93,4 @@ $(NODE_READY): package.json package-lock.json | $(TEST_READY)
 	touch $@
 
 clean:
-	rm -rf $(VENV) node_modules build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(ROS2) node_modules build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -5,6 +5,7 @@ Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from runner.gst.sequence import Form
     from runner.gst.video_reader import Unit
     from runner.lanes import LaneSet
+    from runner.ros.cameras import SharedPicture
     from runner.security.keyring import Keyring
 
 __all__ = [
@@ -233,6 +235,13 @@ class VehicleSide:
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 
+    def push_shared(self, camera: str, picture: SharedPicture) -> bool:
+        """One picture in shared memory, with its capture time; returns False where nobody is watching."""
+        pipeline = self._pipeline(camera)
+        if pipeline is None:
+            os.close(picture.memory)
+        return pipeline is not None and pipeline.push_shared(picture)
+
     def applied(self) -> dict[str, Mapping[str, KnobValue]]:
         """By camera and knob, the values read back from the elements; empty for cameras without a pipeline."""
         return {name: dict(p.knobs.applied) if (p := self._pipeline(name)) else {} for name in self._wanted}
@@ -269,6 +278,11 @@ class VehicleSide:
         """By camera, the fault of its source: it has failed and is being replaced, or repeats a picture."""
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
+
+    def untimed(self) -> frozenset[str]:
+        """Cameras whose source does not know when its last picture was captured."""
+        pipelines = ((name, self._pipeline(name)) for name in self._wanted)
+        return frozenset(name for name, pipeline in pipelines if pipeline and pipeline.untimed)
 
     def stop(self) -> None:
         def stop() -> None:

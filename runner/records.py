@@ -87,15 +87,21 @@ class DecisionMade:
 
 @dataclass(frozen=True, slots=True)
 class CameraState(CameraDecision):
-    """The decision for one camera, the values read back as applied, and the fault of its source, if any."""
+    """The decision for one camera, the values read back as applied, and the fault of its source, if any.
+
+    untimed  True: its source does not know when pictures are captured: their latency is unknown; absent otherwise
+    """
 
     weight: Number
     applied: Applied
     fault: str | None = None
+    untimed: bool | UnsetType = UNSET
 
     @classmethod
-    def at(cls, setting: Setting, weight: Number, applied: Applied, fault: str | None) -> CameraState:
-        return cls(**_decided(setting), weight=weight, applied=applied, fault=fault)
+    def at(
+        cls, setting: Setting, weight: Number, applied: Applied, fault: str | None, untimed: bool = False
+    ) -> CameraState:
+        return cls(**_decided(setting), weight=weight, applied=applied, fault=fault, untimed=untimed or UNSET)
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ def test_words_that_are_no_command(tod: Command, words: list[str], expected: str
     [
         (
             ["print", "duration_s=3"],
-            "duration_s: is an argument of vehicle, operator, latency, demo, record; print has ",
+            "duration_s: is an argument of vehicle, operator, latency, ros, demo, record; print has ",
         ),
         (["print", "input=a.jsonl"], "input: is an argument of replay; print has total_kbps, format, conf"),
         (["print", "vehcle=mine"], "vehcle: unknown name, did you mean vehicle?"),

@@ -58,18 +58,30 @@ def read_image(message: Any) -> Picture:
 
     raises  ValueError with the rule that it breaks
     """
-    encoding, width, height, step = message.encoding, int(message.width), int(message.height), int(message.step)
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    form = image_format(message.encoding, width, height, step, message.is_bigendian, len(message.data))
+    row = width * FORMATS[message.encoding][1]
+    return Picture(stamp_ns(message), form, width, height, _padded(message.data[: step * height], height, row))
+
+
+def image_format(encoding: str, width: int, height: int, step: int, big: bool, size: int) -> str:
+    """GStreamer's name of the format of a raw picture.
+
+    width, height  px
+    step           bytes from one row to the next
+    big            whether the bytes of a number are in big-endian order
+    size           of the picture, bytes
+    raises         ValueError with the rule that it breaks
+    """
     if encoding not in FORMATS:
         raise ValueError(f"encoding {encoding!r} is not supported; expected one of {', '.join(FORMATS)}")
     form, pixel = FORMATS[encoding]
     row = width * pixel
     if not width or not height or step < row:
         raise ValueError(f"a picture of {width}x{height} with rows of {step} bytes, must be at least {max(1, row)}")
-    if len(message.data) < step * height:
-        raise ValueError(f"a picture of {len(message.data)} bytes, must have {step * height}: {height} rows of {step}")
-    if message.is_bigendian and form == "GRAY16_LE":
-        form = "GRAY16_BE"
-    return Picture(stamp_ns(message), form, width, height, _padded(message.data[: step * height], height, row))
+    if size < step * height:
+        raise ValueError(f"a picture of {size} bytes, must have {step * height}: {height} rows of {step}")
+    return "GRAY16_BE" if big and form == "GRAY16_LE" else form
 
 
 def read_compressed(message: Any) -> Picture:
@@ -78,13 +90,21 @@ def read_compressed(message: Any) -> Picture:
     raises  ValueError with the rule that it breaks
     """
     data = bytes(message.data)
+    return Picture(stamp_ns(message), *compressed_form(data, message.format), data)
+
+
+def compressed_form(data: bytes, stated: str) -> tuple[str, int, int]:
+    """jpeg or png, and width and height in px, by the first bytes of a compressed picture.
+
+    data    as many of them as hold its headers
+    stated  its format by the message
+    raises  ValueError with the rule that it breaks
+    """
     if data.startswith(JPEG):
-        form, size = "jpeg", _jpeg_size(data)
-    elif data.startswith(PNG) and len(data) >= 24:
-        form, size = "png", (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
-    else:
-        raise ValueError(f"format {message.format!r} is not supported; expected JPEG or PNG")
-    return Picture(stamp_ns(message), form, *size, data)
+        return ("jpeg", *_jpeg_size(data))
+    if data.startswith(PNG) and len(data) >= 24:
+        return "png", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    raise ValueError(f"format {stated!r} is not supported; expected JPEG or PNG")
 
 
 def stamp_ns(message: Any) -> int:

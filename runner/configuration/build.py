@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,6 +34,9 @@ from runner.core.model import (
     RateQualityModel,
     Recording,
     Roi,
+    RosPrediction,
+    RosQos,
+    RosSettings,
     Source,
     Value,
     Vehicle,
@@ -51,6 +55,8 @@ if TYPE_CHECKING:
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
 BAG_KEYS = ("bag", "topic")
+TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
+TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
 GRAPH_STRUCTURE = ("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable")
 
@@ -98,7 +104,8 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        if not all(map(self.fine, ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics"))):
+        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros")
+        if not all(map(self.fine, sections)):
             return None
         media = self.part(("media",), _media)
         if media is None:
@@ -138,6 +145,7 @@ class Builder:
             keys=keys,
             insecure=document.get("insecure", False),
             metrics=MetricsPorts(**document.get("metrics", {})),
+            ros=_ros(document.get("ros", {})),
         )
 
     def finished(self, built: T | None) -> T:
@@ -294,6 +302,7 @@ class Builder:
         """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""
         source = camera.source
         needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
+        needs |= {"topic"} if source.subscribes else set()
         for key in () if source.render else sorted(needs):
             where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
             given = camera.mount.get(key, source.settings.get(key))
@@ -302,6 +311,8 @@ class Builder:
             elif key == "address" and has_password(str(given)):
                 rule = "must not hold user or password: write user:password into a file, and name that as credentials"
                 self._report(where, ModelError(key, repr(redacted(given)), rule))
+            elif key == "topic" and not TOPIC.fullmatch(str(given)):
+                self._report(where, ModelError(key, repr(given), TOPIC_RULE))
             elif key == "clip" and not Path(str(given)).is_file():
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
@@ -366,6 +377,12 @@ def _media(data: Mapping[str, Any]) -> Media:
     return Media(**{**data, "rtp_ports": (first, last)})
 
 
+def _ros(data: Mapping[str, Any]) -> RosSettings:
+    qos = {topic: RosQos(**its) for topic, its in data.get("qos", {}).items()}
+    prediction = data.get("prediction")
+    return RosSettings(**{**data, "qos": qos, "prediction": RosPrediction(**prediction) if prediction else None})
+
+
 def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
     """What a source asks of its cameras, with the camera's own wishes in their place."""
     own = data.get("capture") or {}
@@ -421,6 +438,7 @@ def _source(data: Mapping[str, Any]) -> Source:
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
         capture=data.get("capture") or {},
         plays_bags="bag" in data,
+        subscribes=data.get("ros", False),
         **_given(data, ("loop", "frozen_s", "repeated_s", "credentials")),
         render=render["drive"] if render else "",
         render_s=render["seconds"] if render else 0,

@@ -220,6 +220,7 @@ class Source:
     render      name of the procedural drive that makes the clip, or ""
     render_s    length of that drive, s
     plays_bags  frames are the pictures of a topic of a bag, which are pushed into its first element
+    subscribes  the same for a topic of ROS 2
     stand_in    elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
     """
 
@@ -233,11 +234,13 @@ class Source:
     render: str = ""
     render_s: float = 0
     plays_bags: bool = False
+    subscribes: bool = False
     stand_in: tuple[Element, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.plays_bags and self.elements[0].factory != "appsrc":
-            rule = "must be appsrc: the pictures of a bag are pushed into the first element"
+        if (self.plays_bags or self.subscribes) and self.elements[0].factory != "appsrc":
+            of = "a bag" if self.plays_bags else "a topic"
+            rule = f"must be appsrc: the pictures of {of} are pushed into the first element"
             raise ModelError("elements[0].element", repr(self.elements[0].factory), rule)
 
     @property
@@ -324,7 +327,8 @@ class Camera:
     floor_kbps      kbit/s that the camera gets first where `modes` have floors; 0: none
     shed            where all floors together exceed the total, cameras with the lowest number are given up first;
                     None: never
-    mount           device, address, clip: values of the placeholders of these names; bag and topic to play
+    mount           device, address, clip: values of the placeholders of these names; bag and topic to play, or topic
+                    to subscribe to
     capture         what its device is to deliver
     credentials     file with user name and password of its address; None: it asks for none
     framing         fit: the page's Drive view shows the whole picture; fill: it fills its box; None: by its place
@@ -363,6 +367,12 @@ class Camera:
     @property
     def source_size(self) -> tuple[int, int]:
         return self.native or (self.width, self.height)
+
+    @property
+    def topic(self) -> str | None:
+        """The topic of ROS 2 that its source subscribes to; None: it does not, or none is named."""
+        topic = self.mount.get("topic", self.source.settings.get("topic"))
+        return str(topic) if self.source.subscribes and topic else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -444,6 +454,52 @@ class MetricsPorts:
     operator_port: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class RosQos:
+    """What a subscription asks of a topic of ROS 2; None: what its publishers offer.
+
+    depth  messages that wait to be taken, of which the oldest go first
+    """
+
+    reliability: str | None = None
+    durability: str | None = None
+    depth: int = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RosPrediction:
+    """Predictions of the bitrate on a topic of ROS 2, by one node alone: its full name."""
+
+    topic: str
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
+class RosSettings:
+    """The node of ROS 2, which runs in a process of its own.
+
+    python        interpreter that can import rclpy
+    node          its name
+    namespace     absolute
+    remap         names of topics and nodes by the names that are used here
+    use_sim_time  whether stamps are of the time on /clock
+    discovery     whose nodes it finds: off, localhost, subnet, system_default
+    qos           by topic
+    position      topic with the vehicle's position, for the verb `ros`; None: none
+    prediction    predictions, for the verb `ros`; None: none
+    """
+
+    python: str = ".venv-ros2/bin/python"
+    node: str = "tod_runner"
+    namespace: str = "/"
+    remap: Mapping[str, str] = field(default_factory=dict)
+    use_sim_time: bool = False
+    discovery: str = "localhost"
+    qos: Mapping[str, RosQos] = field(default_factory=dict)
+    position: str | None = None
+    prediction: RosPrediction | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicle:
     """Everything the runner needs to know, valid once built.
@@ -457,6 +513,7 @@ class Vehicle:
     keys       directory that `tod-runner keys` made for this side; None: nothing is encrypted or authenticated
     insecure   whether that is intended where video or control leave this machine
     metrics    where both sides serve figures for Prometheus
+    ros        the node of ROS 2, for cameras whose source subscribes to topics
     """
 
     name: str
@@ -474,6 +531,7 @@ class Vehicle:
     keys: str | None = None
     insecure: bool = False
     metrics: MetricsPorts = MetricsPorts()
+    ros: RosSettings = RosSettings()
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

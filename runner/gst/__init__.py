@@ -16,6 +16,7 @@ with suppress(OSError):
 
 TYPELIBS = {  # Debian package by typelib
     "Gst": "gir1.2-gstreamer-1.0",
+    "GstAllocators": "gir1.2-gst-plugins-base-1.0",
     "GstPbutils": "gir1.2-gst-plugins-base-1.0",
     "GstRtp": "gir1.2-gst-plugins-base-1.0",
     "GstRtsp": "gir1.2-gst-plugins-base-1.0",

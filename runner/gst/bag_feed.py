@@ -101,7 +101,8 @@ class BagFeed:
         """A round begins with this picture."""
         if self._form is None:
             self._form, self.first = picture, picture.ns
-            self._source.set_property("caps", Gst.Caps.from_string(caps(picture, self._fps)))
+            form = caps(picture.format, picture.width, picture.height, self._fps)
+            self._source.set_property("caps", Gst.Caps.from_string(form))
             start = self._now() if self._on_report else 0
         else:
             start = self._last + self._interval
@@ -152,10 +153,9 @@ class BagFeed:
         self._source.post_message(Gst.Message.new_error(self._source, error, ""))
 
 
-def caps(picture: Picture, fps: Fraction) -> str:
-    """Caps of pictures like this one."""
+def caps(form: str, width: int, height: int, fps: Fraction) -> str:
+    """Caps of pictures of a format, as `Picture` names it."""
     rate = f"framerate={fps.numerator}/{fps.denominator}"
-    if picture.format in ENCODED:
-        return f"{ENCODED[picture.format]},{rate}"
-    size = f"width={picture.width},height={picture.height}"
-    return f"video/x-raw,format={picture.format},{size},pixel-aspect-ratio=1/1,{rate}"
+    if form in ENCODED:
+        return f"{ENCODED[form]},{rate}"
+    return f"video/x-raw,format={form},width={width},height={height},pixel-aspect-ratio=1/1,{rate}"

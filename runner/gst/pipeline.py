@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gi.repository import Gst, GstRtp, GstVideo
 
@@ -17,6 +17,9 @@ from runner.gst.sender_stages import EncoderWatch, SenderStages
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
+if TYPE_CHECKING:
+    from runner.ros.cameras import SharedPicture
+
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
 SRT_KEY_BYTES = 32  # AES-256
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
@@ -29,6 +32,8 @@ class CameraPipeline:
     on_turned  called, from any thread, after knobs were set
     on_report  called, from a streaming thread, with a fault of the source, and when it has passed
     source     the source, if it is watched
+
+    `untimed` is whether the source does not know when the last picture was captured: it came at its stated time.
     """
 
     def __init__(
@@ -42,6 +47,7 @@ class CameraPipeline:
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted = wanted
+        self.untimed = False
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
             loop_clip(pipeline, plan)
@@ -103,6 +109,13 @@ class CameraPipeline:
             raise ValueError(f"camera {self._plan.camera.name}: a frame of {len(data)} bytes {rule}")
         source = self._pipeline.get_by_name(self._plan.source[0].name)
         return bool(source.emit("push-buffer", Gst.Buffer.new_wrapped(data)) == Gst.FlowReturn.OK)
+
+    def push_shared(self, picture: SharedPicture) -> bool:
+        """Hand one picture in shared memory to the source, which must be an appsrc."""
+        from runner.gst.shared import push_shared
+
+        self.untimed = picture.untimed
+        return push_shared(self._pipeline.get_by_name(self._plan.source[0].name), picture, self._plan.camera.fps)
 
     def counters(self) -> tuple[int, int]:
         """Frames and bytes that the encoder has output so far, counted in C."""

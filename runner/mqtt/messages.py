@@ -33,6 +33,8 @@ OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and 
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
+SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
+SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
 MAX_ROUND_TRIP_S = 0.5  # a longer round trip does not excuse an old request: it is too long for driving
 
 JsonObject = Mapping[str, Any]
@@ -41,6 +43,14 @@ JsonObject = Mapping[str, Any]
 def topic(vehicle: str, *parts: str) -> str:
     """A topic of a vehicle, or a filter if a part is +."""
     return "/".join(("tod", vehicle, *parts))
+
+
+def answer_s(expires_s: float) -> float:
+    """How long the vehicle's answer to a request may take, s: by then it has timed out.
+
+    expires_s  age from which the vehicle drops a request
+    """
+    return expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S
 
 
 class MqttMessage(NamedTuple):

@@ -29,13 +29,13 @@ class DriveLog(Listener):
 
     def _with_arrivals(self, name: str, camera: CameraSample) -> CameraSample:
         received: Any = self._station.samples[name]
-        arrivals = tuple(self._arrival(*arrival) for arrival in received.arrivals)
+        arrivals = tuple(self._arrival(name, *arrival) for arrival in received.arrivals)
         return replace(camera, arrivals=arrivals)
 
-    def _arrival(self, arrived: float, captured: float | None) -> tuple[float, float | None]:
+    def _arrival(self, name: str, arrived: float, captured: float | None) -> tuple[float, float | None]:
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
         clock = self._station.clock
-        known = captured is not None and clock is not None
+        known = captured is not None and clock is not None and not self._station.untimed(name)
         # Below 0 where the bound allows it: a reader gets the capture time back.
         ms = round(1000 * (arrived + clock.ahead_s - captured), 2) if known else None  # type: ignore[union-attr, operator]
         return round(arrived - self._log.time, 4), ms

@@ -15,11 +15,11 @@ from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
-    APPLY_S,
-    MAX_ROUND_TRIP_S,
     OPERATOR_GONE,
+    SILENT_S,
     JsonObject,
     MqttMessage,
+    answer_s,
     read_clock,
     read_reply,
     read_settings,
@@ -50,8 +50,6 @@ from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, Cl
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S
 
-SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
-SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
 CLOCK_S = 0.2  # between two comparisons of the clocks
 READINGS = 8  # latencies of a camera that may still turn out to be right
 MOST_VEHICLES = 100  # whose names are remembered
@@ -103,7 +101,7 @@ class Station:
         self._vehicle, self._settings = vehicle, settings
         login = Login(keyring, self.note) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]  # of this operator
-        self.answer_s = vehicle.expires_s + MAX_ROUND_TRIP_S + APPLY_S + SLACK_S  # a request has timed out by then
+        self.answer_s = answer_s(vehicle.expires_s)
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
@@ -192,13 +190,18 @@ class Station:
         """An event of a camera, as `OperatorSide` reports it."""
         self.note(f"{camera}: {what}")
 
-    def captured_here(self, captured: float | None) -> float | None:
-        """A capture time by the vehicle's clock, s since 1970, as this machine's clock shows it; None: unknown."""
+    def captured_here(self, name: str, captured: float | None) -> float | None:
+        """A camera's capture time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
-        if captured is None or clock is None or self._was_set():
+        if captured is None or clock is None or self._was_set() or self.untimed(name):
             return None
         here = captured - clock.ahead_s
         return here if here <= time.time() + clock.bound_s else None  # a picture of the future: a clock has been set
+
+    def untimed(self, name: str) -> bool:
+        """Whether the vehicle does not know when a camera's pictures are captured."""
+        camera = self._camera(name)
+        return camera is not None and camera.untimed is True
 
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
@@ -269,7 +272,7 @@ class Station:
         for name, camera in (state.cameras if state else {}).items():
             if not camera.sending:
                 continue
-            if camera.fault:  # it may repeat a picture, so that the age of what arrives says nothing
+            if camera.fault or self.untimed(name):  # it may repeat a picture: the age of what arrives says nothing
                 return None
             sampled, newest = self.samples.get(name), self._newest.get(name)
             if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
@@ -307,7 +310,8 @@ class Station:
         readings = self._readings[name]
         if received.latency_ms is not None and (not readings or readings[-1][0] != received.latency_at):
             readings.append((received.latency_at, received.latency_ms))
-        counters: StreamCounters = replace(received, latency_ms=self._latency_ms(readings, now))
+        latency_ms = None if self.untimed(name) else self._latency_ms(readings, now)
+        counters: StreamCounters = replace(received, latency_ms=latency_ms)
         return counters
 
     def _latency_ms(self, readings: Iterable[tuple[float, float]], now: float) -> float | None:

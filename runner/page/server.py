@@ -130,7 +130,7 @@ class PageServer(Listener):
 
     def show(self, camera: str, unit: AccessUnit) -> None:
         """A newly received access unit."""
-        self._in_page(self._show, self._index[camera], unit)
+        self._in_page(self._show, camera, unit)
 
     def _in_page(self, callback: Callable[..., object], *values: object) -> None:
         """Call it in the page's thread, unless the page has stopped."""
@@ -247,10 +247,11 @@ class PageServer(Listener):
         for viewer in self._viewers:
             viewer.tell(kind, message)
 
-    def _show(self, camera: int, unit: AccessUnit) -> None:
-        unit = self._recent[camera].add(unit._replace(captured=self._station.captured_here(unit.captured)))
+    def _show(self, camera: str, unit: AccessUnit) -> None:
+        index = self._index[camera]
+        unit = self._recent[index].add(unit._replace(captured=self._station.captured_here(camera, unit.captured)))
         for viewer in self._viewers:
-            viewer.show(camera, unit)
+            viewer.show(index, unit)
 
     async def _on_viewer(self, request: web.Request) -> web.WebSocketResponse:
         token = request.query.get("viewer", "")

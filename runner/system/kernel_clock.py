@@ -28,17 +28,18 @@ class _Timex(ctypes.Structure):
     )
 
 
-def ahead_of(read: Callable[[], int]) -> int:
+def ahead_of(read: Callable[[], int], own: Callable[[], int] = time.time_ns) -> int:
     """By how much the wall clock is ahead of another, ns.
 
     Another thread may run between the two readings. So the wall clock is read before and after the other, several
     times if that took long, and the closest reading counts.
 
     read  reads the other clock, ns
+    own   reads a clock that stands in for the wall clock
     """
     readings: list[tuple[int, int]] = []  # duration of the reading, ns; difference at its middle
     while len(readings) < TRIES and min(readings, default=(CLOSE_NS + 1, 0))[0] > CLOSE_NS:
-        before, there, after = time.time_ns(), read(), time.time_ns()
+        before, there, after = own(), read(), own()
         readings.append((after - before, (before + after) // 2 - there))
     return min(readings)[1]
 

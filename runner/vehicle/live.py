@@ -50,6 +50,7 @@ from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
     from runner.apply import VehicleSide
+    from runner.ros.cameras import RosCameras, SharedPicture
 
 STUCK_S = 2.0  # a loop that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
@@ -274,6 +275,28 @@ class _VehicleControl:
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
+def _check_ros(vehicle: Vehicle) -> None:
+    """raises UserError if the node of ROS 2 would find others that need not prove who they are"""
+    if any(camera.topic for camera in vehicle.cameras.values()):
+        from runner.ros.process import check_discovery
+
+        check_discovery(vehicle.ros, vehicle.insecure)
+
+
+def ros_cameras(
+    vehicle: Vehicle, push: Callable[[str, SharedPicture], bool], report: Callable[[str], None]
+) -> RosCameras | None:
+    """The node that subscribes to the topics of a vehicle's cameras; None: none has one."""
+    if not any(camera.topic for camera in vehicle.cameras.values()):
+        return None
+    from runner.ros.cameras import RosCameras
+
+    def on_report(camera: str, what: str) -> None:
+        report(f"{camera}: {what}" if camera else what)
+
+    return RosCameras(vehicle.ros, vehicle.cameras.values(), push, on_report)
+
+
 @contextmanager
 def live_vehicle(
     overrides: Sequence[str] = (),
@@ -295,6 +318,7 @@ def live_vehicle(
     config = configuration(overrides, conf, check=apply.check_plan)
     (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
     keyring = vehicle_keyring(vehicle)
+    _check_ros(vehicle)
     render_missing(vehicle, progress)
     plans = compile_plans(vehicle)
     apply.check_machine(plans)
@@ -318,7 +342,10 @@ def live_vehicle(
     loop = ControlLoop(vehicle, side, pqos, track, drive, publish, report, Access(keyring, report))
     side.on_turned = loop.wake
     live = LiveVehicle(side, loop)
+    ros = ros_cameras(vehicle, side.push_shared, report)
     try:
+        if ros:
+            ros.start()
         metrics.serve(live.problem)
         control.connect(live)
         for plan in plans:
@@ -328,6 +355,8 @@ def live_vehicle(
         yield live
     finally:
         live.stop()
+        if ros:
+            ros.close()
         metrics.close()
         control.close()
         side.stop()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -66,6 +66,8 @@ class Applier(Protocol):
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
+
+    def untimed(self) -> Collection[str]: ...
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
     def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
@@ -428,9 +430,12 @@ class ControlLoop:
         return state.t - last.t >= rest_s or _without_reasons(state) != _without_reasons(last)
 
     def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
-        decision, weights, faults = self._run.decision, self._run.state.weights, self.applier.sources()
+        decision, weights = self._run.decision, self._run.state.weights
+        faults, untimed = self.applier.sources(), self.applier.untimed()
         cameras = {
-            name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name))
+            name: CameraState.at(
+                setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name), name in untimed
+            )
             for name, setting in decision.settings.items()
         }
         fault = self._run.fault

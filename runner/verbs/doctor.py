@@ -12,6 +12,7 @@ which needs everything that both sides need. Ends with status 1 if something is 
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,12 +27,14 @@ from runner.system.ports import check_port_free
 from runner.system.usb import UsbCamera, buses
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
+IMPORT_S = 30  # rclpy is loaded within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
 STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
 NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
     "latency": ("live", "page"),
+    "ros": ("live",),
     "demo": ("live",),
     "record": ("live",),
     "model": ("model",),
@@ -88,6 +91,9 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield from _devices(vehicle)
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
+    subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
+    if verb == "ros" or (subscribes and verb in ("vehicle", "demo")):
+        yield _rclpy(vehicle.ros.python)
 
 
 def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[str]:
@@ -108,6 +114,18 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         study = document["study"]
         yield from ["vmaf"] if "vmaf" in study["metric"] else []
         yield from ["cluster"] if study["workers"] == "dask" else []
+
+
+def _rclpy(python: str) -> Diagnosis:
+    """Another Python, which must have rclpy."""
+    try:
+        command = [python, "-c", "import rclpy, sensor_msgs.msg"]
+        done = subprocess.run(command, capture_output=True, timeout=IMPORT_S, check=False)
+        why = None if done.returncode == 0 else done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+    except (OSError, subprocess.TimeoutExpired) as error:
+        why = str(error)
+    hint = f": {why}; `make ros2` makes .venv-ros2, see docs/ros.md" if why is not None else ""
+    return Diagnosis(why is None, f"rclpy for ros.python {python}{hint}")
 
 
 def _bindings() -> Iterator[Diagnosis]:

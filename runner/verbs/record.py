@@ -215,6 +215,10 @@ def _check_sources(vehicle: Vehicle) -> None:
 
     raises  UserError
     """
+    subscribed = [camera.name for camera in vehicle.cameras.values() if camera.source.subscribes]
+    if subscribed:
+        rule = "`record` does not subscribe to topics; record a bag with ROS, and choose source=bag"
+        raise UserError("command line", "source", ", ".join(subscribed), rule)
     pushed = [
         c.name for c in vehicle.cameras.values() if c.source.stand_in and not (c.source.render or c.source.plays_bags)
     ]

@@ -174,6 +174,13 @@ def _is_free(port: int) -> bool:
     return True
 
 
+def children_named(parent: int, name: str) -> list[int]:
+    """Children of a process, by a word of their command lines."""
+    files = Path(f"/proc/{parent}/task").glob("*/children")
+    found = [int(word) for file in files for word in file.read_text().split()]
+    return [pid for pid in found if name in Path(f"/proc/{pid}/cmdline").read_text()]
+
+
 def answers(port: int, host: str = "127.0.0.1") -> bool:
     """Whether a server listens on a port."""
     with socket.socket() as probe:

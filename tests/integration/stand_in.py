@@ -60,6 +60,9 @@ class RecordingVehicle:
     def sources(self) -> dict[str, str]:
         return {}
 
+    def untimed(self) -> frozenset[str]:
+        return frozenset()
+
     def stages(self) -> dict[str, tuple[float, float]]:
         return {}
 

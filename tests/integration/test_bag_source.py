@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, image, typestore, write_bag
+from numbered import HEIGHT, WIDTH, encoded, number_of, numbered
 from shared_data import shared
 
 from rig import free_port, process, run, streaming, until, watching
@@ -23,28 +24,11 @@ from runner.operator.frames import live_frames
 pytestmark = pytest.mark.gst
 
 STORE = typestore("mcap")
-BITS = 6  # of the number in a picture
-WIDTH, HEIGHT = 384, 216
 RATE = 15
 
 
 def road(count):
     return filmed(shared("video/forward_highway_day_540p25_A.mp4"), count, (96, 54))
-
-
-def numbered(number):
-    """A picture with its number as bright and dark bars, from the left."""
-    bars = [255 if number >> bit & 1 else 0 for bit in range(BITS)]
-    row = np.repeat(np.array(bars, np.uint8), WIDTH // BITS)
-    return np.broadcast_to(row[None, :, None], (HEIGHT, WIDTH, 3)).copy()
-
-
-def number_of(picture):
-    """The number in a picture; None where it shows damage, as after lost packets."""
-    height, width = picture.shape[:2]
-    seen = [int(picture[height // 2, round((bit + 0.5) * width / BITS)].mean()) for bit in range(BITS)]
-    clear = all(grey < 64 or grey > 192 for grey in seen)
-    return sum((grey > 128) << bit for bit, grey in enumerate(seen)) if clear else None
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
@@ -75,31 +59,6 @@ def shown(bag, topic, form="RGB"):
     finally:
         pipeline.set_state(Gst.State.NULL)
     return pictures, times
-
-
-def encoded(frame, encoding):
-    """A frame of BGR in another encoding, and the RGB that it stands for."""
-    import cv2
-
-    rgb = frame[..., ::-1]
-    alpha = np.full((*frame.shape[:2], 1), 255, np.uint8)
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[..., None]
-    match encoding:
-        case "mono8":
-            return grey, np.repeat(grey, 3, 2)
-        case "mono16":
-            wide = grey.astype("<u2") * 257
-            return wide.view(np.uint8), np.repeat(grey, 3, 2)
-        case "rgb8" | "rgba8":
-            return np.concatenate([rgb, alpha], 2)[..., : 3 if encoding == "rgb8" else 4], rgb
-        case "bgr8" | "bgra8":
-            return np.concatenate([frame, alpha], 2)[..., : 3 if encoding == "bgr8" else 4], rgb
-    # Grey of 4:2:2, limited range: luma of full range is 255 / 219 of what is above 16.
-    luma = np.clip(grey, 16, 235)
-    chroma = np.full_like(luma, 128)
-    pairs = [chroma, luma] if encoding in ("yuv422", "uyvy") else [luma, chroma]
-    bright = np.clip((luma.astype(float) - 16) * 255 / 219, 0, 255).round().astype(np.uint8)
-    return np.concatenate(pairs, 2), np.repeat(bright, 3, 2)
 
 
 @pytest.mark.parametrize("kind", KINDS)

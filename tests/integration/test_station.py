@@ -180,7 +180,7 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     station.take(fresh())
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies still unknown"
-    assert station.captured_here(1000.0) is None
+    assert station.captured_here("front", 1000.0) is None
     vehicle.clock_ahead_s = 3.7
     report_until(station, lambda: station.clock)
     clock = station.clock
@@ -189,7 +189,7 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     clock, sample = station.clock, listener.received[-1][1]
     for camera in sample.cameras.values():
         assert abs(camera.latency_ms - 40) <= sample.clock_bound_ms + 1
-    assert abs(station.captured_here(1003.7) - 1000) <= clock.bound_s
+    assert abs(station.captured_here("front", 1003.7) - 1000) <= clock.bound_s
     expected = f", latencies ± {1000 * station.clock.bound_s:.1f} ms"
     assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
 
@@ -216,6 +216,34 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
     cameras = {name: {**camera, "fault": "it repeats"} for name, camera in STATE["cameras"].items()}
     vehicle.publish("state", {**STATE, "t": 2.0, "cameras": cameras})
     until(lambda: reported() == 0, every_s=0.05)  # pictures come, and nobody knows how old what they show is
+
+
+def test_the_latency_of_a_source_that_knows_no_capture_times_is_unknown(both):
+    station, vehicle, listener = both
+
+    def reach(done):
+        def step():
+            vehicle.publish("telemetry", TELEMETRY)
+            now = time.monotonic()
+            newest = {name: Arrival(now, time.time() + 3.7 - 0.04, 1000) for name in STATE["cameras"]}
+            station.report_reception(Arrivals({}, newest))
+            station.take(fresh())
+            return done()
+
+        until(step, every_s=0.05)
+
+    vehicle.clock_ahead_s = 3.7
+    reach(lambda: station.clock and station.samples["rear"].latency_ms is not None)
+    reach(lambda: "latency_ms" in vehicle.reports[-1])
+    assert station.captured_here("rear", 1003.7) is not None
+    rear = {**STATE["cameras"]["rear"], "untimed": True}
+    vehicle.publish("state", {**STATE, "t": 2.0, "cameras": {**STATE["cameras"], "rear": rear}})
+    reach(lambda: station.untimed("rear") and "latency_ms" not in vehicle.reports[-1])
+    shown = listener.received[-1][1].cameras
+    assert shown["rear"].latency_ms is None
+    assert shown["front"].latency_ms is not None
+    assert station.captured_here("rear", 1003.7) is None
+    assert station.captured_here("front", 1003.7) is not None
 
 
 def test_a_clock_that_is_stated_twice_or_unasked_is_not_believed(both):

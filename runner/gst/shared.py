@@ -1,0 +1,44 @@
+"""Pictures that another process has put into shared memory: pushed into an appsrc without a copy."""
+
+from __future__ import annotations
+
+import os
+import time
+from fractions import Fraction
+
+from gi.repository import Gst, GstAllocators, GstVideo
+
+from runner.gst.bag_feed import caps
+from runner.ros.cameras import SharedPicture
+from runner.system.kernel_clock import ahead_of
+
+
+def push_shared(source: Gst.Element | None, picture: SharedPicture, fps: Fraction) -> bool:
+    """Push a picture with its capture time. Its memory is mapped as it is, and freed with the buffer.
+
+    source   an appsrc; None: it is being replaced
+    fps      stated in the caps, Hz
+    returns  False if it was not taken: the picture is older than the pipeline, or nobody is watching
+    """
+    clock = source.get_clock() if source else None
+    # Capture times are by CLOCK_MONOTONIC, which a pipeline's clock need not be.
+    pts = picture.captured - ahead_of(clock.get_time, time.monotonic_ns) - source.get_base_time() if clock else -1  # type: ignore[union-attr]
+    if pts < 0:
+        os.close(picture.memory)
+        return False
+    form = Gst.Caps.from_string(caps(*picture.type, fps))
+    sample = Gst.Sample.new(_buffer(picture, pts), form, None, None)
+    return bool(source.emit("push-sample", sample) == Gst.FlowReturn.OK)  # type: ignore[union-attr]
+
+
+def _buffer(picture: SharedPicture, pts: int) -> Gst.Buffer:
+    allocator = GstAllocators.FdAllocator.new()
+    buffer = Gst.Buffer.new()
+    flags = GstAllocators.FdMemoryFlags.NONE  # the memory closes its descriptor
+    buffer.append_memory(GstAllocators.FdAllocator.alloc(allocator, picture.memory, picture.size, flags))
+    buffer.pts = pts
+    if picture.step:
+        raw, width, height = picture.type
+        form, none = GstVideo.VideoFormat.from_string(raw), GstVideo.VideoFrameFlags.NONE
+        GstVideo.buffer_add_video_meta_full(buffer, none, form, width, height, 1, [0] * 4, [picture.step, 0, 0, 0])
+    return buffer

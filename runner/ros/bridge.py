@@ -1,0 +1,174 @@
+"""The control link of a vehicle as topics of ROS 2: state out, requests in, answers out."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from runner.core.model import Vehicle
+from runner.graph import rtsp_url
+from runner.mqtt.link import ControlLink
+from runner.mqtt.login import Login
+from runner.mqtt.messages import (
+    OPERATOR_GONE,
+    SILENT_S,
+    MqttMessage,
+    answer_s,
+    read_message,
+    read_reply,
+    read_state,
+    read_telemetry,
+    topic,
+)
+from runner.ros.process import Message, NodeProcess
+from runner.security.keyring import Keyring
+
+REQUEST, REPLY, STATE, TELEMETRY, URL = "~/request", "~/reply", "~/state", "~/telemetry", "~/url"
+EVERY_S = 0.1  # between two positions, and between two predictions
+
+
+class Bridge:
+    """One end of a vehicle's control link, and a node of ROS 2, from `start` until `close`.
+
+    keyring    whose name and role requests have; None: for a broker that does not ask, under an id of its own
+    on_report  called with one line on what is wrong, from any thread
+
+    It does not state that an operator is present: who sends requests through it does, by the event operator_connected.
+    """
+
+    def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
+        self._vehicle, self._on_report = vehicle, on_report
+        login = Login(keyring, on_report) if keyring else None
+        self.identity = login.user if login else uuid.uuid4().hex[:12]
+        self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
+        self._answer_s = answer_s(vehicle.expires_s)
+        self._pending: dict[str, float] = {}  # by id of a request of somebody, until when it may be answered
+        self._due: dict[str, float] = {}  # by event, when the next may be sent
+        self._told: set[str] = set()
+        self._requests = topic(vehicle.name, "request", self.identity)
+        listen = {
+            topic(vehicle.name, "state"): self._on_state,
+            topic(vehicle.name, "telemetry"): self._on_telemetry,
+            topic(vehicle.name, "reply", self.identity): self._on_reply,
+        }
+        will = (self._requests, OPERATOR_GONE)
+        self._link = ControlLink(vehicle.control, will, listen, lambda here: None, on_report, login)
+        inputs = {REQUEST: "text"}
+        if vehicle.ros.position:
+            inputs[vehicle.ros.position] = "fix"
+        if vehicle.ros.prediction:
+            inputs[vehicle.ros.prediction.topic] = "number"
+        self._node = NodeProcess(vehicle.ros, self._on_message, self._on_node_report, inputs=inputs)
+
+    def start(self) -> None:
+        """raises RunError if the node does not start"""
+        self._node.start()
+        for name, camera in self._vehicle.cameras.items():
+            if camera.graph.transport == "rtsp":
+                self._node.publish(f"{URL}/{ros_name(name)}", rtsp_url(self._vehicle.media, name), kept=True)
+        self._link.connect()
+
+    def close(self) -> None:
+        self._link.close((self._requests, OPERATOR_GONE))
+        self._node.close()
+
+    def time_out(self) -> None:
+        """Answer requests that the vehicle has not answered; to be called a few times a second."""
+        now = time.monotonic()
+        for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
+            if self._pending.pop(identity, None) is not None:
+                self._answer(identity, "timed out", f"the vehicle has not answered within {self._answer_s:g} s")
+
+    # --- from the vehicle, in the link's thread -----------------------------------------------------------------------
+
+    def _on_state(self, message: MqttMessage) -> None:
+        read_state(message.payload)
+        self._node.publish(STATE, message.payload.decode(), kept=True)
+
+    def _on_telemetry(self, message: MqttMessage) -> None:
+        telemetry = read_telemetry(message.payload)
+        if not message.retained:
+            self._vehicle_time = (telemetry.t, time.monotonic())
+            self._node.publish(TELEMETRY, message.payload.decode())
+
+    def _on_reply(self, message: MqttMessage) -> None:
+        reply = read_reply(message.payload)
+        if self._pending.pop(reply.id, None) is not None:
+            self._node.publish(REPLY, message.payload.decode())
+        elif reply.result != "applied":
+            self._tell(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
+
+    # --- from ROS, in the node's thread -------------------------------------------------------------------------------
+
+    def _on_message(self, message: Message, _memory: int) -> None:
+        match message["kind"]:
+            case "text":
+                self._on_request(message["text"])
+            case "fix" if message["fixed"] and math.isfinite(message["lat"]) and math.isfinite(message["lon"]):
+                self._report("position_reported", lat=message["lat"], lon=message["lon"])
+            case "number" if self._may_predict(message["nodes"]) and math.isfinite(message["number"]):
+                self._report("bitrate_predicted", kbps=message["number"])
+
+    def _may_predict(self, nodes: list[str]) -> bool:
+        """Whether only the named node publishes predictions; not, as long as names are unknown."""
+        prediction = self._vehicle.ros.prediction
+        assert prediction
+        if others := [name for name in nodes if name != prediction.node]:
+            published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
+            self._tell(f"{prediction.topic} {published}: predictions are left out")
+        return nodes == [prediction.node]
+
+    def _on_request(self, text: str) -> None:
+        try:
+            event = read_message(text.encode())
+        except ValueError as error:
+            self._answer("", "refused", str(error))
+            return
+        identity = event.pop("id", None)
+        if not isinstance(identity, str) or not identity:
+            self._answer("", "refused", "id: must be given, as text")
+        elif not self._is_online():
+            self._answer(identity, "refused", "the vehicle is offline")
+        else:
+            self._pending[identity] = time.monotonic() + self._answer_s
+            self._send(identity, event)
+
+    def _report(self, event: str, **values: Any) -> None:
+        """An event that nobody waits for an answer to."""
+        now = time.monotonic()
+        if self._is_online() and now >= self._due.get(event, now):
+            self._due[event] = now + EVERY_S
+            self._send(f"{event} {uuid.uuid4().hex[:8]}", {"event": event, **values})
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    def _is_online(self) -> bool:
+        return time.monotonic() - self._vehicle_time[1] <= SILENT_S
+
+    def _send(self, identity: str, event: Mapping[str, Any]) -> None:
+        t, came = self._vehicle_time
+        as_of = round(t + time.monotonic() - came, 6)
+        self._link.publish(self._requests, {**event, "id": identity, "as_of": as_of})
+
+    def _answer(self, identity: str, result: str, reason: str) -> None:
+        reply = {"id": identity, "t": self._vehicle_time[0], "result": result, "reason": reason}
+        self._node.publish(REPLY, json.dumps(reply))
+
+    def _on_node_report(self, name: str, what: str) -> None:
+        self._on_report(f"{name}: {what}" if name else what)
+
+    def _tell(self, what: str) -> None:
+        """Report a fault once."""
+        if what not in self._told:
+            self._told.add(what)
+            self._on_report(what)
+
+
+def ros_name(camera: str) -> str:
+    """A camera's name as part of the name of a topic, where a hyphen is not allowed, nor a digit in front."""
+    name = camera.replace("-", "_")
+    return f"_{name}" if name[0].isdigit() else name

@@ -1,0 +1,181 @@
+"""Pictures of topics of ROS 2 for cameras: what they are, whether they may be passed on, what to report about them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from runner.bag.pictures import SECOND_NS, compressed_form, image_format
+from runner.core.model import Camera, RosSettings
+from runner.ros.process import Message, NodeProcess
+
+OLD_NS = SECOND_NS  # a stamp that is older, or further in the future than FUTURE_NS, is of another clock
+FUTURE_NS = 20_000_000
+HEAD_BYTES = 65_536  # of a compressed picture, which hold its headers
+RATED_S = 5.0  # over which a rate is taken
+ENOUGH = 0.8  # of the camera's rate
+
+
+class PictureType(NamedTuple):
+    """format: as in `runner.bag.pictures.Picture`; width, height: px."""
+
+    format: str
+    width: int
+    height: int
+
+    def __str__(self) -> str:
+        return f"{self.format} {self.width}x{self.height}"
+
+
+@dataclass(frozen=True, slots=True)
+class SharedPicture:
+    """A picture in memory that another process has filled.
+
+    memory    file descriptor; whoever takes the picture closes it
+    size      bytes
+    step      bytes from one row to the next; 0: it is compressed
+    captured  ns by CLOCK_MONOTONIC
+    untimed   whether that is not known, and `captured` when the picture came
+    """
+
+    memory: int
+    size: int
+    type: PictureType
+    step: int
+    captured: int
+    untimed: bool = False
+
+    def copy(self) -> SharedPicture:
+        """Another descriptor of the same memory."""
+        return replace(self, memory=os.dup(self.memory))
+
+
+class RosCameras:
+    """The node that subscribes to the topics of cameras, from `start` until `close`.
+
+    push       called with a camera's name and its next picture, which it closes; from one thread
+    on_report  called with a camera's name, "" for all of them, and one line; from the same thread
+    """
+
+    def __init__(
+        self,
+        settings: RosSettings,
+        cameras: Iterable[Camera],
+        push: Callable[[str, SharedPicture], bool],
+        on_report: Callable[[str, str], None],
+    ) -> None:
+        self._push, self._on_report = push, on_report
+        self._streams: dict[str, list[CameraStream]] = {}  # by topic
+        for camera in cameras:
+            if camera.topic:
+                self._streams.setdefault(camera.topic, []).append(CameraStream(camera, on_report))
+        self._node = NodeProcess(settings, self._take, self._report, pictures=self._streams)
+
+    def start(self) -> None:
+        """raises RunError if the node does not start"""
+        self._node.start()
+
+    def close(self) -> None:
+        self._node.close()
+
+    def _report(self, topic: str, what: str) -> None:
+        if not topic:
+            self._on_report("", what)
+        for stream in self._streams.get(topic, ()):
+            stream.report(what)
+
+    def _take(self, message: Message, memory: int) -> None:
+        try:
+            for stream in self._streams[message["topic"]]:
+                if picture := stream.add(message, memory):
+                    self._push(stream.name, picture.copy())
+        finally:
+            os.close(memory)
+
+
+class CameraStream:
+    """What is known about the pictures of a camera's topic. Reports each change once."""
+
+    def __init__(self, camera: Camera, on_report: Callable[[str, str], None]) -> None:
+        self._camera, self._on_report = camera, on_report
+        self.name = camera.name
+        self._faults: set[str] = set()  # of pictures that are left out, until one is passed on
+        self._type: PictureType | None = None
+        self._captured = 0  # of the last picture, ns
+        self._untimed = False  # whether the last stamp was of another clock
+        self._rated = (0, 0)  # pictures since a time, in ns, at which one came
+        self._slow = False
+
+    def report(self, what: str) -> None:
+        self._on_report(self.name, f"{self._camera.topic}: {what}")
+
+    def add(self, message: Message, memory: int) -> SharedPicture | None:
+        """The picture of a message; None if it must be left out, which is reported."""
+        try:
+            kind = _picture_type(message, memory)
+        except ValueError as error:
+            self._leave_out(f"{error}: such pictures are left out")
+            return None
+        captured = self._capture_time(message)
+        self._rate(message["at"])
+        if captured <= self._captured:
+            self._leave_out("a picture is not later than the one before: such pictures are left out")
+            return None
+        self._captured = captured
+        self._faults.clear()
+        self._note_type(kind)
+        return SharedPicture(memory, message["size"], kind, message.get("step", 0), captured, self._untimed)
+
+    def _leave_out(self, why: str) -> None:
+        if why not in self._faults:
+            self._faults.add(why)
+            self.report(why)
+
+    def _note_type(self, kind: PictureType) -> None:
+        before, self._type = self._type, kind
+        if kind == before:
+            return
+        width, height = self._camera.source_size
+        small = kind.width < width or kind.height < height
+        scaled = f", scaled up to the camera's {width}x{height}" if small else ""
+        self.report(f"pictures are {kind}{scaled}" + (f"; they were {before}" if before else ""))
+
+    def _capture_time(self, message: Message) -> int:
+        """By CLOCK_MONOTONIC, ns: that of the stamp, or of arrival where the stamp is of another clock."""
+        at, age = int(message["at"]), message["age"]
+        untimed = age is None or not -FUTURE_NS <= age <= OLD_NS
+        if untimed != self._untimed:
+            self._untimed = untimed
+            self.report(_doubt(age) if untimed else "stamps are right again")
+        return at if untimed else at - max(0, age)
+
+    def _rate(self, at: int) -> None:
+        """Compare the rate with that of the camera."""
+        count, since = self._rated
+        if not since or at - since < RATED_S * SECOND_NS:
+            self._rated = (count + 1, since or at)
+            return
+        rate, fps = (count * SECOND_NS) / (at - since), float(self._camera.fps)
+        self._rated = (1, at)
+        slow = rate < ENOUGH * fps
+        if slow != self._slow:
+            self._slow = slow
+            self.report(f"{rate:.1f} pictures a second, the camera's fps is {fps:g}")
+
+
+def _picture_type(message: Message, memory: int) -> PictureType:
+    """raises ValueError with the rule that a picture breaks"""
+    if "encoding" not in message:
+        return PictureType(*compressed_form(os.pread(memory, HEAD_BYTES, 0), message["stated"]))
+    encoding, width, height = message["encoding"], message["width"], message["height"]
+    form = image_format(encoding, width, height, message["step"], message["big"], message["size"])
+    return PictureType(form, width, height)
+
+
+def _doubt(age: int | None) -> str:
+    if age is None:
+        return "pictures have no stamp: their latency is unknown"
+    of = f"{age / SECOND_NS:.2f} s old" if age > 0 else f"{-age / SECOND_NS:.2f} s in the future"
+    return f"a stamp is {of}: the latency of these pictures is unknown"

@@ -1,0 +1,187 @@
+"""The process of the node of ROS 2: started, started again when it has ended, received from."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from runner.core.model import RosQos, RosSettings
+from runner.errors import RunError, UserError
+from runner.ros import node
+from runner.system import children
+
+START_S = 30.0  # rclpy is loaded, and its node there, within a second; on a machine that boots much later
+RETRY_S = (1.0, 10.0)  # between two starts: doubled from the first value up to the second while they fail
+END_S = 2.0
+LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
+
+Message = Mapping[str, Any]
+NOTHING: Mapping[str, str] = {}
+
+
+def check_discovery(settings: RosSettings, insecure: bool) -> None:
+    """Refuse to find nodes of other machines that need not prove who they are.
+
+    raises  UserError
+    """
+    enforced = os.environ.get("ROS_SECURITY_ENABLE") == "true" and os.environ.get("ROS_SECURITY_STRATEGY") == "Enforce"
+    if settings.discovery not in LOCAL and not enforced and not insecure:
+        rule = "admits any node of the network: set up SROS 2 (ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce)"
+        raise UserError("command line", "ros.discovery", settings.discovery, f"{rule}, or give insecure=true")
+
+
+class NodeProcess:
+    """A node in a process of its own, from `start` until `close`.
+
+    on_message  called with a message of a topic; of a picture with what is known about it, and a file descriptor of its
+                memory, which is then the callee's to close
+    on_report   called with a topic and one line about it; "" stands for the node itself
+    pictures    topics with pictures, to subscribe to
+    inputs      other topics to subscribe to, with the kind of their messages: text, number, fix
+
+    Both are called from one thread.
+    """
+
+    def __init__(
+        self,
+        settings: RosSettings,
+        on_message: Callable[[Message, int], None],
+        on_report: Callable[[str, str], None],
+        *,
+        pictures: Iterable[str] = (),
+        inputs: Mapping[str, str] = NOTHING,
+    ) -> None:
+        self._settings, self._on_message, self._on_report = settings, on_message, on_report
+        asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
+        own = {key: getattr(settings, key) for key in ("node", "namespace", "use_sim_time")}
+        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, "inputs": dict(inputs)}
+        self._kept: dict[str, str] = {}  # text by topic
+        self._lock = threading.Lock()
+        self._socket: socket.socket | None = None  # while there is a process
+        self._closing, self._tried = threading.Event(), threading.Event()
+        self._is_ready, self._fatal = False, ""  # of the present process
+        self._fault = ""  # as reported
+        self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
+
+    def start(self) -> None:
+        """Start the node, and wait until it works.
+
+        raises  RunError with the remedy
+        """
+        if shutil.which(self._settings.python) is None:
+            raise RunError(f"ros.python: {self._settings.python}: no such program; `make ros2` makes .venv-ros2")
+        self._thread.start()
+        if not self._tried.wait(START_S):
+            self.close()
+            raise RunError(f"the ROS node does not start within {START_S:g} s")
+        if self._fault:
+            self.close()
+            raise RunError(f"the ROS node does not start: {self._fault}")
+
+    def publish(self, topic: str, text: str, *, kept: bool = False) -> None:
+        """Publish a text as std_msgs/String, from any thread. While there is no node, only what is kept comes later.
+
+        kept  for subscribers that come later
+        """
+        with self._lock:
+            if kept:
+                self._kept[topic] = text
+            self._send(topic, text, kept)
+
+    def _send(self, topic: str, text: str, kept: bool) -> None:
+        """Under the lock."""
+        order = json.dumps({"topic": topic, "text": text, "kept": kept}).encode()
+        if self._socket and self._is_ready and len(order) <= node.MAX_MESSAGE_BYTES:
+            with suppress(OSError):  # the node is behind, or has just ended
+                self._socket.send(order, socket.MSG_DONTWAIT)
+
+    def close(self) -> None:
+        self._closing.set()
+        with self._lock:
+            if self._socket:
+                self._socket.shutdown(socket.SHUT_RDWR)
+        if self._thread.is_alive():
+            self._thread.join(2 * END_S)
+
+    def _run(self) -> None:
+        """In a thread that lives as long as the processes that it starts: see `children.bound`."""
+        failed = 0
+        while not self._closing.is_set():
+            why = self._run_once()
+            if self._closing.is_set():
+                return
+            failed = 0 if self._is_ready else failed + 1
+            self._fail(why)
+            if not self._tried.is_set():
+                self._tried.set()
+                return
+            first, longest = RETRY_S
+            self._closing.wait(min(first * 2**failed, longest))
+
+    def _fail(self, why: str) -> None:
+        if why != self._fault:
+            self._fault = why
+            if self._tried.is_set():
+                self._on_report("", f"the ROS node ended: {why}; starting it again")
+
+    def _run_once(self) -> str:
+        """Start a process and serve it until it ends; returns why it did."""
+        self._is_ready, self._fatal = False, ""
+        own, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with own, its:
+            own.send(json.dumps(self._task).encode())
+            process = subprocess.Popen(
+                children.bound([self._settings.python, "-P", str(Path(node.__file__)), str(its.fileno())]),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,  # what rclpy prints is in its own log, too
+                env={**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": self._settings.discovery.upper()},
+                pass_fds=[its.fileno()],
+                start_new_session=True,
+            )
+            its.close()
+            with self._lock:
+                self._socket = None if self._closing.is_set() else own
+            if self._socket:
+                self._receive(own)
+            with self._lock:
+                self._socket = None
+        children.end(process, END_S)
+        return self._fatal or children.ending(process.wait())
+
+    def _receive(self, own: socket.socket) -> None:
+        """Until the process ends, or this one closes the connection."""
+        while True:
+            with suppress(ConnectionResetError):
+                data, memory, _, _ = socket.recv_fds(own, node.MAX_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC)
+                if data:
+                    self._take(json.loads(data), memory)
+                    continue
+            return
+
+    def _take(self, message: Message, memory: list[int]) -> None:
+        match message["kind"]:
+            case "report":
+                self._on_report(message["topic"], message["text"])
+            case "fatal":
+                self._fatal = message["text"]
+            case "ready":
+                with self._lock:
+                    self._is_ready = True
+                    for topic, text in self._kept.items():
+                        self._send(topic, text, True)
+                if self._fault:
+                    self._fault = ""
+                    self._on_report("", "the ROS node works again")
+                self._tried.set()
+            case _:
+                self._on_message(message, memory[0] if memory else -1)

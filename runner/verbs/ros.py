@@ -1,0 +1,49 @@
+"""usage: tod-runner ros [OVERRIDE ...] [duration_s=N]
+
+The vehicle's control link as topics of ROS 2, by a node of ROS 2 in a process of its own. It may run on either side.
+Needs an MQTT broker at control.host, and rclpy for ros.python: `make ros2`. Ends with Ctrl-C or after duration_s.
+
+All texts are std_msgs/String. Out: ~/state and ~/telemetry as the vehicle publishes them (schemas/control.schema.json),
+and the RTSP address of each camera in ~/url/CAMERA, kept for late subscribers such as rtsp_image_transport. In:
+~/request, an event of schemas/event.schema.json with `id`; each is answered in ~/reply as applied, refused, expired or
+timed out.
+With ros.position, a topic of sensor_msgs/NavSatFix tells the vehicle where it is; with ros.prediction, a topic of
+std_msgs/Float64 predicts the bitrate, kbit/s, if the named node alone publishes it. docs/ros.md says more.
+
+  tod-runner ros vehicle=delivery_robot
+  tod-runner ros ros.position=/gps/fix 'ros.prediction={topic: /pqos/kbps, node: /pqos}'
+"""
+
+from __future__ import annotations
+
+import time
+
+from runner.configuration.config import configuration
+from runner.system import signals
+from runner.system.signals import stopping
+from runner.verbs import Arguments
+from runner.verbs.screen import say
+
+LOOK_S = 0.1
+
+
+def run(arguments: Arguments) -> int:
+    signals.hold()
+    from runner.ros.bridge import Bridge
+    from runner.ros.process import check_discovery
+    from runner.security.exposure import keyring_of
+
+    duration = arguments.number("duration_s")
+    vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
+    check_discovery(vehicle.ros, vehicle.insecure)
+    bridge = Bridge(vehicle, keyring_of(vehicle), say)
+    try:
+        bridge.start()
+        say(f"requests have the id {bridge.identity}")
+        began = time.monotonic()
+        with stopping() as stop:
+            while not stop.wait(LOOK_S) and (duration is None or time.monotonic() - began < duration):
+                bridge.time_out()
+    finally:
+        bridge.close()
+    return stop.status

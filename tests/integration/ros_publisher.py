@@ -1,0 +1,116 @@
+"""usage: python ros_publisher.py WIDTH HEIGHT BITS
+
+Run by a Python that has rclpy. Each line on standard input is a JSON object for one topic; a later one for the same
+topic changes it. Without further keys the topic has numbered pictures, as `numbered.numbered`, with right stamps.
+
+    topic      its name
+    fps        pictures a second; 0: none any more, and no publisher
+    encoding   bgr8
+    half       true: pictures of half the size
+    late_s     by how much stamps are behind the clock; null: no stamps
+    reliability, durability   of the publisher
+    file, width, height, step, big   publish the bytes of this file instead, as sensor_msgs/Image
+    format     publish the bytes of the file as sensor_msgs/CompressedImage
+
+Each picture with a number is told on standard output as JSON: topic, number, stamp in ns. Ends with its input.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, Image
+
+WIDTH, HEIGHT, BITS = map(int, sys.argv[1:])
+
+
+class Camera:
+    def __init__(self, node: rclpy.node.Node, **wishes: object) -> None:
+        self.node, self.number = node, -1
+        self.wishes = {"encoding": "bgr8", "late_s": 0.0, "reliability": "reliable", "durability": "volatile"} | wishes
+        kind = CompressedImage if "format" in wishes else Image
+        qos = QoSProfile(
+            depth=1,
+            reliability=ReliabilityPolicy[self.wishes["reliability"].upper()],
+            durability=DurabilityPolicy[self.wishes["durability"].upper()],
+        )
+        self.publisher = node.create_publisher(kind, wishes["topic"], qos)
+        self.timer = node.create_timer(1 / wishes["fps"], self.publish)
+
+    def publish(self) -> None:
+        wishes, message = self.wishes, self.publisher.msg_type()
+        stamp = 0
+        if wishes["late_s"] is not None:
+            stamp = self.node.get_clock().now().nanoseconds - round(1e9 * wishes["late_s"])
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        if "file" in wishes:
+            self.fill(message)
+        else:
+            self.draw(message)
+        with suppress(RuntimeError):  # a reliable subscriber that the machine has not run for 0.1 s
+            self.publisher.publish(message)
+            if self.number >= 0:
+                print(json.dumps([wishes["topic"], self.number, stamp]), flush=True)
+
+    def fill(self, message: Image | CompressedImage) -> None:
+        wishes = self.wishes
+        message.data = Path(wishes["file"]).read_bytes()
+        if "format" in wishes:
+            message.format = wishes["format"]
+            return
+        message.encoding, message.is_bigendian = wishes["encoding"], int(wishes.get("big", False))
+        message.width, message.height, message.step = wishes["width"], wishes["height"], wishes["step"]
+
+    def draw(self, message: Image) -> None:
+        self.number = (self.number + 1) % 2**BITS
+        bars = [255 if self.number >> bit & 1 else 0 for bit in range(BITS)]
+        part = 2 if self.wishes.get("half") else 1
+        width, height = WIDTH // part, HEIGHT // part
+        row = np.repeat(np.repeat(np.array(bars, np.uint8), width // BITS), 3)
+        message.encoding, message.width, message.height = self.wishes["encoding"], width, height
+        message.step, message.data = 3 * width, np.tile(row, height).tobytes()
+
+    def end(self) -> None:
+        self.node.destroy_timer(self.timer)
+        self.node.destroy_publisher(self.publisher)
+
+
+def main() -> None:
+    rclpy.init()
+    node = rclpy.create_node("cameras")
+    cameras: dict[str, Camera] = {}
+    orders: list[dict] = []
+    ended = threading.Event()
+
+    def read() -> None:
+        for line in sys.stdin:
+            orders.append(json.loads(line))
+        ended.set()
+
+    def obey() -> None:
+        while orders:
+            wishes = orders.pop(0)
+            before = cameras.pop(wishes["topic"], None)
+            if before:
+                before.end()
+            if wishes["fps"]:
+                cameras[wishes["topic"]] = Camera(node, **wishes)
+
+    node.create_timer(0.02, obey)
+    threading.Thread(target=read, daemon=True).start()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not ended.is_set():
+        executor.spin_once(timeout_sec=0.5)
+    rclpy.try_shutdown()
+
+
+main()

@@ -1,0 +1,155 @@
+"""What is made of the pictures of a topic of ROS 2, without ROS: what is passed on, and what is reported."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import pytest
+
+from runner.bag.pictures import SECOND_NS
+from runner.configuration.config import configuration
+from runner.core.model import RosSettings
+from runner.errors import ConfigError, UserError
+from runner.ros.cameras import CameraStream
+from runner.ros.process import check_discovery
+
+WORDS = ["vehicle=delivery_robot", "source=ros", "fps_max=10"]
+TOPICS = [f"cameras.{name}.topic=/{name}" for name in ("front", "rear", "mast")]
+RAW = {"encoding": "bgr8", "width": 1920, "height": 1080, "step": 5760, "big": False, "size": 5760 * 1080}
+
+
+class Topic:
+    """A camera's topic that gets pictures at times in s."""
+
+    def __init__(self):
+        camera = configuration([*WORDS, *TOPICS]).vehicle().cameras["front"]
+        self.told = []
+        self._stream = CameraStream(camera, lambda name, what: self.told.append(f"{name}: {what}"))
+        self._memory = os.memfd_create("picture")
+
+    def get(self, at, age=0.0, **form):
+        """The capture time of a picture, s; None if it is left out."""
+        age_ns = None if age is None else round(age * SECOND_NS)
+        message = {"at": round(at * SECOND_NS), "age": age_ns, **(form or RAW)}
+        picture = self._stream.add(message, self._memory)
+        return picture and picture.captured / SECOND_NS
+
+    def take_told(self):
+        told, self.told[:] = [line.removeprefix("front: /front: ") for line in self.told], []
+        return told
+
+
+def test_capture_times_are_those_of_stamps_unless_a_clock_is_wrong():
+    topic = Topic()
+    assert topic.get(10, 0.25) == 9.75
+    topic.take_told()
+    assert topic.get(10.1, 1.0) is None  # earlier than the one before
+    assert topic.take_told() == ["a picture is not later than the one before: such pictures are left out"]
+    assert topic.get(11, -0.02) == 11  # never from the future
+    assert topic.take_told() == []
+    for at, age in ((11.1, 1.01), (11.2, -0.021), (11.3, None)):
+        assert topic.get(at, age) == at
+    assert topic.take_told() == ["a stamp is 1.01 s old: the latency of these pictures is unknown"]
+    assert topic.get(11.5, 0.1) == 11.4
+    assert topic.take_told() == ["stamps are right again"]
+    topic.get(11.6, None)
+    assert topic.take_told() == ["pictures have no stamp: their latency is unknown"]
+    topic.get(11.7)
+    topic.get(11.8, -3600)
+    assert topic.take_told()[1:] == ["a stamp is 3600.00 s in the future: the latency of these pictures is unknown"]
+
+
+def test_each_size_and_format_is_told_once():
+    topic = Topic()
+    topic.get(1), topic.get(1.1)
+    assert topic.take_told() == ["pictures are BGR 1920x1080"]
+    small = {**RAW, "encoding": "mono8", "width": 100, "height": 50, "step": 100}
+    topic.get(1.2, **small), topic.get(1.3, **small)
+    assert topic.take_told() == [
+        "pictures are GRAY8 100x50, scaled up to the camera's 1280x960; they were BGR 1920x1080"
+    ]
+
+
+@pytest.mark.parametrize(
+    "wrong, rule",
+    [
+        ({"encoding": "32FC1"}, "encoding '32FC1' is not supported; expected one of mono8, "),
+        ({"step": 100}, "a picture of 1920x1080 with rows of 100 bytes, must be at least 5760"),
+        ({"size": 100}, "a picture of 100 bytes, must have 6220800: 1080 rows of 5760"),
+        ({"height": 0}, "a picture of 1920x0 with rows of 5760 bytes, must be at least 5760"),
+    ],
+)
+def test_pictures_that_cannot_be_shown_are_left_out(wrong, rule):
+    topic = Topic()
+    topic.get(1)
+    topic.take_told()
+    assert [topic.get(at, **{**RAW, **wrong}) for at in (2, 3)] == [None, None]
+    assert topic.get(4) == 4
+    assert topic.get(5, **{**RAW, **wrong}) is None
+    first, again = topic.take_told()
+    assert first == again
+    assert first.startswith(rule)
+    assert first.endswith(": such pictures are left out")
+
+
+def test_compressed_pictures_are_what_their_bytes_say():
+    topic = Topic()
+    os.write(topic._memory, b"GIF89a")
+    assert topic.get(1, size=6, stated="jpeg") is None
+    assert topic.take_told() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are left out"]
+    os.pwrite(topic._memory, b"\x89PNG\r\n\x1a\n" + bytes(8) + (1280).to_bytes(4) + (960).to_bytes(4), 0)
+    assert topic.get(2, size=24, stated="jpeg") == 2
+    assert topic.take_told() == ["pictures are png 1280x960"]
+
+
+def test_a_rate_below_the_cameras_is_told_once():
+    topic = Topic()
+    for number in range(200):
+        topic.get(1 + number / 10)
+    assert topic.take_told() == ["pictures are BGR 1920x1080"]
+    for number in range(100):
+        topic.get(30 + number / 5)
+    for number in range(200):
+        topic.get(60 + number / 10)
+    slow, again = topic.take_told()
+    assert slow.endswith(" pictures a second, the camera's fps is 10")
+    assert again == "10.0 pictures a second, the camera's fps is 10"
+
+
+def test_a_camera_needs_a_topic():
+    with pytest.raises(ConfigError, match="topic: null: must be given, here or for each mounted camera as topic"):
+        configuration([*WORDS, *TOPICS[:2]]).vehicle()
+
+
+def test_the_name_of_a_topic_is_checked():
+    with pytest.raises(ConfigError, match=r"cameras\.front\.topic: '/front camera': must be the name of a topic: "):
+        configuration([*WORDS, *TOPICS[1:], "cameras.front.topic='/front camera'"]).vehicle()
+
+
+def test_the_first_element_must_take_pictures():
+    with pytest.raises(ConfigError, match="must be appsrc: the pictures of a topic are pushed into the first element"):
+        configuration([*WORDS, *TOPICS, "source.elements.0.element=videotestsrc"]).vehicle()
+
+
+def test_nodes_of_other_machines_need_keys(monkeypatch):
+    monkeypatch.delenv("ROS_SECURITY_ENABLE", raising=False)
+    monkeypatch.delenv("ROS_SECURITY_STRATEGY", raising=False)
+    settings = RosSettings()
+    check_discovery(settings, insecure=False)
+    open_to_all = replace(settings, discovery="subnet")
+    check_discovery(open_to_all, insecure=True)
+    with pytest.raises(UserError, match=r"ros.discovery: subnet: admits any node of the network: set up SROS 2"):
+        check_discovery(open_to_all, insecure=False)
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    with pytest.raises(UserError):
+        check_discovery(open_to_all, insecure=False)
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+    check_discovery(open_to_all, insecure=False)
+
+
+def test_doctor_names_what_makes_the_environment(tod):
+    done = tod("doctor", "ros", "ros.python=no/python")
+    assert done.status == 1
+    why = "[Errno 2] No such file or directory: 'no/python'; `make ros2` makes .venv-ros2, see docs/ros.md"
+    assert f"MISSING rclpy for ros.python no/python: {why}" in done.out.splitlines()
