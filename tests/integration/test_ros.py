@@ -164,45 +164,34 @@ def test_pixels_of_each_encoding(tmp_path):
     """With rows of any length; and JPEG and PNG."""
     import cv2
 
-    from runner.ros.cameras import RosCameras
-
     wanted = {}
     with publishing() as publisher:
         for number, encoding in enumerate(FORMATS):
             wishes, rgb = published(tmp_path, encoding, padding=number % 4 * 3)
             wanted[encoding] = rgb
-            publisher.publish(f"/{encoding}", fps=5, **wishes)
+            publisher.publish(f"/{encoding}/image", fps=5, **wishes)
         wishes, wanted["big"] = published(tmp_path, "mono16", 0, big=True)
-        publisher.publish("/big", fps=5, **wishes)
+        publisher.publish("/big/image", fps=5, **wishes)
         for kind in ("png", "jpg"):
             (tmp_path / kind).write_bytes(cv2.imencode(f".{kind}", road())[1].tobytes())
             wanted[kind] = road()[..., ::-1]
-            publisher.publish(f"/{kind}", fps=5, file=str(tmp_path / kind), format=kind)
-        pictures, reported = {}, []
+            publisher.publish(f"/{kind}/image", fps=5, file=str(tmp_path / kind), format=kind)
+        pictures = {}
 
         def push(name, picture):
             if name in pictures:
                 os.close(picture.memory)
             pictures.setdefault(name, picture)
 
-        from runner.configuration.config import configuration
-
-        one = configuration(robot(), runnable=False).vehicle().cameras["front"]
-        cameras = [replace(one, name=name, mount={"topic": f"/{name}"}) for name in wanted]
-        settings = RosSettings(python=str(PYTHON))
-        subscriber = RosCameras(settings, cameras, push, lambda name, what: reported.append(f"{name}: {what}"))
-        subscriber.start()
-        try:
+        with camera_feed(wanted, push) as reported:
             until(lambda: len(pictures) == len(wanted))
-        finally:
-            subscriber.close()
     for name, rgb in wanted.items():
         found = shown(pictures[name])
         if name == "jpg":
             assert np.abs(found.astype(int) - rgb).mean() < 3
         else:
             assert np.abs(found.astype(int) - rgb).max() <= (4 if "u" in name else 2), name
-    assert "rgb8: /rgb8: pictures are RGB 96x54, scaled up to the camera's 384x216" in reported
+    assert "rgb8: /rgb8/image: pictures are RGB 96x54, scaled up to the camera's 384x216" in reported
     assert all("scaled up" in line for line in reported)
 
 
@@ -311,6 +300,34 @@ def test_incompatible_qos_and_a_topic_of_another_type():
         until(lambda: told(reported, f"front: /rosout: {kind}sensor_msgs/msg/CompressedImage"))
         until(lambda: told(reported, "rear: /never: no publisher for 5 s"))
         assert len(reported) == 2
+
+
+def test_names_are_those_of_the_node_and_ages_are_by_its_clock():
+    """A clock of a simulation that nobody publishes stands at 0."""
+    words = ("ros.namespace=/front", "cameras.front.topic=image", "ros.remap={/seen: /rear/image}")
+    simulated = ("cameras.rear.topic=/seen", "ros.use_sim_time=true")
+    with publishing(front={}, rear={}), subscribing(*words, *simulated) as (_, _, reported):
+        for name in ("front: image", "rear: /seen"):
+            until(lambda line=f"{name}: pictures are BGR 384x216": line in reported)
+            (line,) = told(reported, f"{name}: a stamp is ")
+            assert line.endswith(" s in the future: the latency of these pictures is unknown")
+
+
+@contextmanager
+def camera_feed(names, push):
+    """The topics /NAME/image of some cameras, without a vehicle. Yields what was reported."""
+    from runner.configuration.config import configuration
+    from runner.ros.cameras import RosCameras
+
+    one, reported = configuration(robot(), runnable=False).vehicle().cameras["front"], []
+    cameras = [replace(one, name=name, mount={"topic": f"/{name}/image"}) for name in names]
+    settings = RosSettings(python=str(PYTHON))
+    subscriber = RosCameras(settings, cameras, push, lambda name, what: reported.append(f"{name}: {what}"))
+    subscriber.start()
+    try:
+        yield reported
+    finally:
+        subscriber.close()
 
 
 # --- what keeps a vehicle from starting -------------------------------------------------------------------------------
