@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -76,6 +77,10 @@ class RecordingVehicle:
         self.controller = operator
 
     def push(self, camera: str, frame: Any) -> bool:
+        return camera in self.watched
+
+    def push_shared(self, camera: str, picture: Any) -> bool:
+        os.close(picture.memory)
         return camera in self.watched
 
     def stop(self) -> None:
