@@ -585,6 +585,7 @@ def test_keys_of_the_drive_view(page):
     until(lambda: page.evaluate("document.fullscreenElement === null"))
 
 
+@pytest.mark.soak  # 13 s; the arithmetic is that of tests/js/framing.test.js
 def test_regions_dragged_in_mirrored_and_cropped_pictures_are_where_they_are_in_the_image(page):
     choose(page, "single")
     viewing(page, "drive")
