@@ -12,25 +12,27 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from statistics import median
 from typing import IO, Any, NamedTuple
 
 from table import Row, show
+from usage import memory_mb, processor_s
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import Operator, answers, free_port, until
 from runner.apply import check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
-from runner.core.model import Endpoint, Vehicle
+from runner.core.model import Endpoint, Vehicle, exact
+from runner.core.scaling import output_size
 from runner.graph import assignments, launch, turn_elements
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
@@ -118,7 +120,7 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
 
         def resize(name: str, scaling: float) -> None:
             camera = vehicle.cameras[name]
-            size = (_even(camera.width * scaling), _even(camera.height * scaling))
+            size = output_size(camera.full_roi, exact(scaling))
             for element, key, value in assignments(camera, "size", size):
                 _write(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
 
@@ -134,7 +136,7 @@ def _own(words: Sequence[str], seconds: float) -> Cost:
         with _running(["-m", "runner", "vehicle", *words]) as side:
             operator = Operator(broker)
             operator.state(lambda state: state["online"])
-            asked = iter(range(10**9))
+            asked = count()
 
             def resize(name: str, scaling: float) -> None:
                 reply = operator.ask(f"{next(asked)}", event="camera_configured", camera=name, scaling=scaling)
@@ -156,11 +158,11 @@ def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: 
         until(lambda: {frame.stream for frame in list(frames)} == set(range(len(names))), WAIT_S, every_s=0.005)
         first = {frame.stream: frame.t for frame in reversed(list(frames))}
         time.sleep(SETTLE_S)
-        used, at = _cpu_s(pid), time.time()
+        used, at = processor_s(pid), time.time()
         time.sleep(seconds)
-        took, cores = time.time() - at, (_cpu_s(pid) - used) / (time.time() - at)
+        took, cores = time.time() - at, (processor_s(pid) - used) / (time.time() - at)
         seen = [frame for frame in list(frames) if at <= frame.t < at + took]
-        memory = _memory_mb(pid)
+        memory = memory_mb(pid)
         reaction = _reaction(names, frames, resize)
     due = sum(float(camera.fps) for camera in vehicle.cameras.values()) * took
     ages = [frame.age_ms for frame in seen if frame.age_ms is not None]
@@ -214,21 +216,6 @@ def _running(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[
 def _write(pipe: IO[str], what: Any) -> None:
     pipe.write(json.dumps(what) + "\n")
     pipe.flush()
-
-
-def _even(px: float) -> int:
-    return 2 * round(px / 2)
-
-
-def _cpu_s(pid: int) -> float:
-    """Processor time that a process has used so far, s (proc(5))."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _memory_mb(pid: int) -> float:
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-    return float(status["VmRSS"].split()[0]) / 1024
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import shutil
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser, sync_playwright
 from table import Row, show, spread
+from usage import processor_s
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import CHROMIUM_FLAGS, answers, free_port, process, until
@@ -100,10 +100,10 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
         time.sleep(SETTLE_S)
         page.goto(url)
         time.sleep(SETTLE_S)
-        before, began, used = page.evaluate("tod.measure()")["cameras"], time.time(), _cpu_s(operator)
+        before, began, used = page.evaluate("tod.measure()")["cameras"], time.time(), processor_s(operator)
         time.sleep(seconds)
         after, took = page.evaluate("tod.measure()")["cameras"], time.time() - began
-        cores = (_cpu_s(operator) - used) / took
+        cores = (processor_s(operator) - used) / took
         stages = page.evaluate("tod.stages()").values()
     # The first frames of a stream carry no capture time.
     frames = [[f for f in camera if f[-1] > began * 1000 and math.isfinite(f[0])] for camera in stages]
@@ -143,12 +143,6 @@ def _station(words: Sequence[str]) -> Iterator[tuple[str, int]]:
     ):
         until(lambda: answers(page), seconds=20)
         yield f"http://127.0.0.1:{page}/", operator.pid
-
-
-def _cpu_s(process: int) -> float:
-    """Processor time that a process has used so far, s (proc(5))."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

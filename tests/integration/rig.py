@@ -157,11 +157,12 @@ def free_port(count: int = 1) -> int:
 
     "Before" is as far as this process knows; others start elsewhere.
     """
-    ports: list[int] = []
-    while len(ports) < count:
+    row: list[int] = []
+    while len(row) < count:
         port = next(_PORTS)
-        ports = [*ports, port] if _is_free(port) and port - len(ports) == (ports or [port])[0] else []
-    return ports[0]
+        follows = bool(row) and port == row[-1] + 1
+        row = [*(row if follows else []), port] if _is_free(port) else []
+    return row[0]
 
 
 def _is_free(port: int) -> bool:

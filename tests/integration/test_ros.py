@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import re
 import signal
 import subprocess
@@ -19,29 +18,17 @@ import numpy as np
 import pytest
 from bags import filmed
 from numbered import BITS, HEIGHT, WIDTH, encoded, number_of
+from ros_domain import MARKS, PYTHON, domain  # noqa: F401
 from shared_data import shared
 
-from rig import CHECKOUT, children_named, free_port, run, streaming, until, watching
+from rig import children_named, free_port, run, streaming, until, watching
 from runner.bag.pictures import FORMATS
 from runner.core.commands import Command
 from runner.core.model import RosSettings
 from runner.operator.frames import live_frames
 
-PYTHON = CHECKOUT / ".venv-ros2/bin/python"
-pytestmark = [
-    pytest.mark.gst,
-    pytest.mark.ros,
-    pytest.mark.soak,
-    pytest.mark.skipif(not PYTHON.is_file(), reason="needs ROS 2 in .venv-ros2: make ros2"),
-]
+pytestmark = MARKS
 RATE = 15
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    """Nodes of other tests, and of the machine, are in other domains."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.SystemRandom().randrange(1, 100)))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 class Publisher:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import subprocess
 import threading
@@ -12,29 +11,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from ros_domain import MARKS, PYTHON, domain  # noqa: F401
 
 from keyed import VEHICLE, WATCHER, issue
-from rig import CHECKOUT, SMALL_ROBOT, Operator, children_named, free_port, process, until, watching
+from rig import SMALL_ROBOT, Operator, children_named, free_port, process, until, watching
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
-PYTHON = CHECKOUT / ".venv-ros2/bin/python"
-pytestmark = [
-    pytest.mark.gst,
-    pytest.mark.ros,
-    pytest.mark.soak,
-    pytest.mark.skipif(not PYTHON.is_file(), reason="needs ROS 2 in .venv-ros2: make ros2"),
-]
+pytestmark = MARKS
 NODE = "/tod_runner"
 HEARD = [f"{NODE}/{name}" for name in ("state", "telemetry", "reply", "url/front", "url/rear")]
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.SystemRandom().randrange(1, 100)))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 class Client:
