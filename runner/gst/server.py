@@ -15,7 +15,7 @@ from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
-from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
+from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 
 from runner.core.model import Media
 from runner.errors import RunError
@@ -55,6 +55,8 @@ OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
 )
+
+FAILS = "handle-message::error"  # of a media
 
 # From 1.24 on a factory returns its media locked. The same change of the library added this method.
 CONSTRUCTS_LOCKED = hasattr(GstRtspServer.RTSPMedia, "can_be_shared")
@@ -96,6 +98,7 @@ class _Camera:
         self.url = GstRtsp.RTSPUrl.parse(url)[1]
         self.media: GstRtspServer.RTSPMedia | None = None
         self.stage = _Stage.NONE
+        self.prepared = False  # the library has seen it deliver
         self.bus: Gst.Bus | None = None
         self.opening: _Opening | None = None
 
@@ -208,23 +211,28 @@ class CameraServer:
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
         with self._changed:
-            camera.media, camera.bus, camera.stage = media, bus, _Stage.BUILT
+            camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
             self.pipelines[camera.name] = built
-        media.connect("prepared", self._on_stage, camera, _Stage.OPEN)
+        media.connect(FAILS, _on_failing, camera)
+        media.connect("prepared", self._on_prepared, camera)
         media.connect("target-state", self._on_target_state, camera)
         # After the factory's own handler, which forgets the media: only then is another one built.
         media.connect_after("unprepared", self._on_unprepared, camera, built)
         self._on_report(camera.name, "pipeline built")
 
-    def _on_stage(self, media: GstRtspServer.RTSPMedia, camera: _Camera, stage: _Stage) -> None:
+    def _on_prepared(self, media: GstRtspServer.RTSPMedia, camera: _Camera) -> None:
         with self._changed:
             if camera.media is media:
-                camera.stage = stage
+                camera.prepared = True
+                if camera.stage is _Stage.BUILT:  # it has not failed in the meantime
+                    camera.stage = _Stage.OPEN
                 self._changed.notify_all()
 
     def _on_target_state(self, media: GstRtspServer.RTSPMedia, state: int, camera: _Camera) -> None:
-        if state == Gst.State.NULL:
-            self._on_stage(media, camera, _Stage.ENDING)
+        with self._changed:
+            if camera.media is media and state == Gst.State.NULL:
+                camera.stage = _Stage.ENDING
+                self._changed.notify_all()
 
     def _on_unprepared(self, media: GstRtspServer.RTSPMedia, camera: _Camera, pipeline: CameraPipeline) -> None:
         with self._changed:
@@ -243,7 +251,7 @@ class CameraServer:
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
-        # The library admits no new client to a failed pipeline, and ends it when its last viewer has left.
+        # The library ends the pipeline when its last viewer has left; until then no other is admitted.
         for connection in self._watching(camera.name):
             connection.close()
 
@@ -296,7 +304,8 @@ class CameraServer:
                 media.unlock()
             opening.failed = media is None or not media.prepare(thread)
             if media is not None and not opening.failed:
-                opening.held.wait(HELD_S)
+                if camera.is_open:
+                    opening.held.wait(HELD_S)
                 media.unprepare()
         finally:
             with self._changed:
@@ -372,7 +381,7 @@ class CameraServer:
         camera = next((c for c in self._cameras.values() if c.media is context.media), None)
         with self._changed:
             newcomer = self._connections.get(client)
-            if camera is None or newcomer is None:
+            if camera is None or newcomer is None or not camera.is_open:
                 return UNAVAILABLE
             newcomer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
             if camera.name in newcomer.cameras:
@@ -533,6 +542,17 @@ class CameraServer:
     def _is_silent(self, camera: str) -> bool:
         pipeline = self.pipelines.get(camera)
         return pipeline is not None and (pipeline.paused or bool(pipeline.source_fault))
+
+
+def _on_failing(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camera: _Camera) -> bool:
+    """Let the library see only errors of a pipeline that is being opened, which then fails.
+
+    Of a later one it (1.22) would not remove the viewers' transports, and leave the stream's elements behind; and it
+    would end a second time what has ended meanwhile.
+    """
+    if camera.media is not media or camera.prepared:
+        GObject.signal_stop_emission_by_name(media, FAILS)
+    return True
 
 
 def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
