@@ -2,7 +2,7 @@
 # make test   install what is missing, then everything that CI runs
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
-# make soak   long repeats of what a drive must survive, an hour and a half; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
+# make soak   long repeats of what a drive must survive, an hour; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot  two drives over a recorded uplink: the picture of the README
 # make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
@@ -27,7 +27,7 @@ test: $(TEST_READY) $(NODE_READY)
 
 timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
-	$(BIN)/pytest tests/integration -m "alone and not soak" -n 3 --dist loadfile --durations=10
+	$(BIN)/pytest tests/integration -m "alone and not soak" -n 3 --dist worksteal --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
@@ -67,7 +67,6 @@ deadspot: $(TEST_READY)
 	$(BIN)/python bench/deadspot.py $(UPLINK) docs/images/deadspot.png
 
 soak: $(TEST_READY) $(NODE_READY)
-	$(if $(PARTS),,$(BIN)/pytest -m soak)
 	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)
 
 setup: $(READY)

@@ -1,7 +1,7 @@
 """Everything here needs GStreamer, and most of it depends on real time.
 
 `pytest -m "not gst"` leaves out the tests that need GStreamer. `make test` runs those marked `timed`, a few files at a
-time, then those marked `alone`, whose limits are tight, three files at a time. Everything else runs on the processor
+time, then those marked `alone`, whose limits are tight, three at a time. Everything else runs on the processor
 time that these leave over.
 """
 
@@ -17,8 +17,8 @@ from runner.mqtt.broker import private_broker
 
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
-
-LONGEST = ("test_docs", "test_page", "test_live", "test_ends", "test_page_sides", "test_control")  # started first
+# Started first, so that no worker is left with a long file at the end.
+LONGEST = ("test_docs", "test_page", "test_live", "test_secure", "test_server", "test_control", "test_ip_camera")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
