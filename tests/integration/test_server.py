@@ -463,3 +463,20 @@ def test_a_server_that_stops_amid_requests_leaves_no_thread_that_reads_on(capfd)
             assert not client.is_alive()
         time.sleep(0.1)
         assert "CRITICAL" not in capfd.readouterr().err[:1000]
+
+
+def test_a_pipeline_that_fails_with_viewers_ends_whole_and_is_built_anew(capfd):
+    """The library complains on standard error about whatever it leaves behind, or ends twice."""
+    sender = (
+        "graph.sender=[{name: sent, element: identity, properties: {error-after: 6}},"
+        " {name: pay0, element: rtph264pay, properties: {pt: 96, config-interval: -1}}]"
+    )
+    with serving(*SMALL, sender, cameras=(SMALL_CAMERA,)) as vehicle:
+        for number in range(1, 4):
+            with RtspClient(vehicle.url(SMALL_CAMERA)) as one, RtspClient(vehicle.url(SMALL_CAMERA)) as other:
+                assert one.open() == [200, 200, 200]
+                other.open(udp=True)  # it may come too late
+                until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
+            assert vehicle.pipelines(SMALL_CAMERA) == number
+        assert any("Failed after iterations" in report for report in vehicle.reported)
+    assert "CRITICAL" not in capfd.readouterr().err
