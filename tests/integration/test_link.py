@@ -249,11 +249,11 @@ def test_queued_packets_do_not_block_their_sender():
         "out.setblocking(False)\n"
         "print(sum(out.sendto(bytes(1200), (sys.argv[1], 9)) for _ in range(300)))\n"
     )
-    slow = Limit(lambda t: 1000, queue_ms=8000, delay_ms=0)
+    slow = Limit(lambda t: 100, queue_ms=60_000, delay_ms=0)  # it takes 29 s to send them
     with limited_link("netns", slow, *_ends(), print) as link:
         command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-        waits = link._shaper.limit(Rates(1000, None))
+        waits = link._shaper.limit(Rates(100, None))
     assert done.stdout.strip() == str(300 * 1200)
     assert waits.dropped == 0
     assert waits.queue_ms > 1000
