@@ -30,6 +30,7 @@ class RtspConnection:
 
     viewer       its address and its operator
     cameras      what it watches, with the library's transport once it is set up
+    described    camera that was last described to it: the library keeps that one open for it
     interleaved  whether this connection also carries video
     last_request monotonic time of its last complete request, s; that of its start before the first
     """
@@ -43,6 +44,7 @@ class RtspConnection:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
+        self.described = ""
         self.interleaved = False
         self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = 0

@@ -251,8 +251,9 @@ class CameraServer:
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
-        # The library ends the pipeline when its last viewer has left; until then no other is admitted.
-        for connection in self._watching(camera.name):
+            concerned = [c for c in self._connections.values() if camera.name in (c.described, *c.cameras)]
+        # The library ends the pipeline when the last of them has left; until then no other is admitted.
+        for connection in concerned:
             connection.close()
 
     def _hold(self, client: GstRtspServer.RTSPClient, camera: _Camera) -> bool:
@@ -359,7 +360,12 @@ class CameraServer:
         if _has_query(context):
             self._redirect(client, context)
             return MOVED
-        return OK if self._hold(client, camera) else UNAVAILABLE
+        if not self._hold(client, camera):
+            return UNAVAILABLE
+        connection = self._connection(client)
+        if connection:
+            connection.described = camera.name
+        return OK
 
     def _redirect(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         """Answer with the correct URL: with a query the library would find the camera here, but not in PLAY."""

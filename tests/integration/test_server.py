@@ -471,9 +471,11 @@ def test_a_pipeline_that_fails_with_viewers_ends_whole_and_is_built_anew(capfd):
         "graph.sender=[{name: sent, element: identity, properties: {error-after: 6}},"
         " {name: pay0, element: rtph264pay, properties: {pt: 96, config-interval: -1}}]"
     )
-    with serving(*SMALL, sender, cameras=(SMALL_CAMERA,)) as vehicle:
+    with serving(*SMALL, sender, "media.session_timeout_s=60", cameras=(SMALL_CAMERA,)) as vehicle:
         for number in range(1, 4):
-            with RtspClient(vehicle.url(SMALL_CAMERA)) as one, RtspClient(vehicle.url(SMALL_CAMERA)) as other:
+            one, other, idle = (RtspClient(vehicle.url(SMALL_CAMERA)) for _ in range(3))
+            with one, other, idle:
+                assert idle.ask("DESCRIBE") == 200
                 assert one.open() == [200, 200, 200]
                 other.open(udp=True)  # it may come too late
                 until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
