@@ -95,7 +95,7 @@ def test_other_operators_do_not_stop_the_video_of_one_who_is_present(broker, veh
     first.operator.state(paused)
 
 
-@pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
+@pytest.mark.parametrize("stall_s", [2.2, 4.0])
 def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_s, tmp_path):
     """The broker may or may not have closed its connection meanwhile."""
     waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path)
