@@ -53,6 +53,41 @@ def test_the_command_line_changes_a_part(conf: UserConf) -> None:
     assert graph(conf, "graph.encoder.0.properties.quantizer=20").vehicle[4].properties["quantizer"] == 20
 
 
+@pytest.mark.parametrize(
+    "words, properties",
+    [
+        ((), "tune=zerolatency speed-preset=superfast intra-refresh"),
+        (("graph.effort=high",), "tune=zerolatency speed-preset=veryfast intra-refresh"),
+        (
+            ("graph=h264_srt", "graph.effort=low"),
+            "speed-preset=ultrafast option-string=cabac=1:8x8dct=1:deblock=0,0 intra-refresh",
+        ),
+        (
+            ("graph.effort=low", "graph.efforts.low.preset=faster"),
+            "speed-preset=faster option-string",
+        ),
+    ],
+)
+def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str, ...], properties: str) -> None:
+    out = tod("print", "source=test", "vehicle=delivery_robot", *words).out
+    assert out.count(properties) == out.count("x264enc") > 0
+
+
+@pytest.mark.parametrize(
+    "words, problem",
+    [
+        (("graph.effort=most",), "'most': must be one of low, medium, high"),
+        (
+            ("graph.effort=high", "~graph.efforts.high"),
+            "high: must be low or medium, which the encoder of this graph has",
+        ),
+        (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which the encoder of this graph has"),
+    ],
+)
+def test_an_effort_that_the_encoder_has_not_is_refused(tod: Command, words: tuple[str, ...], problem: str) -> None:
+    assert tod("print", "source=test", *words).problems == [f"command line: graph.effort: {problem}"]
+
+
 def test_a_whole_list_replaces_the_list_with_its_parts(conf: UserConf) -> None:
     text = f"defaults: [openh264_rtsp, _self_]\nvehicle: {WHOLE}"
     conf.write("graph/mine.yaml", text + "{name: encoder, element: x264enc}, {name: pay0, element: rtph264pay}]\n")

@@ -58,7 +58,11 @@ BAG_KEYS = ("bag", "topic")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
-GRAPH_STRUCTURE = ("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable")
+GRAPH_STRUCTURE = (
+    *("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
+    *("effort", "efforts"),
+)
+ONLY_EFFORT = "medium"  # of graphs without `efforts`
 
 T = TypeVar("T")
 
@@ -412,6 +416,18 @@ def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
     return tuple(Element(e["name"], e["element"], e.get("properties") or {}) for e in data or ())
 
 
+def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
+    """What a graph's `effort` means: values by key, None for an element's own default."""
+    efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts", {})
+    elements = str(data["vehicle"])
+    is_used = any(f"{{{key}}}" in elements for values in efforts.values() for key in values)
+    known = list(efforts) if is_used else [ONLY_EFFORT]
+    effort = data.get("effort", ONLY_EFFORT)
+    if effort not in known:
+        raise ModelError("effort", effort, f"must be {' or '.join(known)}, which the encoder of this graph has")
+    return dict(efforts.get(effort, {}))
+
+
 def _graph(data: Mapping[str, Any]) -> Graph:
     for key, side in GRAPH_PARTS.items():
         if key in data:
@@ -425,7 +441,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         wire_vehicle=_elements(wire.get("vehicle")),
         wire_operator=_elements(wire.get("operator")),
         knobs={knob: tuple(KnobTarget(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
-        settings=settings,
+        settings=settings | _effort(data),
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **_given(data, ("verified", "key_frame")),
     )
