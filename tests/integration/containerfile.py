@@ -7,8 +7,8 @@ Each command runs in its own mount and PID namespace, so that nothing stays moun
 
 What the network of this machine requires is not part of the files, and is passed in from outside:
 
-    TOD_IMAGE_BINDS   paths, separated by colons, that commands of RUN see read-only: certificates, pip's configuration
-    PIP_..., ..._proxy, SSL_CERT_FILE   passed on to RUN
+    PIP_..., ..._proxy, SSL_CERT_FILE   passed on to RUN, which sees the files that they name read-only
+    TOD_IMAGE_BINDS   further paths, separated by colons, that it sees: pip's configuration
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pathlib import Path
 
 BASES = {"docker.io/library/debian:12-slim": "bookworm"}  # suite of Debian by image
 PASSED = re.compile(r"PIP_.*|SSL_CERT_FILE|(http|https|no)_proxy", re.IGNORECASE)
+OUTSIDE = "/mnt"
 DEVICES = ("full", "null", "random", "urandom", "zero")
 COMMAND_S = 900.0  # installing takes a minute or two
 
@@ -229,10 +230,15 @@ def _copy(instruction: Instruction, image: Image, context: Path, stages: Mapping
 
 def _run(instruction: Instruction, image: Image) -> None:
     passed = {key: value for key, value in os.environ.items() if PASSED.fullmatch(key)}
-    binds = [Path("/etc/resolv.conf"), *map(Path, filter(None, os.environ.get("TOD_IMAGE_BINDS", "").split(":")))]
-    environment = {"DEBIAN_FRONTEND": "noninteractive", **passed, **image.env}
+    # Files that they name, at a place where no package has its own.
+    named = {key: value for key, value in passed.items() if value.startswith("/") and Path(value).exists()}
+    given = filter(None, os.environ.get("TOD_IMAGE_BINDS", "").split(":"))
+    binds = [Bind(Path(path), path) for path in ("/etc/resolv.conf", *given)]
+    binds += [Bind(Path(path), OUTSIDE + path) for path in dict.fromkeys(named.values())]
+    moved = {key: OUTSIDE + path for key, path in named.items()}
+    environment = {"DEBIAN_FRONTEND": "noninteractive", **passed, **moved, **image.env}
     words = ["env", "-i", *(f"{key}={value}" for key, value in environment.items()), "sh", "-c", instruction.rest]
-    command = entering(image.root, words, [Bind(path, str(path)) for path in binds], read_only=False)
+    command = entering(image.root, words, binds, read_only=False)
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_S)
     if done.returncode:
         raise instruction.refused(f"status {done.returncode}\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
