@@ -8,6 +8,7 @@ from contextlib import suppress
 from importlib import import_module
 
 from runner.errors import MissingBindings
+from runner.gst.memory import map_pictures
 
 # GStreamer loads libunwind, whose functions replace those of libgcc in all libraries loaded later: the next C++
 # exception, in Matplotlib or OpenCV, then ends the process. The library loaded first is found first.
@@ -51,6 +52,7 @@ from gi.repository import GLib, Gst  # noqa: E402
 
 __all__ = ["TYPELIBS", "GLib", "Gst", "load_types"]
 
+map_pictures()
 Gst.init(None)
 
 

@@ -1,13 +1,14 @@
-"""State changes that may never return, kept off the thread that serves all cameras, and memory that they free."""
+"""State changes that may never return, kept off the thread that serves all cameras."""
 
 from __future__ import annotations
 
-import ctypes
 import threading
 import time
 from collections.abc import Callable
 
 from gi.repository import Gst
+
+from runner.gst.memory import give_back
 
 HUNG_S = 5.0  # a state change that takes longer counts as hung
 HUNG = f"did not stop within {HUNG_S:g} s, and was abandoned"
@@ -48,18 +49,6 @@ def set_state_aside(
         worker.start()
         _workers.add(worker)
     return worker
-
-
-def give_back() -> None:
-    """Return freed memory to the system; takes a few ms, see malloc_trim(3).
-
-    The GNU C library keeps up to eight arenas for each core, and a pipeline's threads free pictures in whichever they
-    were given. Pipelines built anew, and encoders of new sizes, would leave some MB behind. Other C libraries have no
-    such function.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim:
-        trim(0)
 
 
 def settle(limit_s: float) -> None:

@@ -20,8 +20,8 @@ from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
-from runner.gst.aside import give_back
 from runner.gst.connections import RtspConnection
+from runner.gst.memory import give_back
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
