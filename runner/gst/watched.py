@@ -42,7 +42,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
-        self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, self._on_event)
+        self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
         self._lock = threading.Lock()  # of the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
         self._timer = 0
@@ -83,11 +83,12 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
                 return
         Gst.Bin.do_handle_message(self, message)
 
-    def _on_event(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        if info.get_event().type == Gst.EventType.EOS and self._frames():
-            self._failed = "the stream ended"
-            return Gst.PadProbeReturn.DROP
-        return Gst.PadProbeReturn.OK
+    def has_ended(self) -> bool:
+        """The source sends no more. Returns whether that stays inside this bin."""
+        if not self._frames():
+            return False
+        self._failed = "the stream ended"
+        return True
 
     # --- in GLib's thread ---------------------------------------------------------------------------------------------
 
@@ -177,6 +178,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if not here:
             pad.remove_probe(probe)
         return bool(here)
+
+
+def _on_event(pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    """Not a method: the pad would keep the bin alive that it is part of, for good."""
+    if info.get_event().type == Gst.EventType.EOS and pad.get_parent_element().get_parent().has_ended():
+        return Gst.PadProbeReturn.DROP
+    return Gst.PadProbeReturn.OK
 
 
 def _remember(_pad: Gst.Pad, _info: Gst.PadProbeInfo, here: list[bool]) -> Gst.PadProbeReturn:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import subprocess
 import threading
@@ -482,3 +483,19 @@ def test_a_pipeline_that_fails_with_viewers_ends_whole_and_is_built_anew(capfd):
             assert vehicle.pipelines(SMALL_CAMERA) == number
         assert any("Failed after iterations" in report for report in vehicle.reported)
     assert "CRITICAL" not in capfd.readouterr().err
+
+
+def test_an_ended_pipeline_leaves_no_watched_source():
+    """A probe that refers to its own element through Python keeps it for good."""
+    with serving(*SMALL, "source.frozen_s=1", cameras=(SMALL_CAMERA,)) as vehicle:
+        for number in range(1, 4):
+            with RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
+                assert viewer.open() == [200, 200, 200]
+                assert _watched_sources() == 1
+            until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
+            until(lambda: _watched_sources() == 0)
+
+
+def _watched_sources():
+    gc.collect()
+    return sum(type(each).__name__ == "WatchedSource" for each in gc.get_objects())

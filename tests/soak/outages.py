@@ -265,7 +265,7 @@ class _Drive:
     def _is_current(state: Any, telemetry: Any) -> bool:
         second = int(telemetry["t"])
         predicted = {PREDICTED[at % len(PREDICTED)] for at in (second - 1, second)}
-        cameras = state["cameras"].values()
+        cameras = state.get("cameras", {}).values()  # none while it is offline
         return (
             state["online"]
             and telemetry["predicted_kbps"] in predicted
