@@ -8,7 +8,7 @@ from contextlib import suppress
 from importlib import import_module
 
 from runner.errors import MissingBindings
-from runner.gst.memory import map_pictures
+from runner.gst.memory import limit_heaps
 
 # GStreamer loads libunwind, whose functions replace those of libgcc in all libraries loaded later: the next C++
 # exception, in Matplotlib or OpenCV, then ends the process. The library loaded first is found first.
@@ -52,7 +52,7 @@ from gi.repository import GLib, Gst  # noqa: E402
 
 __all__ = ["TYPELIBS", "GLib", "Gst", "load_types"]
 
-map_pictures()
+limit_heaps()
 Gst.init(None)
 
 

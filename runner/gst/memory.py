@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import ctypes
+import os
 
 PICTURE_BYTES = 256 * 1024  # blocks of this size and more are mapped one by one, and unmapped when they are freed
-_M_MMAP_THRESHOLD = -3  # malloc.h
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # malloc.h
 
 
-def map_pictures() -> None:
-    """Keep pictures out of the heaps of threads, which shrink only from their ends, see mallopt(3).
+def limit_heaps() -> None:
+    """Keep pictures out of the heaps, and have no more of these than processors, see mallopt(3).
 
-    By default the library raises the threshold to the largest block ever freed, up to 32 MB; what lies above a freed
-    picture in its heap then keeps it there. Pools and encoders allocate their pictures once, so this costs no time
-    while streaming.
+    Heaps shrink only from their ends, or page by page. By default the library has eight for each processor, all of
+    which the threads of pipelines use, and raises the size from which it maps blocks to the largest ever freed, up to
+    32 MB.
+    Pools and encoders allocate their pictures once, so this costs no time while streaming.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt:
         mallopt(_M_MMAP_THRESHOLD, PICTURE_BYTES)
+        mallopt(_M_ARENA_MAX, max(2, os.cpu_count() or 1))
 
 
 def give_back() -> None:
-    """Return freed memory to the system; takes a few ms, see malloc_trim(3).
-
-    The library keeps up to eight heaps for each core; the threads of a pipeline free memory in whichever they got it.
-    """
+    """Return freed memory to the system; takes a few ms, see malloc_trim(3)."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim:
         trim(0)

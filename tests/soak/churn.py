@@ -30,7 +30,7 @@ RESIZES, RECONNECTS, REBUILDS = 10_000, 1000, 1000
 # Operations before these: caches, arenas and pools fill up, and viewers that left without a word are dropped.
 WARM = {"resizes": 2000, "reconnects": 150, "rebuilds": 100}
 EVERY_S = 0.5
-BLOCKS = 20  # samples are averaged in so many blocks: those that follow each other are not independent
+BLOCKS = 20  # of samples: those that follow each other are not independent
 CONFIDENT = 2.1  # standard errors: 95 % for the line through so many means
 PER = 1000  # operations
 WAIT_S = 60.0
@@ -135,10 +135,13 @@ def _measured(system: System, what: str, most: int, operations: Iterator[int]) -
 
 
 def slope(samples: Sequence[tuple[int, float]]) -> Slope:
-    """The line through the means of successive samples (operations, value), and its 95 % confidence interval."""
+    """The line through the least of each of successive blocks of samples (operations, value), with its 95 % interval.
+
+    What comes and goes, such as viewers that left without a word, lies above it.
+    """
     assert len(samples) >= 4, f"{len(samples)} samples are too few: more operations"
     blocks = np.array_split(np.array(samples, float), min(BLOCKS, len(samples)))
-    done, value = np.array([block.mean(axis=0) for block in blocks]).T
+    done, value = np.array([(block[:, 0].mean(), block[:, 1].min()) for block in blocks]).T
     (rate, _), covariance = np.polyfit(done, value, 1, cov=True)
     return Slope(PER * float(rate), PER * CONFIDENT * float(np.sqrt(covariance[0, 0])))
 
