@@ -186,6 +186,18 @@ class SpeedAdvice:
 
 
 @dataclass(frozen=True, slots=True)
+class SteeringAngle:
+    """The steering angle, as soon as it is reported: a picture shows where the wheels led when it was captured.
+
+    at   when it was reported, s since 1970 by the vehicle's clock, as capture times are
+    rad  as in `runner.core.events.SteeringReported`
+    """
+
+    at: float
+    rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """Outcome of a request: applied, refused, expired or timed out, and why."""
 

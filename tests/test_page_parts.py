@@ -106,15 +106,31 @@ def test_no_viewer_is_waited_for_once_the_page_has_stopped():
     assert waiting == []
 
 
-def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_is_framed():
+def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that():
     async def hello(port):
         own = f"http://localhost:{port}"
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{own}/live?viewer=me", origin=own) as ws:
             return await ws.receive_json(timeout=5)
 
-    with served("+cameras.front_left.framing=fit") as port:
-        cameras = {camera["name"]: camera for camera in asyncio.run(hello(port))["cameras"]}
-    assert cameras["front_left"]["pose"] == {"yaw_deg": 55, "pitch_deg": 5}
+    native = "{width_px: 1920, height_px: 1080, left_px: 0, top_px: 30}"
+    words = (
+        "+cameras.front_left.framing=fit",
+        "+cameras.rear_center.calibrated=true",
+        f"+cameras.front_left.native={native}",
+    )
+    with served(*words) as port:
+        told = asyncio.run(hello(port))
+    cameras = {camera["name"]: camera for camera in told["cameras"]}
+    pose = {"x_m": 1.9, "y_m": 0.5, "z_m": 1.5, "yaw_deg": 55, "pitch_deg": 5, "roll_deg": 0}
+    native = {"width": 1920, "height": 1080, "left": 0, "top": 30}
+    optics = {"pose": pose, "fov_deg": 90, "lens": "pinhole", "native": native, "calibrated": False}
+    assert {key: cameras["front_left"][key] for key in optics} == optics
+    native = {"width": 1280, "height": 800, "left": 0, "top": 0}
+    optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
+    assert {key: cameras["top_left"][key] for key in optics} == optics
+    assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
+    dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}
+    assert told["dimensions"] == dimensions
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
 
 

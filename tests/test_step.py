@@ -188,6 +188,7 @@ def test_the_vehicles_own_weights_hold_until_others_are_set() -> None:
         ("link_measured", {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}),
         ("link_measured", {"queue_ms": 300, "state": "stalled"}),
         ("position_reported", {"lat": 48.2, "lon": 11.6, "speed_mps": 8, "heading_deg": 90}),
+        ("steering_reported", {"rad": 0.4}),
         ("bitrate_predicted", {"kbps": 3000, "lower_kbps": 1, "valid_s": 0}),
     ],
 )

@@ -19,6 +19,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
     Capture,
+    Dimensions,
     Element,
     Endpoint,
     Graph,
@@ -104,7 +105,7 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros")
+        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "dimensions")
         if not all(map(self.fine, sections)):
             return None
         media = self.part(("media",), _media)
@@ -117,6 +118,8 @@ class Builder:
         self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
+        known = document.get("dimensions") is not None
+        dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         listening = {"page.port": page.port} if page.serve else {}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
@@ -146,6 +149,7 @@ class Builder:
             insecure=document.get("insecure", False),
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=_ros(document.get("ros", {})),
+            dimensions=dimensions,
         )
 
     def finished(self, built: T | None) -> T:
@@ -241,7 +245,7 @@ class Builder:
         fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens", "shed", "framing"))
+        options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated"))
         options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,

@@ -51,6 +51,13 @@ class PositionReported(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringReported(Event):
+    """Angle of the front wheels (bicycle model), rad, positive to the left."""
+
+    rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TotalSet(Event):
     """The operator's total for mode collective."""
 
@@ -136,6 +143,7 @@ EVENTS: dict[str, type[Event]] = {
     "mode_selected": ModeSelected,
     "bitrate_predicted": BitratePredicted,
     "position_reported": PositionReported,
+    "steering_reported": SteeringReported,
     "total_set": TotalSet,
     "camera_switched": CameraSwitched,
     "roi_set": RoiSet,

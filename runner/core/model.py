@@ -310,6 +310,29 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
+class Dimensions:
+    """The vehicle seen from above, m: what the page draws on the ground.
+
+    wheelbase_m      between the axles
+    track_m          between the middles of the wheels of an axle
+    width_m          at its widest
+    front_m, rear_m  from the rear axle to the front and to the rear end
+    """
+
+    wheelbase_m: float
+    track_m: float
+    width_m: float
+    front_m: float
+    rear_m: float
+
+    def __post_init__(self) -> None:
+        if self.front_m < self.wheelbase_m:
+            raise ModelError("front_m", f"{self.front_m:g}", f"must reach the front axle, {self.wheelbase_m:g} m ahead")
+        if self.track_m > self.width_m:
+            raise ModelError("track_m", f"{self.track_m:g}", f"must be at most width_m, {self.width_m:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class Place:
     """Tile on the operator's page, counted from the top left."""
 
@@ -332,6 +355,7 @@ class Camera:
     capture         what its device is to deliver
     credentials     file with user name and password of its address; None: it asks for none
     framing         fit: the page's Drive view shows the whole picture; fill: it fills its box; None: by its place
+    calibrated      whether pose, fov_deg and lens were measured, not estimated
     """
 
     name: str
@@ -354,6 +378,7 @@ class Camera:
     fov_deg: float = 90.0
     lens: str = "pinhole"
     framing: str | None = None
+    calibrated: bool = False
     full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:
@@ -514,6 +539,7 @@ class Vehicle:
     insecure   whether that is intended where video or control leave this machine
     metrics    where both sides serve figures for Prometheus
     ros        the node of ROS 2, for cameras whose source subscribes to topics
+    dimensions None: unknown
     """
 
     name: str
@@ -532,6 +558,7 @@ class Vehicle:
     insecure: bool = False
     metrics: MetricsPorts = MetricsPorts()
     ros: RosSettings = RosSettings()
+    dimensions: Dimensions | None = None
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

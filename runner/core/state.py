@@ -35,6 +35,7 @@ class State:
     collective_total  kbit/s, total of mode collective
     link              the newest measurement of the uplink; None: no operator measures it
     position          the newest one
+    steering          the newest one
     copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
     operator_since    t at which the operator's side connected; None: it is not connected
     operator_lost     t at which the operator's side disconnected
@@ -53,6 +54,7 @@ class State:
     operator_lost: float | None = None
     link: ev.LinkMeasured | None = None
     position: ev.PositionReported | None = None
+    steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
 
     @staticmethod
@@ -125,6 +127,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return gone if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
+        case ev.SteeringReported():
+            return {"steering": event}
         case ev.ClockAdvanced():
             return {}
         case _:

@@ -9,6 +9,7 @@ CAUSES = {
     "bitrate_predicted": "Prediction {kbps} kbit/s",
     "mode_selected": "Mode {mode}",
     "position_reported": "New position",
+    "steering_reported": "New steering angle",
     "total_set": "Total set to {kbps} kbit/s",
     "camera_switched": "{camera} switched",
     "roi_set": "ROI of {camera} set",

@@ -24,6 +24,7 @@ from runner.mqtt.messages import (
     read_reply,
     read_settings,
     read_state,
+    read_steering,
     read_telemetry,
     topic,
 )
@@ -67,6 +68,9 @@ class Listener:
 
     def on_sample(self, sample: Sample) -> None:
         """The reception of all cameras, a few times a second."""
+
+    def on_steering(self, at: float, rad: float) -> None:
+        """The steering angle that was reported to the vehicle at a time by this machine's clock."""
 
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
@@ -134,6 +138,7 @@ class Station:
             topic(vehicle.name, "reply", self.identity): self._on_reply,
             topic(vehicle.name, "clock", self.identity): self._on_clock,
             topic(vehicle.name, "telemetry"): self._on_telemetry,
+            topic(vehicle.name, "steering"): self._on_steering,
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         self._requests = topic(vehicle.name, "request", self.identity)
@@ -192,11 +197,15 @@ class Station:
 
     def captured_here(self, name: str, captured: float | None) -> float | None:
         """A camera's capture time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
+        return None if captured is None or self.untimed(name) else self._here(captured)
+
+    def _here(self, at: float) -> float | None:
+        """A past time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
-        if captured is None or clock is None or self._was_set() or self.untimed(name):
+        if clock is None or self._was_set():
             return None
-        here = captured - clock.ahead_s
-        return here if here <= time.time() + clock.bound_s else None  # a picture of the future: a clock has been set
+        here = at - clock.ahead_s
+        return here if here <= time.time() + clock.bound_s else None  # of the future: a clock has been set
 
     def untimed(self, name: str) -> bool:
         """Whether the vehicle does not know when a camera's pictures are captured."""
@@ -404,6 +413,13 @@ class Station:
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         self._vehicle_online()
+
+    def _on_steering(self, message: MqttMessage) -> None:
+        steering = read_steering(message.payload)
+        at = None if message.retained else self._here(steering.at)
+        if at is not None:
+            for listener in self.listeners:
+                listener.on_steering(at, steering.rad)
 
     def _on_clock(self, message: MqttMessage) -> None:
         returned, now, answer = time.time(), time.monotonic(), read_clock(message.payload)

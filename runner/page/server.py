@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,9 @@ class PageServer(Listener):
 
     def on_sample(self, sample: Sample) -> None:
         self._in_page(self._add_sample, sample)
+
+    def on_steering(self, at: float, rad: float) -> None:
+        self._in_page(self._tell, "steering", {"at_ms": 1000 * at, "rad": rad})
 
     def on_note(self, note: Note) -> None:
         self._in_page(self._add_note, {"time": note.t, "text": note.text})
@@ -406,7 +410,11 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "height": camera.height,
             "fps": float(camera.fps),
             "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
-            "pose": {"yaw_deg": camera.pose.yaw_deg, "pitch_deg": camera.pose.pitch_deg} if camera.pose else None,
+            "pose": camera.pose and asdict(camera.pose),
+            "fov_deg": camera.fov_deg,
+            "lens": camera.lens,
+            "native": _native(camera),
+            "calibrated": camera.calibrated,
             "framing": camera.framing,
             "codec": video_codec(camera.graph) or None,
             "weight": plain(camera.weight),
@@ -416,7 +424,16 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
         }
         for camera in vehicle.cameras.values()
     ]
-    return {"vehicle": vehicle.name, "cameras": cameras, "late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
+    dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
+    limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
+    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, **limits}
+
+
+def _native(camera: Camera) -> dict[str, int]:
+    """The source's image, and where the full image begins in it, px."""
+    width, height = camera.source_size
+    left, top = (camera.crop.x, camera.crop.y) if camera.crop else (0, 0)
+    return {"width": width, "height": height, "left": left, "top": top}
 
 
 def _tls(keyring: Keyring) -> ssl.SSLContext:

@@ -3,7 +3,9 @@
 import { inControl, listen, mode, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
+import { isGuided, nextChoice } from "./guides.js";
 import { toggleControl } from "./header.js";
+import { showGuides } from "./link.js";
 import { SHAPES } from "./tiles.js";
 import { whyLess } from "./total.js";
 import { by, latency, mark, spoken, whole, write } from "./format.js";
@@ -13,6 +15,7 @@ const ALARMS = ["lost", "frozen", "unsupported", "damaged", "late"]; // the wors
 const WORDS = { unsupported: "NO PICTURE" };
 const STANDING = ["lost", "frozen", "unsupported"];
 const KMH = 3.6; // of 1 m/s
+const GUIDES = "tod-guides";
 
 const attention = new Attention();
 let focused = document.hasFocus();
@@ -76,6 +79,28 @@ function refreshControl() {
   button.disabled = !store.connected;
 }
 
+// --- lines on the ground ----------------------------------------------------------------------------------------------
+
+/** @returns {import("./guides.js").Choice} */
+const chosen = () => /** @type {any} */ (localStorage.getItem(GUIDES)) ?? "calibrated";
+const placedCameras = () => (store.hello?.dimensions ? store.hello.cameras.filter(({ pose }) => pose) : []);
+
+export function toggleGuides() {
+  localStorage.setItem(GUIDES, nextChoice(placedCameras(), chosen()));
+  refreshGuides();
+}
+
+function refreshGuides() {
+  const cameras = placedCameras();
+  const guided = store.view === "drive" ? cameras.filter((camera) => isGuided(camera, chosen())).map(({ name }) => name) : [];
+  for (const canvas of document.querySelectorAll("canvas.guides")) canvas.toggleAttribute("hidden", !guided.includes(canvas.getAttribute("data-guides") ?? ""));
+  showGuides(guided);
+  by("guides").hidden = !cameras.length;
+  const some = chosen() === "calibrated" && guided.length < cameras.length;
+  write(by("guides"), guided.length ? `Guides on${some ? ` (${guided.length})` : ""}` : "Guides off");
+  mark(by("guides"), "aria-pressed", guided.length > 0);
+}
+
 // --- the driver looks elsewhere ---------------------------------------------------------------------------------------
 
 function look() {
@@ -88,6 +113,7 @@ function look() {
 
 export function startDrive() {
   by("drive-control").addEventListener("click", toggleControl);
+  by("guides").addEventListener("click", toggleGuides);
   by("drive-help").addEventListener("click", () => publish("help"));
   addEventListener("blur", () => {
     focused = false;
@@ -100,5 +126,6 @@ export function startDrive() {
   document.addEventListener("visibilitychange", look);
   listen("hello state sample ages status control socket requests view", refresh);
   listen("control socket view", look);
+  listen("hello view", refreshGuides);
   refresh();
 }

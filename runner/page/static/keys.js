@@ -6,6 +6,7 @@ import { focusTile, switchCamera } from "./tiles.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
 import { rolesOf } from "./arrange.js";
+import { toggleGuides } from "./drive.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleView } from "./views.js";
 import { by, make } from "./format.js";
@@ -21,6 +22,7 @@ const LIST = [
   ["Esc", "back from the enlarged picture"],
   ["v", "Drive or Configure view"],
   ["d", "Drive view: open or close the drawer"],
+  ["g", "Drive view: lines on the ground of calibrated cameras, of all, or none"],
   ["b", "Drive view: tones for lost, frozen and late pictures, or none"],
   ["Shift+F", "full screen"],
   ["drag on a picture", "choose the ROI (mode S)"],
@@ -43,6 +45,7 @@ const plain = {
   v: toggleView,
   d: toggleDrawer,
   b: toggleSound,
+  g: () => store.view === "drive" && toggleGuides(),
   F: toggleFullScreen,
   "?": () => publish("help"),
   m() {

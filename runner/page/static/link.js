@@ -73,6 +73,16 @@ export function giveCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
+/** Give the worker the canvas of a camera's guides. */
+export function giveGuides(name, element) {
+  if (!canShowVideo) return;
+  const canvas = element.transferControlToOffscreen();
+  worker.postMessage({ order: "guides", name, canvas }, [canvas]);
+}
+
+/** @param {string[]} names of the cameras whose guides are shown */
+export const showGuides = (names) => worker.postMessage({ order: "guided", names });
+
 /** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
 export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>
   worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view });

@@ -41,6 +41,7 @@ globalThis.tod = {
   stages: () => ask("stages"),
   picture: (name) => ask("picture", name),
   first: (name) => ask("first", name),
+  guides: (name) => ask("guides", name),
   request: (event) =>
     new Promise((resolve) => {
       const id = crypto.randomUUID();

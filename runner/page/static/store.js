@@ -12,13 +12,17 @@ const listeners = new Map();
  * @property {number} height px
  * @property {number} fps
  * @property {{row: number, column: number}|null} place on the page
- * @property {{yaw_deg: number, pitch_deg: number}|null} pose to the left, and down
+ * @property {import("./projection.js").Pose|null} pose
+ * @property {number} fov_deg
+ * @property {"pinhole"|"fisheye"} lens
+ * @property {{width: number, height: number, left: number, top: number}} native
+ * @property {boolean} calibrated whether these were measured
  * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: by its place
  * @property {string|null} codec
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], answer_s: number, late_ms: number}} Hello answer_s: by then the station has
+ * @typedef {{vehicle: string, cameras: Camera[], dimensions: import("./guides.js").Dimensions|null, answer_s: number, late_ms: number}} Hello answer_s: by then the station has
  *   answered a request; late_ms: an older picture is late
  * @typedef {object} Applied what was read back from the elements
  * @property {boolean} [sending]
