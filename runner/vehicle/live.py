@@ -350,7 +350,7 @@ def live_vehicle(
     control = _VehicleControl(vehicle, document, report, keyring)
     metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port)
 
-    def publish(record: VehicleState | Telemetry | SpeedAdvice) -> bool:
+    def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
         metrics.take(record)
         return control.publish(record)
 
