@@ -31,7 +31,10 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.8, "event": "link_measured", "queue_ms": 0, "state": "stalled"},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
     {"t": 0.8, "event": "control_passed", "operator": "me"},
+    {"t": 0.8, "event": "attention_changed", "attention": "hidden"},
+    {"t": 0.8, "event": "attention_changed"},
     {"t": 0.9, "event": "operator_connected"},
+    {"t": 0.9, "event": "operator_connected", "attention": "watching"},
     {"t": 0.9, "event": "operator_disconnected"},
     {"t": 0.9, "event": "clock_advanced"},
 ]

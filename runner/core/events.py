@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from enum import StrEnum
 from fractions import Fraction
 from typing import Any
 
@@ -124,9 +125,28 @@ class ControlPassed(Event):
     operator: str
 
 
+class Attention(StrEnum):
+    """Whether the person who drives can see the pictures, by the page in control."""
+
+    WATCHING = "watching"
+    UNFOCUSED = "unfocused"  # seen, but keys do not reach the page
+    SLOW = "slow"  # fewer than 10 pictures a second are drawn
+    HIDDEN = "hidden"
+    ABSENT = "absent"  # the page is closed, or does not answer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttentionChanged(Event):
+    """The operator in control states another attention; None: none, as without a page."""
+
+    attention: Attention | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(Event):
-    pass
+    """attention  what the operator's page states with its sign of life; the vehicle makes `AttentionChanged` of it"""
+
+    attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,11 +172,17 @@ EVENTS: dict[str, type[Event]] = {
     "link_measured": LinkMeasured,
     "copies_counted": CopiesCounted,
     "control_passed": ControlPassed,
+    "attention_changed": AttentionChanged,
     "operator_connected": OperatorConnected,
     "operator_disconnected": OperatorDisconnected,
     "clock_advanced": ClockAdvanced,
 }
-OWN = (LinkMeasured, CopiesCounted, ControlPassed)  # made by the vehicle itself; no operator may request them
+OWN = (
+    LinkMeasured,
+    CopiesCounted,
+    ControlPassed,
+    AttentionChanged,
+)  # made by the vehicle itself; no operator may request them
 NAMES = {kind: name for name, kind in EVENTS.items()}
 
 _EXACT = ("kbps", "lower_kbps", "scaling")
@@ -170,6 +196,8 @@ def parse(document: Mapping[str, Any]) -> Event:
     for key in _EXACT:
         if key in values:
             values[key] = exact(values[key])
+    if "attention" in values:
+        values["attention"] = Attention(values["attention"])
     if kind is ModeSelected:
         values["mode"] = Mode(values["mode"])
     elif kind is LinkMeasured and "state" in values:

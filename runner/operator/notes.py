@@ -18,6 +18,7 @@ CAUSES = {
     "link_measured": "Link measured",
     "copies_counted": "Number of viewers changed",
     "control_passed": "Control passed",
+    "attention_changed": "Attention changed",
     "operator_connected": "Operator connected",
     "operator_disconnected": "Operator disconnected",
     "clock_advanced": "Time elapsed",

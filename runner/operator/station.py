@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from runner.configuration import agreement
+from runner.core.events import Attention
 from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
@@ -109,6 +110,7 @@ class Station:
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
+        self.attention: Attention | None = None  # of the person who drives, as the page knows it
         self._telemetry: Telemetry | None = None
         self._signed_off = False  # by itself, or by its last will
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it arrived
@@ -172,10 +174,14 @@ class Station:
     def _announce(self, now: float) -> None:
         """State that this operator is present, also to a vehicle that is not heard for a moment."""
         if self.state is not None:
-            self.ask({"event": "operator_connected"})
+            self.ask(self._presence())
         elif self._may_be_heard(now):
-            event = {"event": "operator_connected", "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
+            event = {**self._presence(), "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
             self._link.publish(self._requests, event)
+
+    def _presence(self) -> JsonObject:
+        attention = self.attention  # another thread may replace it
+        return {"event": "operator_connected", **({"attention": attention} if attention else {})}
 
     def _may_be_heard(self, now: float) -> bool:
         """Whether the vehicle may hear this side: it was heard lately and did not sign off."""
@@ -392,7 +398,7 @@ class Station:
             self._note_changes(before, state)
         else:
             self.note(f"the vehicle is online, mode {state.mode}")
-            self.ask({"event": "operator_connected"})
+            self.ask(self._presence())
 
     def _set_state(self, state: VehicleState | None) -> None:
         self.state = state

@@ -20,6 +20,7 @@ from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web_protocol import RequestHandler
 
+from runner.core.events import Attention
 from runner.core.model import Camera, Vehicle, plain
 from runner.errors import RunError
 from runner.graph import video_codec
@@ -40,6 +41,7 @@ STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # sent to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
+STATED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by a page itself
 SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here, not megabytes later
 START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
 STOP_S = 0.5  # how long open connections may take to close
@@ -318,6 +320,15 @@ class PageServer(Listener):
     def _tell_control(self) -> None:
         for viewer in self._viewers:
             viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
+        self._state_attention()
+
+    def _state_attention(self) -> None:
+        """State whether the person who drives can see the pictures: by the page in control."""
+        driving = [viewer for viewer in self._viewers if self._control.seen_by(viewer.token) == "you"]
+        if driving:
+            self._station.attention = driving[0].attention
+        else:
+            self._station.attention = Attention.ABSENT if self._control.is_held else None
 
     def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
         """One message of a page; whatever it contains, it is answered and affects nothing else."""
@@ -333,6 +344,9 @@ class PageServer(Listener):
                 viewer.restart(self._index[name])
             case {"counter": dict(found)} if self._on_counter and (reading := counter_reading(found)):
                 self._on_counter(reading)
+            case {"attention": str(word)} if word in STATED:
+                viewer.attention = Attention(word)
+                self._state_attention()
             case {"take_control": True}:
                 self._control.take(viewer.token)
                 self._tell_control()

@@ -13,6 +13,8 @@ from runner.core.commands import Command, KnobValues
 from runner.core.events import (
     NAMES,
     OWN,
+    Attention,
+    AttentionChanged,
     ClockAdvanced,
     ControlPassed,
     CopiesCounted,
@@ -340,6 +342,14 @@ class ControlLoop:
         else:
             self._operators.message_received(sender, t)
         self._presence_changed(before, t, "disconnected")
+        if isinstance(event, OperatorConnected) and sender and sender == self._operators.in_control:
+            self._attend(sender, event.attention, t)
+
+    def _attend(self, operator: str, attention: Attention | None, t: float) -> None:
+        """What the operator in control states of the person who drives."""
+        if attention is not self._run.state.attention:
+            self._take(AttentionChanged(t=t, attention=attention))
+            self.on_report(f"operator {operator} is {attention or 'no longer stating its attention'}")
 
     def _watch_operators(self, t: float) -> None:
         """Notice operators that have fallen silent, unless it is this loop that has stood still."""
@@ -450,7 +460,9 @@ class ControlLoop:
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
-        return VehicleState(self._now(), self._cause, decision.mode, total, cameras, fault, asked_kbps=asked)
+        attention = self._run.state.attention or UNSET
+        decided = (decision.mode, total, cameras, fault)
+        return VehicleState(self._now(), self._cause, *decided, asked_kbps=asked, attention=attention)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request if all its knob values are applied, or it has timed out."""

@@ -5,7 +5,7 @@ import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
 import { toggleControl } from "./header.js";
-import { showGuides } from "./link.js";
+import { send, showGuides } from "./link.js";
 import { SHAPES } from "./tiles.js";
 import { whyLess } from "./total.js";
 import { by, latency, mark, spoken, whole, write } from "./format.js";
@@ -16,9 +16,12 @@ const WORDS = { unsupported: "NO PICTURE" };
 const STANDING = ["lost", "frozen", "unsupported"];
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
+const SETTLED_MS = 2500; // by then what a hidden page did not draw counts no longer
 
 const attention = new Attention();
 let focused = document.hasFocus();
+let shown = -Infinity; // when the page was last hidden
+let told = ""; // what the station knows of it
 const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const current = () => store.connected && store.state?.online;
 
@@ -104,11 +107,21 @@ function refreshGuides() {
 // --- the driver looks elsewhere ---------------------------------------------------------------------------------------
 
 function look() {
-  const words = attention.changed({ hidden: document.hidden, focused }, performance.now());
-  const warning = inControl() ? attention.warning() : null;
-  by("attention").hidden = warning === null || store.view !== "drive";
+  if (document.hidden) shown = performance.now();
+  const slow = store.slow && performance.now() - shown > SETTLED_MS;
+  const words = attention.changed({ hidden: document.hidden, focused, slow }, performance.now());
+  const warning = inControl() ? attention.warning : null;
+  by("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
   write(by("attention"), warning ?? "");
+  tellAttention();
   if (words && inControl() && store.view === "drive") publish("toast", { text: words, level: "problem" });
+}
+
+/** Tell the station, which tells the vehicle while this page is in control. */
+function tellAttention() {
+  if (!store.connected || told === attention.state) return;
+  told = attention.state;
+  send({ attention: told });
 }
 
 export function startDrive() {
@@ -125,7 +138,8 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", look);
   listen("hello state sample ages status control socket requests view", refresh);
-  listen("control socket view", look);
+  listen("socket", () => (told = ""));
+  listen("control socket view ages", look);
   listen("hello view", refreshGuides);
   refresh();
 }

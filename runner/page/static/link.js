@@ -25,11 +25,12 @@ const heard = {
     store.refused[camera] = why;
     publish("status", { camera, status });
   },
-  ages({ ages, skew_ms }) {
+  ages({ ages, skew_ms, slow }) {
     told = performance.now();
     if (hung) revive(ages);
     store.ages = ages;
     store.skew_ms = skew_ms;
+    store.slow = slow;
     publish("ages", ages);
   },
   sent: ({ id, sent }) => sent || publish("unsent", id),

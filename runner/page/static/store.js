@@ -74,6 +74,7 @@ const listeners = new Map();
  * @property {Record<string, string>} refused
  * @property {Record<string, {age_ms: number|null, bound_ms: number, parts_ms: {page: number, decode: number, draw: number}|null}>} ages
  * @property {number|null} skew_ms
+ * @property {boolean} slow
  * @property {string|null} selected
  * @property {string|null} enlarged
  * @property {"configure"|"drive"} view
@@ -91,6 +92,7 @@ export const store = {
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
   ages: {}, // by camera, capture to drawing, by how much that may be wrong, and its parts on the page
+  slow: false, // whether too few of the pictures that come are drawn
   skew_ms: null, // between the capture times of the oldest and of the newest picture on show
   selected: null,
   enlarged: null,

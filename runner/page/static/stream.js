@@ -4,6 +4,7 @@ import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
 import { placed, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
+import { Pace } from "./pace.js";
 import { pictureOf } from "./picture.js";
 import { GuideLayer } from "./guide_layer.js";
 import { judge, words } from "./status.js";
@@ -60,7 +61,8 @@ export class Stream {
     this.shown = null; // picture last drawn, kept for alarms and for tests
     this.meta = new Map(); // by timestamp: metadata of a unit in the decoder
     this.timestamp = 0;
-    this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
+    this.pace = new Pace();
+    this.counts = { received: 0, due: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // of the decoder, the last one
     this.refused = isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there is no picture
     this.asked = now(); // when the browser last stated that it has no decoder
@@ -92,7 +94,8 @@ export class Stream {
   }
 
   /** The vehicle's decision about this camera. */
-  decide({ on, sending, fault, ...decision }) {
+  decide(decision) {
+    const { on, sending, fault } = decision;
     const begins = on && sending && (this.on === false || this.sending === false);
     Object.assign(this, { on, sending });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
@@ -179,6 +182,7 @@ export class Stream {
   decode(unit, received) {
     this.timestamp += 1000;
     this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
+    if (!(unit.flags & CATCH_UP)) this.counts.due++;
     const type = unit.flags & KEY ? "key" : "delta";
     try {
       this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
@@ -325,6 +329,12 @@ export class Stream {
     const { on, sending, refused, drawn, damaged, arrived, decoded, late_until } = this;
     const faulty = this.failed_at !== null;
     return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: this.camera.fps };
+  }
+
+  /** Whether too few of the pictures that come are drawn; to be called a few times a second. */
+  isSlow() {
+    this.pace.add(now(), this.counts.due, this.counts.drawn);
+    return this.pace.slow;
   }
 
   /** Judge the status; returns whether it has changed. Called by a timer. */

@@ -14,6 +14,7 @@ import "./counter.js";
 import "./framing.js";
 import "./guide_layer.js";
 import "./guides.js";
+import "./pace.js";
 import "./projection.js";
 import "./overlay.js";
 import "./status.js";
@@ -190,7 +191,8 @@ function tellAges() {
   const bound_ms = station.bound + station.clock.bound;
   const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages), bound_ms, status }]));
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
-  tell({ kind: "ages", ages, skew_ms });
+  const slow = streams.filter((stream) => stream.isSlow()).length > 0; // all are to be counted
+  tell({ kind: "ages", ages, skew_ms, slow });
 }
 
 // --- the page ---------------------------------------------------------------------------------------------------------
