@@ -86,7 +86,10 @@ def paint(world: Path) -> None:
         left = CAR.width_m / 2 * (1 + 2 * side) + aside
         x, y = at_x + cos * ahead - sin * left, at_y + sin * ahead + cos * left
         rows, columns = (np.floor(per_m * each).astype(int) for each in (y, x))
-        luma[rows % luma.shape[0], columns % luma.shape[1]] = white
+        texels = rows % luma.shape[0] * luma.shape[1] + columns % luma.shape[1]
+        which, samples = np.unique(texels, return_inverse=True)  # the edges lie within texels, which are 1 cm wide
+        means = np.bincount(samples.ravel(), white.ravel()) / np.bincount(samples.ravel())
+        luma[which // luma.shape[1], which % luma.shape[1]] = np.rint(means)
     shrink(atlas, GROUND)
 
 

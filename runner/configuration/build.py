@@ -23,6 +23,7 @@ from runner.core.model import (
     Element,
     Endpoint,
     Graph,
+    Inputs,
     KnobTarget,
     LatencyLimit,
     Media,
@@ -105,7 +106,7 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "dimensions")
+        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros")
         if not all(map(self.fine, sections)):
             return None
         media = self.part(("media",), _media)
@@ -118,6 +119,7 @@ class Builder:
         self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
+        inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None  # older drives
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         listening = {"page.port": page.port} if page.serve else {}
@@ -150,6 +152,7 @@ class Builder:
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=_ros(document.get("ros", {})),
             dimensions=dimensions,
+            inputs=inputs or Inputs(),
         )
 
     def finished(self, built: T | None) -> T:

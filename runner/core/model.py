@@ -451,6 +451,27 @@ class PageSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Inputs:
+    """Keys and buttons of the operator's page, by action; None: the action has none.
+
+    keys     names in the browser's KeyboardEvent.key
+    buttons  numbers in the browser's Gamepad API
+    """
+
+    keys: Mapping[str, str | None] = field(default_factory=dict)
+    buttons: Mapping[str, int | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, given in (("keys", self.keys), ("buttons", self.buttons)):
+            taken: dict[str | int, str] = {}
+            for action, value in given.items():
+                if value is not None and value in taken:
+                    raise ModelError(f"{kind}.{action}", repr(value), f"is already that of {taken[value]}")
+                if value is not None:
+                    taken[value] = action
+
+
+@dataclass(frozen=True, slots=True)
 class LatencyLimit:
     """What latency means for the speed.
 
@@ -540,6 +561,7 @@ class Vehicle:
     metrics    where both sides serve figures for Prometheus
     ros        the node of ROS 2, for cameras whose source subscribes to topics
     dimensions None: unknown
+    inputs     keys and buttons of the operator's page
     """
 
     name: str
@@ -559,6 +581,7 @@ class Vehicle:
     metrics: MetricsPorts = MetricsPorts()
     ros: RosSettings = RosSettings()
     dimensions: Dimensions | None = None
+    inputs: Inputs = Inputs()
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

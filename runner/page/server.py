@@ -440,7 +440,8 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
     ]
     dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
     limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
-    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, **limits}
+    inputs = asdict(vehicle.inputs)
+    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
 
 
 def _native(camera: Camera) -> dict[str, int]:

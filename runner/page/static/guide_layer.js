@@ -106,7 +106,7 @@ function stroke(context, points, thick, colour) {
 
 /** The distances beside the right ends of their lines, as far as there is room between them. */
 function nameDistances(context, lines, visible) {
-  const size = fontSize(visible, 0.035);
+  const size = fontSize(visible, 0.028);
   context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   context.textBaseline = "middle";
   /** @type {{x: number, y: number}[]} */
@@ -126,8 +126,8 @@ function nameDistances(context, lines, visible) {
   }
 }
 
-function namePicture(context, words, { left, top, right, bottom }) {
-  const size = fontSize({ left, top, right, bottom }, 0.04);
+function namePicture(context, words, { left, top, bottom }) {
+  const size = fontSize({ top, bottom }, 0.035);
   context.font = `700 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   context.textBaseline = "middle";
   const wide = context.measureText(words).width + size;
@@ -137,4 +137,4 @@ function namePicture(context, words, { left, top, right, bottom }) {
   context.fillText(words, left + size / 2, bottom - 0.75 * size);
 }
 
-const fontSize = ({ top, bottom }, share) => Math.round(Math.min(28, Math.max(10, share * (bottom - top))));
+const fontSize = ({ top, bottom }, share) => Math.round(Math.min(22, Math.max(10, share * (bottom - top))));

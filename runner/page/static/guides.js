@@ -38,7 +38,10 @@ export function straightGuides({ width_m, front_m, rear_m }) {
 
 const across = (x, half) => Array.from({ length: ACROSS + 1 }, (_, i) => ground(x, half - (2 * half * i) / ACROSS));
 
-/** @returns {Guide} */
+/**
+ * @param {Guide["kind"]} kind  @param {Place[]} places  @param {number|null} metres
+ * @returns {Guide}
+ */
 const guide = (kind, places, metres = null) => ({ kind, metres, places });
 
 /**
