@@ -101,7 +101,6 @@ function refreshGuides() {
   by("guides").hidden = !cameras.length;
   const some = chosen() === "calibrated" && guided.length < cameras.length;
   write(by("guides"), guided.length ? `Guides on${some ? ` (${guided.length})` : ""}` : "Guides off");
-  mark(by("guides"), "aria-pressed", guided.length > 0);
 }
 
 // --- the driver looks elsewhere ---------------------------------------------------------------------------------------
