@@ -18,7 +18,7 @@ from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
 from runner.core.decision import Decision, Setting
-from runner.core.events import PositionReported
+from runner.core.events import Attention, PositionReported
 from runner.core.model import Mode, Roi, plain
 
 Number = int | float
@@ -112,6 +112,7 @@ class VehicleState:
     asked_kbps  the total that the prediction or the operator gives; None in older logs
     total_kbps  the same after what rules have taken away, such as the cap by the measured link
     fault       why the rules could not decide, so that an earlier decision stays in force
+    attention   of the person who drives; absent: the operator in control states none
     """
 
     t: float = field(compare=False)
@@ -122,6 +123,7 @@ class VehicleState:
     fault: str | None = None
     online: bool = True
     asked_kbps: Number | None = None
+    attention: Attention | UnsetType = UNSET
 
     @property
     def total_words(self) -> str:
@@ -183,6 +185,18 @@ class SpeedAdvice:
     speed_factor: float
     latency_ms: float | None
     expires_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringAngle:
+    """The steering angle, as soon as it is reported: a picture shows where the wheels led when it was captured.
+
+    at   when it was reported, s since 1970 by the vehicle's clock, as capture times are
+    rad  as in `runner.core.events.SteeringReported`
+    """
+
+    at: float
+    rad: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -445,6 +445,12 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             "graph.first_port: 8550: camera top_front would get port 8554, already the port of media.port",
         ),
         (["control.port=8554"], "control.port: 8554: is already the port of media.port"),
+        (["dimensions.front_m=2.5"], "dimensions.front_m: 2.5: must reach the front axle, 2.9 m ahead"),
+        (["dimensions.track_m=2"], "dimensions.track_m: 2: must be at most width_m, 1.92"),
+        (["dimensions.width=2"], "dimensions.width: unknown key, did you mean width_m?"),
+        (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already that of view"),
+        (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already that of enlarge"),
+        (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or null"),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )

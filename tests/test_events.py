@@ -19,6 +19,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.1, "event": "bitrate_predicted", "kbps": 3000.5, "lower_kbps": 100, "valid_s": 2},
     {"t": 0.2, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3, "heading_deg": 90},
     {"t": 0.2, "event": "position_reported", "lat": -90, "lon": -180},
+    {"t": 0.2, "event": "steering_reported", "rad": -0.35},
     {"t": 0.3, "event": "total_set", "kbps": 4000},
     {"t": 0.4, "event": "camera_switched", "camera": "rear_center", "on": False},
     {"t": 0.5, "event": "roi_set", "camera": "front_left", "x": 0, "y": 0, "width": 960, "height": 520},
@@ -30,7 +31,10 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.8, "event": "link_measured", "queue_ms": 0, "state": "stalled"},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
     {"t": 0.8, "event": "control_passed", "operator": "me"},
+    {"t": 0.8, "event": "attention_changed", "attention": "hidden"},
+    {"t": 0.8, "event": "attention_changed"},
     {"t": 0.9, "event": "operator_connected"},
+    {"t": 0.9, "event": "operator_connected", "attention": "watching"},
     {"t": 0.9, "event": "operator_disconnected"},
     {"t": 0.9, "event": "clock_advanced"},
 ]
@@ -113,6 +117,7 @@ def roi(**keys: Any) -> dict[str, Any]:
         (clock(event="link_measured", camera="a", kbps=1, loss=1.1), "loss: 1.1: must be at most 1"),
         (clock(event="position_reported", lat=91, lon=0), "lat: 91: must be at most 90"),
         (clock(event="position_reported", lat=0, lon=-181), "lon: -181: must be at least -180"),
+        (clock(event="steering_reported", rad=90), "rad: 90: must be at most 1.5"),
     ],
 )
 def test_an_invalid_event_is_refused(document: Any, problem: str) -> None:

@@ -59,9 +59,9 @@ def test_a_default_given_changes_nothing_and_another_value_does(key_tables: Modu
         return {each.name: getattr(found, each.name) for each in fields(Camera)}
 
     minimal = camera()
-    others: dict[str, Any] = {"lens": "fisheye"}
+    others: dict[str, Any] = {"lens": "fisheye", "calibrated": "true"}
     stated = [key for keys in key_tables.tables().values() for key in keys if key.default.startswith("`")]
-    assert len(stated) == 8
+    assert len(stated) == 9
     for key in stated:
         assert camera(f"cameras.a.{key.path}={key.default.strip('`')}") == minimal, key.path
         assert camera(f"cameras.a.{key.path}={others.get(key.path, 5)}") != minimal, key.path
@@ -71,7 +71,7 @@ def test_every_example_is_valid(key_tables: ModuleType) -> None:
     """All examples of a kind together are a file of conf/cameras/, and so those of a place in conf/vehicle/."""
     import yaml
 
-    documents: dict[str, dict[str, Any]] = {"kind": {}, "place": {}}
+    documents: dict[str, dict[str, Any]] = {"kind": {}, "place": {}, "dimensions": {}}
     for name, keys in key_tables.tables().items():
         for key in keys:
             above, node = key.path.split("."), documents[name]
@@ -79,4 +79,4 @@ def test_every_example_is_valid(key_tables: ModuleType) -> None:
                 node = node.setdefault(step, {})
             node[above[-1]] = yaml.safe_load(key.example)
     assert findings(documents["kind"], "camera") == []
-    assert findings({"name": "van", "cameras": {"a": documents["place"]}}, "vehicle") == []
+    assert findings({"name": "van", **documents["dimensions"], "cameras": {"a": documents["place"]}}, "vehicle") == []

@@ -197,13 +197,13 @@ def test_a_name_has_one_role(tmp_path, capsys):
 
 # --- roles x events ---------------------------------------------------------------------------------------------------
 
-OWN = ("link_measured", "copies_counted", "control_passed", "clock_advanced")
+OWN = ("link_measured", "copies_counted", "control_passed", "attention_changed", "clock_advanced")
 PRESENCE = ("operator_connected", "operator_disconnected")
 ALLOWED = {
-    Role.CONTROLLER: {*EVENTS} - {*OWN, "bitrate_predicted", "position_reported"},
+    Role.CONTROLLER: {*EVENTS} - {*OWN, "bitrate_predicted", "position_reported", "steering_reported"},
     Role.WATCHER: {*PRESENCE},
     Role.PREDICTOR: {"bitrate_predicted"},
-    Role.POSITIONER: {"position_reported"},
+    Role.POSITIONER: {"position_reported", "steering_reported"},
     Role.VEHICLE: set(),
     Role.BROKER: set(),
     None: set(),

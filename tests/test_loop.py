@@ -6,14 +6,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
 from runner.configuration.config import configuration
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import Telemetry, VehicleState
+from runner.records import SteeringAngle, Telemetry, VehicleState
 from runner.vehicle.inbox import Request
 from runner.vehicle.loop import ControlLoop
 from runner.vehicle.operators import SILENT_S
@@ -143,3 +145,49 @@ def test_operators_are_present_after_the_loop_itself_stood_still(monkeypatch: py
     assert stood.is_set()
     assert watched.reports.count("operator driver is present") == 1
     assert not [line for line in watched.reports if "silent" in line]
+
+
+def test_a_steering_angle_is_published_at_once_with_its_time_and_at_most_every_50_ms() -> None:
+    watched = Watched()
+    with watched.running():
+        before = time.time()
+        watched.loop.post({"event": "steering_reported", "rad": 0.25})
+        until(lambda: watched.of(SteeringAngle))
+        (first,) = watched.of(SteeringAngle)
+        assert (first.rad, before - 1e-3 <= first.at <= time.time()) == (0.25, True)
+        began = time.monotonic()
+        while time.monotonic() < began + 0.5:
+            watched.loop.post({"event": "steering_reported", "rad": 0.5})
+            time.sleep(0.005)
+        until(lambda: len(watched.of(SteeringAngle)) > 2)
+    published = watched.of(SteeringAngle)
+    assert all(b.at - a.at >= 0.049 for a, b in pairwise(published))
+    assert {angle.rad for angle in published[1:]} == {0.5}
+
+
+def test_what_the_operator_in_control_states_of_its_attention_is_in_the_state_until_another_is_in_control() -> None:
+    watched = Watched()
+
+    def states(sender: str, **attention: str) -> None:
+        watched.loop.take(Request(sender, {"event": "operator_connected", **attention}))
+
+    def attention() -> Any:
+        return next((state.attention for state in reversed(watched.of(VehicleState))), None)
+
+    with watched.running():
+        states("driver", attention="watching")
+        until(lambda: attention() == "watching")
+        states("other", attention="hidden")
+        states("driver", attention="slow")
+        until(lambda: attention() == "slow")
+        states("driver")
+        until(lambda: attention() is UNSET)
+        states("driver", attention="hidden")
+        until(lambda: attention() == "hidden")
+        watched.loop.take(Request("driver", {"event": "operator_disconnected"}))
+        until(lambda: attention() is UNSET)
+        states("other", attention="watching")
+        until(lambda: attention() == "watching")
+    told = [report for report in watched.reports if report.startswith("operator driver is ")]
+    expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
+    assert told == [f"operator driver is {what}" for what in expected]

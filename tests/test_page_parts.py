@@ -50,15 +50,15 @@ def sent(viewer):
 
 @contextmanager
 def served(*overrides):
-    """Port of a page."""
+    """Port of a page, and its station."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    station = SimpleNamespace(state=None, note=print, answer_s=1.0)
+    station = SimpleNamespace(state=None, note=print, answer_s=1.0, attention=None)
     page = PageServer(vehicle(f"page.port={port}", *overrides), station)
     page.start()
     try:
-        yield port
+        yield port, station
     finally:
         page.stop()
 
@@ -66,7 +66,7 @@ def served(*overrides):
 @pytest.mark.parametrize("begun", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", FULL + b"GET / H"])
 def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
     monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
-    with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
         line.sendall(begun.replace(b"PORT", str(port).encode()))
         with suppress(ConnectionResetError):
             while line.recv(65536):  # the response to the finished request, then the end
@@ -75,7 +75,7 @@ def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
 
 @pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])
 def test_invalid_http_is_refused_without_a_traceback(line, caplog, capfd):
-    with served() as port, socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         connection.sendall(line + b"\r\n\r\n")
         assert connection.recv(12)[:10] in (b"HTTP/1.0 4", b"HTTP/1.1 4")
     assert (caplog.text, *capfd.readouterr()) == ("", "", "")
@@ -83,7 +83,7 @@ def test_invalid_http_is_refused_without_a_traceback(line, caplog, capfd):
 
 @pytest.mark.parametrize("host", ["127.0.0.1:abc", "[::1", "a:b:c", "127.0.0.1:99999", "%zz", "", "a b"])
 def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
-    with served() as port:
+    with served() as (port, _):
         with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
             line.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
             answer = b"".join(iter(lambda: line.recv(65536), b""))
@@ -98,7 +98,7 @@ def test_no_viewer_is_waited_for_once_the_page_has_stopped():
     """Python 3.11 may crash when it ends while a handler still waits."""
     hello = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:PORT\r\n{UPGRADE}\r\n\r\n"
     with socket.socket() as line:
-        with served() as port:
+        with served() as (port, _):
             line.connect(("127.0.0.1", port))
             line.sendall(hello.replace("PORT", str(port)).encode())
             assert line.recv(12) == b"HTTP/1.1 101"
@@ -106,16 +106,74 @@ def test_no_viewer_is_waited_for_once_the_page_has_stopped():
     assert waiting == []
 
 
-def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_is_framed():
+def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that():
     async def hello(port):
         own = f"http://localhost:{port}"
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{own}/live?viewer=me", origin=own) as ws:
             return await ws.receive_json(timeout=5)
 
-    with served("+cameras.front_left.framing=fit") as port:
-        cameras = {camera["name"]: camera for camera in asyncio.run(hello(port))["cameras"]}
-    assert cameras["front_left"]["pose"] == {"yaw_deg": 55, "pitch_deg": 5}
+    native = "{width_px: 1920, height_px: 1080, left_px: 0, top_px: 30}"
+    words = (
+        "+cameras.front_left.framing=fit",
+        "+cameras.rear_center.calibrated=true",
+        f"+cameras.front_left.native={native}",
+    )
+    with served(*words) as (port, _):
+        told = asyncio.run(hello(port))
+    cameras = {camera["name"]: camera for camera in told["cameras"]}
+    pose = {"x_m": 1.9, "y_m": 0.5, "z_m": 1.5, "yaw_deg": 55, "pitch_deg": 5, "roll_deg": 0}
+    native = {"width": 1920, "height": 1080, "left": 0, "top": 30}
+    optics = {"pose": pose, "fov_deg": 90, "lens": "pinhole", "native": native, "calibrated": False}
+    assert {key: cameras["front_left"][key] for key in optics} == optics
+    native = {"width": 1280, "height": 800, "left": 0, "top": 0}
+    optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
+    assert {key: cameras["top_left"][key] for key in optics} == optics
+    assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
+    dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}
+    assert told["dimensions"] == dimensions
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
+
+
+def test_the_station_is_told_whether_the_driver_watches():
+    """By the page in control alone; a page that is closed is absent, one that gives control away says nothing."""
+
+    async def drive(own, station):
+        async def stated(attention):
+            for _ in range(500):
+                if station.attention == attention:
+                    return
+                await asyncio.sleep(0.01)
+            assert station.attention == attention
+
+        async with aiohttp.ClientSession() as session:
+            driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
+            await stated(None)
+            await driver.send_json({"attention": "watching"})
+            await stated("watching")
+            async with session.ws_connect(f"{own}/live?viewer=other", origin=own) as other:
+                await other.send_json({"attention": "hidden"})
+                await driver.send_json({"attention": "slow"})
+                await stated("slow")
+                await other.send_json({"take_control": True})
+                await stated("hidden")
+                await driver.send_json({"take_control": True})
+                await stated("slow")
+                for invalid in ("absent", "asleep", 1, None):
+                    await driver.send_json({"attention": invalid, "id": "1"})
+                    while (told := await driver.receive_json(timeout=5))["kind"] != "reply":
+                        pass
+                    assert told["result"] == "refused"
+            assert station.attention == "slow"
+            await driver.close()
+            await stated("absent")
+            driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
+            await driver.send_json({"attention": "unfocused"})
+            await stated("unfocused")
+            await driver.send_json({"release_control": True})
+            await stated(None)
+
+    with served() as (port, station):
+        asyncio.run(drive(f"http://localhost:{port}", station))
 
 
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():

@@ -359,6 +359,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "mode_selected": {"mode": st.sampled_from(list(map(str, Mode)))},
     "bitrate_predicted": {**KBPS, "lower_kbps": st.sampled_from([0, 900, 4000]), "valid_s": st.sampled_from([0.5, 4])},
     "position_reported": {"lat": st.just(48.1), "lon": st.just(11.6)},
+    "steering_reported": {"rad": st.just(0.2)},
     "total_set": KBPS,
     "camera_switched": {**FRONT_LEFT, "on": st.booleans()},
     "roi_set": {

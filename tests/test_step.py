@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from runner.core import rules
 from runner.core import step as step_module
 from runner.core.commands import wanted
-from runner.core.events import parse
+from runner.core.events import Attention, parse
 from runner.core.model import Mode
 from runner.core.step import Run, start, step
 
@@ -188,6 +188,8 @@ def test_the_vehicles_own_weights_hold_until_others_are_set() -> None:
         ("link_measured", {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}),
         ("link_measured", {"queue_ms": 300, "state": "stalled"}),
         ("position_reported", {"lat": 48.2, "lon": 11.6, "speed_mps": 8, "heading_deg": 90}),
+        ("steering_reported", {"rad": 0.4}),
+        ("attention_changed", {"attention": "hidden"}),
         ("bitrate_predicted", {"kbps": 3000, "lower_kbps": 1, "valid_s": 0}),
     ],
 )
@@ -378,3 +380,19 @@ def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
     lists = {**drive.vehicle.modes, Mode.AUTOMATIC: (*drive.vehicle.modes[Mode.AUTOMATIC][:-1], rules.RuleCall(wrong))}
     with pytest.raises(rules.RuleFailed, match="rule mine failed: total -1: must be kbit/s"):
         start(replace(drive.vehicle, modes=lists))
+
+
+def test_rules_may_read_the_attention_of_the_person_who_drives() -> None:
+    """It is that of one operator, and unknown once another is in control, or none."""
+    drive = predicted(3000)
+    drive.accept("operator_connected", attention="watching")
+    assert drive.run.state.attention is None  # the vehicle states it by an event of its own
+    for event, keys in (
+        ("control_passed", {"operator": "bob"}),
+        ("operator_disconnected", {}),
+        ("attention_changed", {}),
+    ):
+        drive.accept("attention_changed", attention="hidden")
+        assert drive.run.state.attention is Attention.HIDDEN
+        drive.accept(event, **keys)
+        assert drive.run.state.attention is None

@@ -23,6 +23,7 @@ OWN = (
     "framing",
     "fov_deg",
     "lens",
+    "calibrated",
 )
 NAMED = 3  # differences that a message names
 

@@ -19,9 +19,11 @@ from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
     Capture,
+    Dimensions,
     Element,
     Endpoint,
     Graph,
+    Inputs,
     KnobTarget,
     LatencyLimit,
     Media,
@@ -121,6 +123,9 @@ class Builder:
         self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
+        inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None  # older drives
+        known = document.get("dimensions") is not None
+        dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         listening = {"page.port": page.port} if page.serve else {}
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
@@ -150,6 +155,8 @@ class Builder:
             insecure=document.get("insecure", False),
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=_ros(document.get("ros", {})),
+            dimensions=dimensions,
+            inputs=inputs or Inputs(),
         )
 
     def finished(self, built: T | None) -> T:
@@ -245,7 +252,7 @@ class Builder:
         fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens", "shed", "framing"))
+        options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated"))
         options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from enum import StrEnum
 from fractions import Fraction
 from typing import Any
 
@@ -48,6 +49,13 @@ class PositionReported(Event):
     lon: float
     speed_mps: float | None = None
     heading_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringReported(Event):
+    """Angle of the front wheels (bicycle model), rad, positive to the left."""
+
+    rad: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,9 +125,28 @@ class ControlPassed(Event):
     operator: str
 
 
+class Attention(StrEnum):
+    """Whether the person who drives can see the pictures, by the page in control."""
+
+    WATCHING = "watching"
+    UNFOCUSED = "unfocused"  # seen, but keys do not reach the page
+    SLOW = "slow"  # fewer than 10 pictures a second are drawn
+    HIDDEN = "hidden"
+    ABSENT = "absent"  # the page is closed, or does not answer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttentionChanged(Event):
+    """The operator in control states another attention; None: none, as without a page."""
+
+    attention: Attention | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(Event):
-    pass
+    """attention  what the operator's page states with its sign of life; the vehicle makes `AttentionChanged` of it"""
+
+    attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +163,7 @@ EVENTS: dict[str, type[Event]] = {
     "mode_selected": ModeSelected,
     "bitrate_predicted": BitratePredicted,
     "position_reported": PositionReported,
+    "steering_reported": SteeringReported,
     "total_set": TotalSet,
     "camera_switched": CameraSwitched,
     "roi_set": RoiSet,
@@ -144,11 +172,17 @@ EVENTS: dict[str, type[Event]] = {
     "link_measured": LinkMeasured,
     "copies_counted": CopiesCounted,
     "control_passed": ControlPassed,
+    "attention_changed": AttentionChanged,
     "operator_connected": OperatorConnected,
     "operator_disconnected": OperatorDisconnected,
     "clock_advanced": ClockAdvanced,
 }
-OWN = (LinkMeasured, CopiesCounted, ControlPassed)  # made by the vehicle itself; no operator may request them
+OWN = (
+    LinkMeasured,
+    CopiesCounted,
+    ControlPassed,
+    AttentionChanged,
+)  # made by the vehicle itself; no operator may request them
 NAMES = {kind: name for name, kind in EVENTS.items()}
 
 _EXACT = ("kbps", "lower_kbps", "scaling")
@@ -162,6 +196,8 @@ def parse(document: Mapping[str, Any]) -> Event:
     for key in _EXACT:
         if key in values:
             values[key] = exact(values[key])
+    if "attention" in values:
+        values["attention"] = Attention(values["attention"])
     if kind is ModeSelected:
         values["mode"] = Mode(values["mode"])
     elif kind is LinkMeasured and "state" in values:

@@ -310,6 +310,29 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
+class Dimensions:
+    """The vehicle seen from above, m: what the page draws on the ground.
+
+    wheelbase_m      between the axles
+    track_m          between the middles of the wheels of an axle
+    width_m          at its widest
+    front_m, rear_m  from the rear axle to the front and to the rear end
+    """
+
+    wheelbase_m: float
+    track_m: float
+    width_m: float
+    front_m: float
+    rear_m: float
+
+    def __post_init__(self) -> None:
+        if self.front_m < self.wheelbase_m:
+            raise ModelError("front_m", f"{self.front_m:g}", f"must reach the front axle, {self.wheelbase_m:g} m ahead")
+        if self.track_m > self.width_m:
+            raise ModelError("track_m", f"{self.track_m:g}", f"must be at most width_m, {self.width_m:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class Place:
     """Tile on the operator's page, counted from the top left."""
 
@@ -332,6 +355,7 @@ class Camera:
     capture         what its device is to deliver
     credentials     file with user name and password of its address; None: it asks for none
     framing         fit: the page's Drive view shows the whole picture; fill: it fills its box; None: by its place
+    calibrated      whether pose, fov_deg and lens were measured, not estimated
     """
 
     name: str
@@ -354,6 +378,7 @@ class Camera:
     fov_deg: float = 90.0
     lens: str = "pinhole"
     framing: str | None = None
+    calibrated: bool = False
     full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:
@@ -423,6 +448,27 @@ class PageSettings:
     @property
     def endpoint(self) -> Endpoint:
         return Endpoint(self.host, self.port)
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Keys and buttons of the operator's page, by action; None: the action has none.
+
+    keys     names in the browser's KeyboardEvent.key
+    buttons  numbers in the browser's Gamepad API
+    """
+
+    keys: Mapping[str, str | None] = field(default_factory=dict)
+    buttons: Mapping[str, int | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, given in (("keys", self.keys), ("buttons", self.buttons)):
+            taken: dict[str | int, str] = {}
+            for action, value in given.items():
+                if value is not None and value in taken:
+                    raise ModelError(f"{kind}.{action}", repr(value), f"is already that of {taken[value]}")
+                if value is not None:
+                    taken[value] = action
 
 
 @dataclass(frozen=True, slots=True)
@@ -514,6 +560,8 @@ class Vehicle:
     insecure   whether that is intended where video or control leave this machine
     metrics    where both sides serve figures for Prometheus
     ros        the node of ROS 2, for cameras whose source subscribes to topics
+    dimensions None: unknown
+    inputs     keys and buttons of the operator's page
     """
 
     name: str
@@ -532,6 +580,8 @@ class Vehicle:
     insecure: bool = False
     metrics: MetricsPorts = MetricsPorts()
     ros: RosSettings = RosSettings()
+    dimensions: Dimensions | None = None
+    inputs: Inputs = Inputs()
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

@@ -13,7 +13,7 @@ class Role(StrEnum):
     CONTROLLER = "controller"  # an operator who may drive
     WATCHER = "watcher"  # sees what the operator sees
     PREDICTOR = "predictor"  # pQoS
-    POSITIONER = "positioner"  # localisation, where it is not on the vehicle
+    POSITIONER = "positioner"  # localisation and odometry, where they are not on the vehicle
 
 
 PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
@@ -22,7 +22,7 @@ MAY_REQUEST: dict[Role, frozenset[str]] = {
     Role.CONTROLLER: PRESENCE | SETTINGS,
     Role.WATCHER: PRESENCE,
     Role.PREDICTOR: frozenset({"bitrate_predicted"}),
-    Role.POSITIONER: frozenset({"position_reported"}),
+    Role.POSITIONER: frozenset({"position_reported", "steering_reported"}),
     Role.VEHICLE: frozenset(),
     Role.BROKER: frozenset(),
 }

@@ -35,9 +35,11 @@ class State:
     collective_total  kbit/s, total of mode collective
     link              the newest measurement of the uplink; None: no operator measures it
     position          the newest one
+    steering          the newest one
     copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
     operator_since    t at which the operator's side connected; None: it is not connected
     operator_lost     t at which the operator's side disconnected
+    attention         of the person who drives, as the operator in control states it
     """
 
     mode: Mode
@@ -51,8 +53,10 @@ class State:
     collective_total: Kbps | None = None
     operator_since: float | None = None
     operator_lost: float | None = None
+    attention: ev.Attention | None = None
     link: ev.LinkMeasured | None = None
     position: ev.PositionReported | None = None
+    steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
 
     @staticmethod
@@ -112,7 +116,9 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             _known(vehicle, name)
             return {}
         case ev.ControlPassed():
-            return {"link": None}  # another place, and another path to it
+            return {"link": None, "attention": None}  # another place, another path to it, another person
+        case ev.AttentionChanged(attention=attention):
+            return {"attention": attention}
         case ev.CopiesCounted(copies=copies):
             for name in copies:
                 _known(vehicle, name)
@@ -121,10 +127,12 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             since = event.t if state.operator_since is None else state.operator_since
             return {"operator_since": since, "operator_lost": None}
         case ev.OperatorDisconnected():
-            gone = {"operator_since": None, "operator_lost": event.t, "link": None}
+            gone = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
             return gone if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
+        case ev.SteeringReported():
+            return {"steering": event}
         case ev.ClockAdvanced():
             return {}
         case _:

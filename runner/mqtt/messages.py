@@ -9,6 +9,7 @@ Topics of a vehicle, below tod/<vehicle>/:
     reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never retained
     clock/<operator>     to that operator, five times a second: when a report came, by the vehicle's clock
     advice               from the vehicle, ten times a second, if it knows `latency.fixed_ms`: speed by latency
+    steering             from the vehicle, up to 20 times a second: the steering angle that was reported to it
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
@@ -23,7 +24,16 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from runner.records import ClockAnswer, ReceptionReport, Reply, Settings, Telemetry, VehicleState, from_json
+from runner.records import (
+    ClockAnswer,
+    ReceptionReport,
+    Reply,
+    Settings,
+    SteeringAngle,
+    Telemetry,
+    VehicleState,
+    from_json,
+)
 from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
@@ -86,7 +96,7 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
 
 
 def read_state(payload: bytes) -> VehicleState | None:
-    """A vehicle's state; None: it is offline. Like the four below, raises ValueError with the problem."""
+    """A vehicle's state; None: it is offline. Like the five below, raises ValueError with the problem."""
     document = _checked("state", payload)
     return from_json(VehicleState, document) if document["online"] else None
 
@@ -97,6 +107,10 @@ def read_telemetry(payload: bytes) -> Telemetry:
 
 def read_settings(payload: bytes) -> Settings:
     return from_json(Settings, _checked("configuration", payload))
+
+
+def read_steering(payload: bytes) -> SteeringAngle:
+    return from_json(SteeringAngle, _checked("steering", payload, MAX_REQUEST_BYTES))
 
 
 def read_reply(payload: bytes) -> Reply:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from runner.configuration import agreement
+from runner.core.events import Attention
 from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
@@ -24,6 +25,7 @@ from runner.mqtt.messages import (
     read_reply,
     read_settings,
     read_state,
+    read_steering,
     read_telemetry,
     topic,
 )
@@ -68,6 +70,9 @@ class Listener:
     def on_sample(self, sample: Sample) -> None:
         """The reception of all cameras, a few times a second."""
 
+    def on_steering(self, at: float, rad: float) -> None:
+        """The steering angle that was reported to the vehicle at a time by this machine's clock."""
+
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
 
@@ -105,6 +110,7 @@ class Station:
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
+        self.attention: Attention | None = None  # of the person who drives, as the page knows it
         self._telemetry: Telemetry | None = None
         self._signed_off = False  # by itself, or by its last will
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it arrived
@@ -134,6 +140,7 @@ class Station:
             topic(vehicle.name, "reply", self.identity): self._on_reply,
             topic(vehicle.name, "clock", self.identity): self._on_clock,
             topic(vehicle.name, "telemetry"): self._on_telemetry,
+            topic(vehicle.name, "steering"): self._on_steering,
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         self._requests = topic(vehicle.name, "request", self.identity)
@@ -167,10 +174,14 @@ class Station:
     def _announce(self, now: float) -> None:
         """State that this operator is present, also to a vehicle that is not heard for a moment."""
         if self.state is not None:
-            self.ask({"event": "operator_connected"})
+            self.ask(self._presence())
         elif self._may_be_heard(now):
-            event = {"event": "operator_connected", "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
+            event = {**self._presence(), "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
             self._link.publish(self._requests, event)
+
+    def _presence(self) -> JsonObject:
+        attention = self.attention  # another thread may replace it
+        return {"event": "operator_connected", **({"attention": attention} if attention else {})}
 
     def _may_be_heard(self, now: float) -> bool:
         """Whether the vehicle may hear this side: it was heard lately and did not sign off."""
@@ -192,11 +203,15 @@ class Station:
 
     def captured_here(self, name: str, captured: float | None) -> float | None:
         """A camera's capture time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
+        return None if captured is None or self.untimed(name) else self._here(captured)
+
+    def _here(self, at: float) -> float | None:
+        """A past time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
-        if captured is None or clock is None or self._was_set() or self.untimed(name):
+        if clock is None or self._was_set():
             return None
-        here = captured - clock.ahead_s
-        return here if here <= time.time() + clock.bound_s else None  # a picture of the future: a clock has been set
+        here = at - clock.ahead_s
+        return here if here <= time.time() + clock.bound_s else None  # of the future: a clock has been set
 
     def untimed(self, name: str) -> bool:
         """Whether the vehicle does not know when a camera's pictures are captured."""
@@ -383,7 +398,7 @@ class Station:
             self._note_changes(before, state)
         else:
             self.note(f"the vehicle is online, mode {state.mode}")
-            self.ask({"event": "operator_connected"})
+            self.ask(self._presence())
 
     def _set_state(self, state: VehicleState | None) -> None:
         self.state = state
@@ -404,6 +419,13 @@ class Station:
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         self._vehicle_online()
+
+    def _on_steering(self, message: MqttMessage) -> None:
+        steering = read_steering(message.payload)
+        at = None if message.retained else self._here(steering.at)
+        if at is not None:
+            for listener in self.listeners:
+                listener.on_steering(at, steering.rad)
 
     def _on_clock(self, message: MqttMessage) -> None:
         returned, now, answer = time.time(), time.monotonic(), read_clock(message.payload)

@@ -31,6 +31,11 @@ class Control:
         if token == self._holder:
             self._holder, self._left = "", None
 
+    @property
+    def is_held(self) -> bool:
+        """Whether a page holds control, also one that is closed."""
+        return bool(self._holder)
+
     def seen_by(self, token: str) -> str:
         """you, another or nobody"""
         if token == self._holder:

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web_protocol import RequestHandler
 
+from runner.core.events import Attention
 from runner.core.model import Camera, Vehicle, plain
 from runner.errors import RunError
 from runner.graph import video_codec
@@ -39,6 +41,7 @@ STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # sent to a page that opens
 EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
+STATED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by a page itself
 SEND_BUFFER_BYTES = 131_072  # so that a viewer that does not read is noticed here, not megabytes later
 START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
 STOP_S = 0.5  # how long open connections may take to close
@@ -124,6 +127,9 @@ class PageServer(Listener):
 
     def on_sample(self, sample: Sample) -> None:
         self._in_page(self._add_sample, sample)
+
+    def on_steering(self, at: float, rad: float) -> None:
+        self._in_page(self._tell, "steering", {"at_ms": 1000 * at, "rad": rad})
 
     def on_note(self, note: Note) -> None:
         self._in_page(self._add_note, {"time": note.t, "text": note.text})
@@ -314,6 +320,15 @@ class PageServer(Listener):
     def _tell_control(self) -> None:
         for viewer in self._viewers:
             viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
+        self._state_attention()
+
+    def _state_attention(self) -> None:
+        """State whether the person who drives can see the pictures: by the page in control."""
+        driving = [viewer for viewer in self._viewers if self._control.seen_by(viewer.token) == "you"]
+        if driving:
+            self._station.attention = driving[0].attention
+        else:
+            self._station.attention = Attention.ABSENT if self._control.is_held else None
 
     def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
         """One message of a page; whatever it contains, it is answered and affects nothing else."""
@@ -329,6 +344,9 @@ class PageServer(Listener):
                 viewer.restart(self._index[name])
             case {"counter": dict(found)} if self._on_counter and (reading := counter_reading(found)):
                 self._on_counter(reading)
+            case {"attention": str(word)} if word in STATED:
+                viewer.attention = Attention(word)
+                self._state_attention()
             case {"take_control": True}:
                 self._control.take(viewer.token)
                 self._tell_control()
@@ -406,7 +424,11 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "height": camera.height,
             "fps": float(camera.fps),
             "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
-            "pose": {"yaw_deg": camera.pose.yaw_deg, "pitch_deg": camera.pose.pitch_deg} if camera.pose else None,
+            "pose": camera.pose and asdict(camera.pose),
+            "fov_deg": camera.fov_deg,
+            "lens": camera.lens,
+            "native": _native(camera),
+            "calibrated": camera.calibrated,
             "framing": camera.framing,
             "codec": video_codec(camera.graph) or None,
             "weight": plain(camera.weight),
@@ -416,7 +438,17 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
         }
         for camera in vehicle.cameras.values()
     ]
-    return {"vehicle": vehicle.name, "cameras": cameras, "late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
+    dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
+    limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
+    inputs = asdict(vehicle.inputs)
+    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
+
+
+def _native(camera: Camera) -> dict[str, int]:
+    """The source's image, and where the full image begins in it, px."""
+    width, height = camera.source_size
+    left, top = (camera.crop.x, camera.crop.y) if camera.crop else (0, 0)
+    return {"width": width, "height": height, "left": left, "top": top}
 
 
 def _tls(keyring: Keyring) -> ssl.SSLContext:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from runner.core.events import Attention
 from runner.h264.access_unit import AccessUnit
 
 HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
@@ -25,12 +26,14 @@ Burst = Callable[[int], list[AccessUnit]]  # by camera index: the units for a de
 class PageViewer:
     """Queues of one viewer. Used from one thread.
 
-    token  its identity: a random name that the browser keeps when the page is reloaded
-    burst  returns the units that bring a late decoder up to date; called only when the viewer is ready for them
+    token      its identity: a random name that the browser keeps when the page is reloaded
+    attention  whether its user can see the pictures; None: it has not stated that yet
+    burst      returns the units that bring a late decoder up to date; called only when the viewer is ready for them
     """
 
     def __init__(self, token: str, cameras: int, burst: Burst) -> None:
         self.token = token
+        self.attention: Attention | None = None
         self._burst = burst
         self._filled = asyncio.Event()
         self._texts: deque[str] = deque(maxlen=WAITING_TEXTS)

@@ -15,10 +15,12 @@ pattern read tod/+/state
 pattern read tod/+/telemetry
 pattern read tod/+/configuration
 pattern read tod/+/advice
+pattern read tod/+/steering
 pattern write tod/%u/state
 pattern write tod/%u/telemetry
 pattern write tod/%u/configuration
 pattern write tod/%u/advice
+pattern write tod/%u/steering
 pattern write tod/%u/reply/+
 pattern write tod/%u/clock/+
 pattern read tod/%u/request/+

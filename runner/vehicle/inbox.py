@@ -15,7 +15,12 @@ ROUND_S = 0.1
 TAKEN = 32  # requests taken from one sender per round: a flood leaves CPU time to others
 SENDERS = 64  # senders with queued requests; requests of further senders are refused
 MODE_CHANGING = "mode_selected"
-MEASUREMENTS = ("position_reported", "bitrate_predicted", "link_measured")  # only the newest one counts
+MEASUREMENTS = (
+    "position_reported",
+    "steering_reported",
+    "bitrate_predicted",
+    "link_measured",
+)  # only the newest one counts
 
 Answer = Callable[[Outcome], None]
 

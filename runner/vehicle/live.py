@@ -39,7 +39,16 @@ from runner.mqtt.messages import (
     topic,
 )
 from runner.plans import compile_plans, render_missing
-from runner.records import ClockAnswer, Outcome, Settings, SpeedAdvice, Telemetry, VehicleState, to_json
+from runner.records import (
+    ClockAnswer,
+    Outcome,
+    Settings,
+    SpeedAdvice,
+    SteeringAngle,
+    Telemetry,
+    VehicleState,
+    to_json,
+)
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
@@ -57,7 +66,13 @@ WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
 NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none has come by then, the name is free
 CONSOLE_LINES = 1000
-TOPICS = {VehicleState: "state", Telemetry: "telemetry", Settings: "configuration", SpeedAdvice: "advice"}
+TOPICS = {
+    VehicleState: "state",
+    Telemetry: "telemetry",
+    Settings: "configuration",
+    SpeedAdvice: "advice",
+    SteeringAngle: "steering",
+}
 
 
 class LiveVehicle:
@@ -195,7 +210,7 @@ class _VehicleControl:
         self._live = live
         self._link.connect()
 
-    def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice) -> bool:
+    def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice | SteeringAngle) -> bool:
         """Returns False if it has to wait, since the link is behind."""
         return not self._alone.is_set() or self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
@@ -335,7 +350,7 @@ def live_vehicle(
     control = _VehicleControl(vehicle, document, report, keyring)
     metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port)
 
-    def publish(record: VehicleState | Telemetry | SpeedAdvice) -> bool:
+    def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
         metrics.take(record)
         return control.publish(record)
 

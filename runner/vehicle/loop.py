@@ -13,6 +13,8 @@ from runner.core.commands import Command, KnobValues
 from runner.core.events import (
     NAMES,
     OWN,
+    Attention,
+    AttentionChanged,
     ClockAdvanced,
     ControlPassed,
     CopiesCounted,
@@ -20,6 +22,7 @@ from runner.core.events import (
     OperatorConnected,
     OperatorDisconnected,
     PositionReported,
+    SteeringReported,
     describe,
     parse,
 )
@@ -36,6 +39,7 @@ from runner.records import (
     Position,
     ReceptionReported,
     SpeedAdvice,
+    SteeringAngle,
     Telemetry,
     VehicleState,
     applied_to_json,
@@ -52,6 +56,7 @@ STATE_S = 0.2  # between two states, unless a request waits for its answer: each
 REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; while no operator is present
 CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
 KEY_FRAME_S = 1.0  # between two key frames that repair pictures of a camera: each takes bits from the next ones
+STEERING_S = 0.05  # between two steering angles published: each takes 0.2 kB of the link that video needs
 ADVICE_S = 0.2  # how long a reported latency, and what is advised because of it, counts
 POSITION_S = 5.0  # a position that is older is not where the vehicle is
 REPEAT_S = 10.0  # the same fault is reported no more often than this
@@ -99,7 +104,7 @@ class ControlLoop:
     pqos: Pqos
     track: Track | None
     log: Log
-    publish: Callable[[VehicleState | Telemetry | SpeedAdvice], bool]
+    publish: Callable[[VehicleState | Telemetry | SpeedAdvice | SteeringAngle], bool]
     on_report: Callable[[str], None]
     access: Access = field(default_factory=Access)
     refused: int = 0
@@ -118,6 +123,7 @@ class ControlLoop:
     _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, when
     _seen: tuple[float, float | None] = (-ADVICE_S, None)  # when the operator reported a latency, and that, ms
     _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, when one was last asked for
+    _steered: float = -STEERING_S  # when the steering angle was last published
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
@@ -336,6 +342,14 @@ class ControlLoop:
         else:
             self._operators.message_received(sender, t)
         self._presence_changed(before, t, "disconnected")
+        if isinstance(event, OperatorConnected) and sender and sender == self._operators.in_control:
+            self._attend(sender, event.attention, t)
+
+    def _attend(self, operator: str, attention: Attention | None, t: float) -> None:
+        """What the operator in control states of the person who drives."""
+        if attention is not self._run.state.attention:
+            self._take(AttentionChanged(t=t, attention=attention))
+            self.on_report(f"operator {operator} is {attention or 'no longer stating its attention'}")
 
     def _watch_operators(self, t: float) -> None:
         """Notice operators that have fallen silent, unless it is this loop that has stood still."""
@@ -388,6 +402,8 @@ class ControlLoop:
         log_run(self.log, event, before, after)
         if isinstance(event, PositionReported):
             self._position = event
+        if isinstance(event, SteeringReported):
+            self._publish_steering(event)
         if after.fault:
             self._report_once(f"{after.fault}; the decision before stays in force")
         elif before.fault:
@@ -401,6 +417,11 @@ class ControlLoop:
             self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S))
         if after.commands or after.decision != before.decision:
             self._report_decision(before, event)
+
+    def _publish_steering(self, event: SteeringReported) -> None:
+        if event.t - self._steered >= STEERING_S:
+            self._steered = event.t
+            self.publish(SteeringAngle(round(time.time() - (self._now() - event.t), 4), event.rad))
 
     def _report_decision(self, before: Run, event: Event) -> None:
         self._cause = describe(event)
@@ -439,7 +460,9 @@ class ControlLoop:
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
-        return VehicleState(self._now(), self._cause, decision.mode, total, cameras, fault, asked_kbps=asked)
+        attention = self._run.state.attention or UNSET
+        decided = (decision.mode, total, cameras, fault)
+        return VehicleState(self._now(), self._cause, *decided, asked_kbps=asked, attention=attention)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request if all its knob values are applied, or it has timed out."""

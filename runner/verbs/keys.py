@@ -9,7 +9,7 @@ it is; DIR/authority stays. What exists is kept, so that names can be added at a
   controller  an operator who may drive                 page is served to other machines
   watcher     sees the pictures                   broker  address or DNS name of the machine with the MQTT broker
   predictor   sends predicted bitrates
-  positioner  sends positions
+  positioner  sends positions and steering angles
 
 rotate=NAME replaces keys and passwords, revoke=NAME withdraws them. Both take effect where the changed directories are
 copied to; the last line of the output names these. A certificate is valid for a year.

@@ -125,7 +125,7 @@ def test_eight_pictures_move(page):
 
 def test_single_a_dragged_region_changes_what_is_received(page):
     choose(page, "single")
-    tile = page.locator("[data-camera=front_center] canvas").bounding_box()
+    tile = page.locator("[data-camera=front_center] canvas[role=img]").bounding_box()
     full, _ = luma(page, "front_center")
 
     def at(x, y):
@@ -158,7 +158,7 @@ def test_single_a_dragged_region_changes_what_is_received(page):
 def test_a_button_released_outside_the_picture_leaves_no_drag_behind(page):
     """The next click must not send a region of the smallest size."""
     choose(page, "single")
-    tile = page.locator("[data-camera=front_center] canvas").bounding_box()
+    tile = page.locator("[data-camera=front_center] canvas[role=img]").bounding_box()
     x, y = tile["x"] + tile["width"] / 2, tile["y"] + 2
     before = page.evaluate("tod.state.cameras.front_center.roi")
     page.mouse.move(x, y)
@@ -604,7 +604,7 @@ def test_regions_dragged_in_mirrored_and_cropped_pictures_are_where_they_are_in_
 def likeness(page, camera, mirrored):
     """Correlation of what the screen shows of a camera with its picture; low if that has changed meanwhile."""
     picture, _ = luma(page, camera)
-    png = page.locator(f"[data-camera={camera}] canvas").screenshot()
+    png = page.locator(f"[data-camera={camera}] canvas[role=img]").screenshot()
     seen = np.asarray(image.open(io.BytesIO(png)).convert("L").resize(picture.shape[::-1]), float)
     return np.corrcoef(seen.ravel(), (picture[:, ::-1] if mirrored else picture).ravel())[0, 1]
 

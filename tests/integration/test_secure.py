@@ -154,6 +154,8 @@ def published(endpoint, holder, topic, **how):
         ("alice", f"tod/{NAME}/reply/alice", False),
         (NAME, f"tod/{NAME}/state", True),
         (NAME, f"tod/{NAME}/reply/alice", True),
+        (NAME, f"tod/{NAME}/steering", True),
+        ("alice", f"tod/{NAME}/steering", False),
         (NAME, "tod/another/state", False),
         (NAME, "tod/another/reply/alice", False),
     ],

@@ -9,12 +9,13 @@ import pytest
 
 from rig import RecordingListener, free_port, passes, until
 from runner.configuration.config import configuration
+from runner.core.events import Attention
 from runner.core.model import Endpoint
 from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
-from runner.operator.station import SILENT_S, Station
+from runner.operator.station import SILENT_S, Listener, Station
 from runner.records import Arrival, Arrivals
 
 pytestmark = pytest.mark.gst
@@ -192,6 +193,39 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     assert abs(station.captured_here("front", 1003.7) - 1000) <= clock.bound_s
     expected = f", latencies ± {1000 * station.clock.bound_s:.1f} ms"
     assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
+
+
+def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both):
+    """None before that clock is compared with the vehicle's, and none of the future."""
+    heard = []
+
+    class Steered(Listener):
+        def on_steering(self, at, rad):
+            heard.append((at, rad))
+
+    station, vehicle, _ = both
+    station.listeners.append(Steered())
+    vehicle.clock_ahead_s = 3.7
+    vehicle.publish("steering", {"at": time.time() + 3.7, "rad": 0.1})
+    report_until(station, lambda: station.clock)
+    at = time.time()
+    vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
+    vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
+    until(lambda: heard)
+    assert heard == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
+
+
+def test_the_sign_of_life_states_whether_the_driver_watches(both):
+    station, vehicle, _ = both
+    assert "attention" not in vehicle.request("operator_connected")
+    for number, attention in enumerate((Attention.HIDDEN, Attention.WATCHING, None), 2):
+        station.attention = attention
+        station.take(samples())
+        until(lambda n=number: len(vehicle.requests) == n)
+        assert (vehicle.requests[-1]["event"], vehicle.requests[-1].get("attention")) == (
+            "operator_connected",
+            attention,
+        )
 
 
 def test_the_slowest_camera_that_should_send_is_reported(both):

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { placed, shownWords, toBox, toPicture, visible, WHOLE } from "../../runner/page/static/framing.js";
+import { imageToBox, placed, shownWords, toBox, toPicture, visible, WHOLE } from "../../runner/page/static/framing.js";
 
 const PICTURE = { width: 1920, height: 1080 };
 const NARROW = { width: 270, height: 1080 };
@@ -46,6 +46,19 @@ test("from the box into the picture and back is where it was", () => {
           const part = { x: Math.min(a.x, b.x), y: Math.min(a.y, b.y), width: Math.abs(a.x - b.x), height: Math.abs(a.y - b.y) };
           near(toBox(part, box, PICTURE, view), { x: 31, y: 47, width: 172, height: 164 });
         }
+});
+
+test("a point of the full image is where the picture of a region shows it, scaled, cropped and mirrored", () => {
+  const region = { x: 480, y: 260, width: 960, height: 540 };
+  const half = { width: 480, height: 270 }; // px of the picture that comes
+  near(imageToBox({ width: 960, height: 600 }, half, WHOLE, region)({ x: 480 + 240, y: 260 + 54 }), { x: 240, y: 30 + 54 });
+  near(imageToBox({ width: 960, height: 540 }, half, { ...WHOLE, mirrored: true }, region)({ x: 480 + 240, y: 260 }), { x: 720, y: 0 });
+  near(imageToBox({ width: 270, height: 540 }, half, cover(1), region)({ x: 480 + 960, y: 260 + 540 }), { x: 270, y: 540 });
+  near(imageToBox({ width: 270, height: 540 }, half, cover(1), region)({ x: 0, y: 0 }), { x: 270 - 960 - 480, y: -260 });
+  for (const view of [WHOLE, cover(0), cover(1, true)]) {
+    const there = imageToBox({ width: 333, height: 222 }, half, view, region)({ x: 700, y: 500 });
+    near(toPicture(there, { width: 333, height: 222 }, half, view), { x: 110, y: 120 });
+  }
 });
 
 test("what is cropped or mirrored is stated, and nothing else", () => {

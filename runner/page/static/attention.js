@@ -1,4 +1,4 @@
-/** Whether the operator can see this page and its keys reach it. Pure; ms. */
+/** Whether the operator can see this page, it draws enough pictures, and its keys reach it. Pure; ms. */
 
 const NOTICED_MS = 500; // a shorter absence, as of a dialog of the browser, is not worth a word
 
@@ -9,13 +9,16 @@ export class Attention {
   /** @type {number|null} since when the page is hidden or out of focus */
   since = null;
   saw = true; // whether the page was visible all that time
+  slow = false; // whether too few pictures are drawn
 
   /**
-   * The page is hidden or not, and in focus or not.
+   * The page is hidden or not, in focus or not, and draws too few pictures or not.
+   * @param {{hidden: boolean, focused: boolean, slow?: boolean}} page
+   * @param {number} now
    * @returns {string|null} what to tell an operator who has just returned
    */
-  changed({ hidden, focused }, now) {
-    Object.assign(this, { hidden, focused });
+  changed({ hidden, focused, slow = false }, now) {
+    Object.assign(this, { hidden, focused, slow });
     if (hidden || !focused) {
       if (this.since === null) Object.assign(this, { since: now, saw: true });
       this.saw &&= !hidden;
@@ -28,8 +31,19 @@ export class Attention {
     return this.saw ? `No key reached this page for ${seconds}` : `This page was hidden for ${seconds}: look at every picture`;
   }
 
+  /**
+   * In one word, as the vehicle is told it.
+   * @returns {"watching"|"unfocused"|"slow"|"hidden"}
+   */
+  get state() {
+    if (this.hidden) return "hidden";
+    if (this.slow) return "slow";
+    return this.focused ? "watching" : "unfocused";
+  }
+
   /** What to tell an operator who may still see the page; null: all is well. */
-  warning() {
-    return !this.hidden && !this.focused ? "OUT OF FOCUS: keys do not reach this page; click it" : null;
+  get warning() {
+    if (this.state === "slow") return "SLOW: this page draws fewer than 10 pictures a second";
+    return this.state === "unfocused" ? "OUT OF FOCUS: keys do not reach this page; click it" : null;
   }
 }

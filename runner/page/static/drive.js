@@ -3,7 +3,9 @@
 import { inControl, listen, mode, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
+import { isGuided, nextChoice } from "./guides.js";
 import { toggleControl } from "./header.js";
+import { send, showGuides } from "./link.js";
 import { SHAPES } from "./tiles.js";
 import { whyLess } from "./total.js";
 import { by, latency, mark, spoken, whole, write } from "./format.js";
@@ -13,9 +15,13 @@ const ALARMS = ["lost", "frozen", "unsupported", "damaged", "late"]; // the wors
 const WORDS = { unsupported: "NO PICTURE" };
 const STANDING = ["lost", "frozen", "unsupported"];
 const KMH = 3.6; // of 1 m/s
+const GUIDES = "tod-guides";
+const SETTLED_MS = 2500; // by then what a hidden page did not draw counts no longer
 
 const attention = new Attention();
 let focused = document.hasFocus();
+let shown = -Infinity; // when the page was last hidden
+let told = ""; // what the station knows of it
 const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const current = () => store.connected && store.state?.online;
 
@@ -76,18 +82,50 @@ function refreshControl() {
   button.disabled = !store.connected;
 }
 
+// --- lines on the ground ----------------------------------------------------------------------------------------------
+
+/** @returns {import("./guides.js").Choice} */
+const chosen = () => /** @type {any} */ (localStorage.getItem(GUIDES)) ?? "calibrated";
+const placedCameras = () => (store.hello?.dimensions ? store.hello.cameras.filter(({ pose }) => pose) : []);
+
+export function toggleGuides() {
+  localStorage.setItem(GUIDES, nextChoice(placedCameras(), chosen()));
+  refreshGuides();
+}
+
+function refreshGuides() {
+  const cameras = placedCameras();
+  const guided = store.view === "drive" ? cameras.filter((camera) => isGuided(camera, chosen())).map(({ name }) => name) : [];
+  for (const canvas of document.querySelectorAll("canvas.guides")) canvas.toggleAttribute("hidden", !guided.includes(canvas.getAttribute("data-guides") ?? ""));
+  showGuides(guided);
+  by("guides").hidden = !cameras.length;
+  const some = chosen() === "calibrated" && guided.length < cameras.length;
+  write(by("guides"), guided.length ? `Guides on${some ? ` (${guided.length})` : ""}` : "Guides off");
+}
+
 // --- the driver looks elsewhere ---------------------------------------------------------------------------------------
 
 function look() {
-  const words = attention.changed({ hidden: document.hidden, focused }, performance.now());
-  const warning = inControl() ? attention.warning() : null;
-  by("attention").hidden = warning === null || store.view !== "drive";
+  if (document.hidden) shown = performance.now();
+  const slow = store.slow && performance.now() - shown > SETTLED_MS;
+  const words = attention.changed({ hidden: document.hidden, focused, slow }, performance.now());
+  const warning = inControl() ? attention.warning : null;
+  by("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
   write(by("attention"), warning ?? "");
+  tellAttention();
   if (words && inControl() && store.view === "drive") publish("toast", { text: words, level: "problem" });
+}
+
+/** Tell the station, which tells the vehicle while this page is in control. */
+function tellAttention() {
+  if (!store.connected || told === attention.state) return;
+  told = attention.state;
+  send({ attention: told });
 }
 
 export function startDrive() {
   by("drive-control").addEventListener("click", toggleControl);
+  by("guides").addEventListener("click", toggleGuides);
   by("drive-help").addEventListener("click", () => publish("help"));
   addEventListener("blur", () => {
     focused = false;
@@ -99,6 +137,8 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", look);
   listen("hello state sample ages status control socket requests view", refresh);
-  listen("control socket view", look);
+  listen("socket", () => (told = ""));
+  listen("control socket view ages", look);
+  listen("hello view", refreshGuides);
   refresh();
 }

@@ -45,6 +45,19 @@ export function toBox(part, box, picture, view) {
 }
 
 /**
+ * A function from a point of the full image to where it is shown in the box.
+ * @param {Size} box  @param {Size} picture  @param {View} view  @param {Rectangle} region of the full image that the picture shows
+ */
+export function imageToBox(box, picture, view, region) {
+  const { scale, x, y } = placed(box, picture, view);
+  const [across, down] = [picture.width / region.width, picture.height / region.height];
+  return (point) => {
+    const right = (point.x - region.x) * across;
+    return { x: x + scale * (view.mirrored ? picture.width - right : right), y: y + scale * (point.y - region.y) * down };
+  };
+}
+
+/**
  * What of the picture is shown, in words; "" where that is all of it, as it is.
  * @param {Size} box  @param {Size} picture  @param {View} view
  */

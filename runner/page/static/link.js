@@ -25,11 +25,12 @@ const heard = {
     store.refused[camera] = why;
     publish("status", { camera, status });
   },
-  ages({ ages, skew_ms }) {
+  ages({ ages, skew_ms, slow }) {
     told = performance.now();
     if (hung) revive(ages);
     store.ages = ages;
     store.skew_ms = skew_ms;
+    store.slow = slow;
     publish("ages", ages);
   },
   sent: ({ id, sent }) => sent || publish("unsent", id),
@@ -72,6 +73,16 @@ export function giveCanvas(name, element) {
   const canvas = element.transferControlToOffscreen();
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
+
+/** Give the worker the canvas of a camera's guides. */
+export function giveGuides(name, element) {
+  if (!canShowVideo) return;
+  const canvas = element.transferControlToOffscreen();
+  worker.postMessage({ order: "guides", name, canvas }, [canvas]);
+}
+
+/** @param {string[]} names of the cameras whose guides are shown */
+export const showGuides = (names) => worker.postMessage({ order: "guided", names });
 
 /** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
 export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>

@@ -15,6 +15,7 @@ import { startTabs } from "./tabs.js";
 import { startNews } from "./news.js";
 import { startCharts } from "./charts.js";
 import { startKeys } from "./keys.js";
+import { startGamepads } from "./gamepads.js";
 
 startTheme();
 startViews();
@@ -28,6 +29,7 @@ startTabs();
 startNews();
 startCharts();
 startKeys();
+startGamepads();
 start();
 
 /** For tests and benchmarks. With #measure in the address the first picture of each camera is kept as well. */
@@ -41,6 +43,7 @@ globalThis.tod = {
   stages: () => ask("stages"),
   picture: (name) => ask("picture", name),
   first: (name) => ask("first", name),
+  guides: (name) => ask("guides", name),
   request: (event) =>
     new Promise((resolve) => {
       const id = crypto.randomUUID();

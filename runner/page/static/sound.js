@@ -3,7 +3,7 @@
  * after a click or a key, such as those that take control; until then, and while muted, the page says so.
  */
 
-import { listen, store } from "./store.js";
+import { listen, publish, store } from "./store.js";
 import { Alarm } from "./alarm.js";
 import { by, mark, write } from "./format.js";
 
@@ -42,9 +42,11 @@ function play(kind) {
 }
 
 function heard({ status }) {
-  if (!drives || store.view !== "drive" || muted()) return;
+  if (!drives || store.view !== "drive") return;
   const kind = alarm.due(status, performance.now());
-  if (kind) play(kind);
+  if (!kind) return;
+  publish("alarm", kind);
+  if (!muted()) play(kind);
 }
 
 export function toggleSound() {

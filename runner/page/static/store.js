@@ -12,14 +12,19 @@ const listeners = new Map();
  * @property {number} height px
  * @property {number} fps
  * @property {{row: number, column: number}|null} place on the page
- * @property {{yaw_deg: number, pitch_deg: number}|null} pose to the left, and down
+ * @property {import("./projection.js").Pose|null} pose
+ * @property {number} fov_deg
+ * @property {"pinhole"|"fisheye"} lens
+ * @property {{width: number, height: number, left: number, top: number}} native
+ * @property {boolean} calibrated whether these were measured
  * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: by its place
  * @property {string|null} codec
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], answer_s: number, late_ms: number}} Hello answer_s: by then the station has
+ * @typedef {{vehicle: string, cameras: Camera[], dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello answer_s: by then the station has
  *   answered a request; late_ms: an older picture is late
+ * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|null>}} Inputs by action
  * @typedef {object} Applied what was read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
@@ -70,6 +75,7 @@ const listeners = new Map();
  * @property {Record<string, string>} refused
  * @property {Record<string, {age_ms: number|null, bound_ms: number, parts_ms: {page: number, decode: number, draw: number}|null}>} ages
  * @property {number|null} skew_ms
+ * @property {boolean} slow
  * @property {string|null} selected
  * @property {string|null} enlarged
  * @property {"configure"|"drive"} view
@@ -87,6 +93,7 @@ export const store = {
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
   ages: {}, // by camera, capture to drawing, by how much that may be wrong, and its parts on the page
+  slow: false, // whether too few of the pictures that come are drawn
   skew_ms: null, // between the capture times of the oldest and of the newest picture on show
   selected: null,
   enlarged: null,

@@ -4,7 +4,9 @@ import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
 import { placed, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
+import { Pace } from "./pace.js";
 import { pictureOf } from "./picture.js";
+import { GuideLayer } from "./guide_layer.js";
 import { judge, words } from "./status.js";
 import { drawOverlay } from "./overlay.js";
 
@@ -21,6 +23,8 @@ const SETTLE_MS = 2000; // after a restart the decoder may take this long for th
 const REFUSED_MS = 5000; // between two questions whether the browser decodes a stream now
 const LATE_HOLD_MS = 500; // how long one late picture is indicated
 const STAGES = 1200;
+const UNTIMED_MS = 1000; // a picture without a capture time has been on its way for less
+const MOVING = ["live", "late", "damaged"];
 // Not every encoder states what the vehicle pins (ITU-R BT.709); browsers would take BT.601 for small pictures.
 /** @type {VideoColorSpaceInit} */
 const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRange: false };
@@ -57,7 +61,8 @@ export class Stream {
     this.shown = null; // picture last drawn, kept for alarms and for tests
     this.meta = new Map(); // by timestamp: metadata of a unit in the decoder
     this.timestamp = 0;
-    this.counts = { received: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
+    this.pace = new Pace();
+    this.counts = { received: 0, due: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // of the decoder, the last one
     this.refused = isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there is no picture
     this.asked = now(); // when the browser last stated that it has no decoder
@@ -74,6 +79,10 @@ export class Stream {
     /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
     this.late_age = NaN; // of the last late picture
+    this.guides = camera.pose && station.dimensions ? new GuideLayer(camera, station.dimensions) : null;
+    /** @type {{x: number, y: number, width: number, height: number, size: {width: number, height: number}}|null} */
+    this.region = null; // of the full image that pictures show, and their size; null: unknown, or about to change
+    this.region_since = Infinity; // capture times from then on are those of pictures that show it
     this.started();
   }
 
@@ -85,11 +94,24 @@ export class Stream {
   }
 
   /** The vehicle's decision about this camera. */
-  decide({ on, sending, fault }) {
+  decide(decision) {
+    const { on, sending, fault } = decision;
     const begins = on && sending && (this.on === false || this.sending === false);
     Object.assign(this, { on, sending });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     if (begins) this.started();
+    this.regard(decision);
+  }
+
+  /** Which part of the full image pictures show, once that was read back. */
+  regard({ roi, width, height, applied }) {
+    const seen = applied.roi ?? roi;
+    const size = applied.size ?? { width, height };
+    const same = ["x", "y", "width", "height"].every((key) => seen[key] === roi[key]) && size.width === width && size.height === height;
+    const region = same ? { ...seen, size } : null;
+    if (JSON.stringify(region) === JSON.stringify(this.region)) return;
+    this.region = region;
+    this.region_since = this.station.clock.server(now());
   }
 
   attach(canvas) {
@@ -160,6 +182,7 @@ export class Stream {
   decode(unit, received) {
     this.timestamp += 1000;
     this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
+    if (!(unit.flags & CATCH_UP)) this.counts.due++;
     const type = unit.flags & KEY ? "key" : "delta";
     try {
       this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
@@ -246,9 +269,29 @@ export class Stream {
     this.age(this.shown.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
     this.paint(now());
+    this.drawGuides();
     this.note(this.shown.meta, now());
     if (this.station.keep) this.first ??= this.picture();
     if (this.station.counted === this.name) this.readCounter(this.shown);
+  }
+
+  /** Show the guides of this camera, or none. */
+  guide(shown) {
+    if (!this.guides) return;
+    this.guides.shown = shown;
+    this.drawGuides();
+  }
+
+  /** The guides of the picture on show; none over one that stands still, since nobody may steer by it. */
+  drawGuides() {
+    const { guides, shown, region } = this;
+    if (!guides) return;
+    const { captured = NaN, arrived = NaN } = shown?.meta ?? {};
+    const taken = Number.isFinite(captured) ? captured : arrived - UNTIMED_MS;
+    const picture = shown && { width: shown.picture.width, height: shown.picture.height };
+    const fits = picture && region && picture.width === region.size.width && picture.height === region.size.height;
+    const seen = fits && MOVING.includes(this.status) && taken >= this.region_since ? { picture, region, rad: this.station.steering.when(captured) } : null;
+    guides.draw(this.display, seen);
   }
 
   age({ captured }, time) {
@@ -288,12 +331,19 @@ export class Stream {
     return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: this.camera.fps };
   }
 
+  /** Whether too few of the pictures that come are drawn; to be called a few times a second. */
+  isSlow() {
+    this.pace.add(now(), this.counts.due, this.counts.drawn);
+    return this.pace.slow;
+  }
+
   /** Judge the status; returns whether it has changed. Called by a timer. */
   watch() {
     const time = now();
     this.status = judge(this.times(), this.station.limits, time);
     const text = this.overlay(time);
     if (this.context && text !== this.painted) this.paint(time);
+    if (!MOVING.includes(this.status)) this.drawGuides();
     const changed = this.status !== this.reported;
     this.reported = this.status;
     return changed;

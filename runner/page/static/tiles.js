@@ -1,7 +1,7 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
 import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
-import { giveCanvas, tellSize } from "./link.js";
+import { giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
 import { heightsOf, rowsOf } from "./layout.js";
@@ -58,7 +58,7 @@ function sayNoVideo() {
   area.before(make("p", { class: "no-video", role: "alert" }, text));
 }
 
-function tile({ name }) {
+function tile({ name, pose }) {
   const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${spoken(name)}` });
   const parts = {
     view: WHOLE,
@@ -87,6 +87,11 @@ function tile({ name }) {
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, reason, refused, ...parts });
   giveCanvas(name, canvas);
+  if (pose) {
+    const guides = make("canvas", { class: "guides", "data-guides": name, "aria-hidden": "true" });
+    canvas.after(guides);
+    giveGuides(name, guides);
+  }
   dragRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
   return element;

@@ -6,11 +6,16 @@
 import { ageOf, skewOf } from "./ages.js";
 import { Clock, now } from "./clock.js";
 import { hasGpu } from "./picture.js";
+import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
 // Imported here, though used only by other modules, so that all modules are fetched at once.
 import "./codec.js";
 import "./counter.js";
 import "./framing.js";
+import "./guide_layer.js";
+import "./guides.js";
+import "./pace.js";
+import "./projection.js";
 import "./overlay.js";
 import "./status.js";
 import "./yuv.js";
@@ -24,6 +29,8 @@ const HEADER = 24;
 
 const station = {
   clock: new Clock(),
+  steering: new Steering(),
+  dimensions: null, // of the vehicle
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
   online: true,
@@ -40,6 +47,8 @@ let moved = 0; // when it last received anything
 let attempts = 0; // to reconnect
 let streams = []; // in the order of hello, by which the binary messages are indexed
 let described = "";
+/** @type {string[]} */
+let guided = []; // cameras whose guides are shown
 let asleep = true;
 let watched = now();
 let stalled = false; // at the last tick
@@ -104,6 +113,7 @@ function send(message) {
 
 function heard(message) {
   if (message.kind === "clock") return station.clock.heard(message.page_ms, message.server_ms);
+  if (message.kind === "steering") return station.steering.heard(message.at_ms, message.rad);
   if (message.kind === "hello") hello(message);
   if (message.kind === "state") decided(message);
   if (message.kind === "sample") station.bound = message.clock_bound_ms ?? NaN;
@@ -112,11 +122,13 @@ function heard(message) {
 
 function hello(message) {
   station.limits = { late_ms: message.late_ms, frozen_ms: message.frozen_ms };
-  const text = JSON.stringify(message.cameras);
+  const text = JSON.stringify([message.cameras, message.dimensions]);
   if (text !== described) {
+    station.dimensions = message.dimensions;
     streams.forEach((stream) => stream.end());
     streams = message.cameras.map((camera) => new Stream(camera, station));
     described = text;
+    guide();
   }
   streams.forEach((stream) => stream.started());
   connection(true);
@@ -127,6 +139,10 @@ function decided(message) {
   if (message.online && !station.online) streams.forEach((stream) => stream.started());
   station.online = message.online;
   for (const stream of streams) if (message.cameras?.[stream.name]) stream.decide(message.cameras[stream.name]);
+}
+
+function guide() {
+  for (const stream of streams) stream.guide(guided.includes(stream.name));
 }
 
 function unit(buffer) {
@@ -175,7 +191,8 @@ function tellAges() {
   const bound_ms = station.bound + station.clock.bound;
   const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages), bound_ms, status }]));
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
-  tell({ kind: "ages", ages, skew_ms });
+  const slow = streams.filter((stream) => stream.isSlow()).length > 0; // all are to be counted
+  tell({ kind: "ages", ages, skew_ms, slow });
 }
 
 // --- the page ---------------------------------------------------------------------------------------------------------
@@ -192,13 +209,18 @@ const orders = {
     setInterval(() => send({ clock: now() }), 1000);
   },
   canvas: ({ name, canvas }) => find(name)?.attach(canvas),
+  guides: ({ name, canvas }) => find(name)?.guides?.attach(canvas),
+  guided({ names }) {
+    guided = names;
+    guide();
+  },
   size({ name, ...display }) {
     const stream = find(name);
     if (stream) Object.assign(stream, { display, painted: null });
   },
   send: ({ message }) => tell({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = { measure, guides: () => find(name)?.guides?.lines, stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
     tell({ kind: "answer", id, value: await questions[what]() });
   },
 };

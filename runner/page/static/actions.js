@@ -1,0 +1,56 @@
+/** What the operator does by a key or a button; which one is the vehicle's configuration, `inputs`. */
+
+import { enlarge, publish, select, store } from "./store.js";
+import { selectMode, toggleControl } from "./header.js";
+import { focusTile, switchCamera } from "./tiles.js";
+import { sendFull } from "./panel.js";
+import { toggleTheme } from "./theme.js";
+import { rolesOf } from "./arrange.js";
+import { toggleGuides } from "./drive.js";
+import { toggleSound } from "./sound.js";
+import { toggleDrawer, toggleFullScreen, toggleView } from "./views.js";
+
+/**
+ * @typedef {object} Action
+ * @property {string} words
+ * @property {() => unknown} run
+ * @property {boolean} [onCameras] by a key only while no control has the focus: Enter on a button presses that
+ */
+/** @type {Record<string, Action>} */
+export const ACTIONS = {
+  camera_left: { words: "Drive view: select the left camera", run: () => look("left"), onCameras: true },
+  camera_front: { words: "Drive view: select the front camera", run: () => look("front"), onCameras: true },
+  camera_right: { words: "Drive view: select the right camera", run: () => look("right"), onCameras: true },
+  camera_rear: { words: "Drive view: select the rear camera", run: () => look("rear"), onCameras: true },
+  enlarge: { words: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera", run: enlargeSelected, onCameras: true },
+  back: { words: "back from the enlarged picture", run: () => store.enlarged && enlarge(null) },
+  mode_single: { words: "mode Single", run: () => selectMode("single") },
+  mode_automatic: { words: "mode Automatic", run: () => selectMode("automatic") },
+  mode_collective: { words: "mode Collective", run: () => selectMode("collective") },
+  view: { words: "Drive or Configure view", run: toggleView },
+  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view === "drive" && toggleGuides() },
+  drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
+  sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
+  full_screen: { words: "full screen", run: toggleFullScreen },
+  switch: { words: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
+  full_image: { words: "full image of the selected camera (mode S)", run: sendFull },
+  control: { words: "take or release control", run: toggleControl },
+  theme: { words: "night or day", run: toggleTheme },
+  help: { words: "this list", run: () => publish("help") },
+};
+
+/** @param {"left"|"front"|"right"|"rear"} role */
+function look(role) {
+  if (store.view === "drive") selectCamera(rolesOf(store.hello?.cameras ?? [])[role]?.name);
+}
+
+function enlargeSelected() {
+  if (store.selected) enlarge(store.enlarged === store.selected ? null : store.selected);
+}
+
+export function selectCamera(name) {
+  if (name === undefined) return;
+  if (store.enlarged) enlarge(name);
+  select(name);
+  focusTile(name);
+}

@@ -1,0 +1,54 @@
+/** Where points around the vehicle appear in a camera's full image. Pure; m, degrees and px. */
+
+/** @typedef {{x: number, y: number}} Point */
+/** @typedef {{x: number, y: number, z: number}} Place axes of ROS REP 103: forward, left, up, from the ground below the rear axle */
+/** @typedef {{x_m: number, y_m: number, z_m: number, yaw_deg: number, pitch_deg: number, roll_deg: number}} Pose yaw to the left, pitch down, roll clockwise */
+/**
+ * @typedef {object} Optics
+ * @property {Pose} pose
+ * @property {number} fov_deg horizontal, of the native image
+ * @property {"pinhole"|"fisheye"} lens a fisheye is equidistant: equal angles take equal numbers of px
+ * @property {{width: number, height: number, left: number, top: number}} native the source's image, and where the full image begins in it
+ */
+
+const BESIDE = 1e-6; // a pinhole sees nothing whose depth is a smaller part of its distance from the axis
+const BEHIND = 0.9 * Math.PI; // rad from the axis: beyond it a line through the back of a fisheye would cross its image
+
+/**
+ * A function from a place to its point in the full image, or null if it has none: behind the camera. The point may
+ * lie outside the image; the middle of the first pixel is at 0.5.
+ * @param {Optics} optics
+ * @returns {(place: Place) => Point|null}
+ */
+export function projection({ pose, fov_deg, lens, native }) {
+  const { forward, right, down } = axesOf(pose);
+  const half = radians(fov_deg / 2);
+  const focal = native.width / 2 / (lens === "fisheye" ? half : Math.tan(half)); // px per radian, or per unit of tangent
+  const middle = { x: native.width / 2 - native.left, y: native.height / 2 - native.top };
+  return ({ x, y, z }) => {
+    const ray = [x - pose.x_m, y - pose.y_m, z - pose.z_m];
+    const [depth, across, below] = [dot(ray, forward), dot(ray, right), dot(ray, down)];
+    const aside = Math.hypot(across, below);
+    const angle = Math.atan2(aside, depth);
+    if (lens === "fisheye" ? angle > BEHIND : depth <= BESIDE * aside) return null;
+    if (aside === 0) return { ...middle };
+    const radius = focal * (lens === "fisheye" ? angle : aside / depth);
+    return { x: middle.x + (across / aside) * radius, y: middle.y + (below / aside) * radius };
+  };
+}
+
+/** Directions of the camera in the vehicle's axes: along its view, and to the right and down in its picture. */
+function axesOf({ yaw_deg, pitch_deg, roll_deg }) {
+  const [sy, sp, sr] = [yaw_deg, pitch_deg, roll_deg].map((angle) => Math.sin(radians(angle)));
+  const [cy, cp, cr] = [yaw_deg, pitch_deg, roll_deg].map((angle) => Math.cos(radians(angle)));
+  const right = [sy, -cy, 0];
+  const down = [-sp * cy, -sp * sy, -cp];
+  return {
+    forward: [cp * cy, cp * sy, -sp],
+    right: right.map((each, i) => cr * each + sr * down[i]),
+    down: down.map((each, i) => cr * each - sr * right[i]),
+  };
+}
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const radians = (degrees) => (degrees * Math.PI) / 180;

@@ -1,0 +1,134 @@
+"""Marks painted into the ground of the synthetic drive, and found in pictures by image processing.
+
+A mark is a corner where two white and two black fields meet; there is one at each end of the lines that the page draws
+across the ground, 5, 10 and 15 m from both ends of the vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from itertools import product
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from runner.clips import View
+from runner.core.model import Dimensions, Pose
+
+SECONDS = 4.0
+FPS = Fraction(5)
+SIZE = (1280, 720)
+CAR = Dimensions(wheelbase_m=2.9, track_m=1.65, width_m=1.92, front_m=3.65, rear_m=0.95)
+DISTANCES_M = (5, 10, 15)
+WITHIN_PX = 2  # of the full image
+AROUND_PX = 40  # how far from the end of its line a mark is looked for, at most
+End = tuple[int, int, int]  # 1 ahead or -1 behind, distance in m, side: 0 left or -1 right
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A camera and the ends of lines that it must show.
+
+    top   where the full image begins in the native one, px
+    roi   x, y, width, height in the full image; None: all of it
+    """
+
+    pose: Pose
+    ends: tuple[End, ...]
+    fov_deg: float = 90
+    lens: str = "pinhole"
+    native: tuple[int, int] = SIZE
+    top: int = 0
+    factor: float = 1.0
+    roi: tuple[int, int, int, int] | None = None
+
+    @property
+    def view(self) -> View:
+        return View(*self.native, FPS, self.pose, self.fov_deg, self.lens)
+
+    @property
+    def optics(self) -> dict[str, Any]:
+        """As the page is told of it."""
+        native = {"width": self.native[0], "height": self.native[1], "left": 0, "top": self.top}
+        return {"pose": asdict(self.pose), "fov_deg": self.fov_deg, "lens": self.lens, "native": native}
+
+
+AHEAD, BEHIND = ([(sign, far, side) for far, side in product(DISTANCES_M, (0, -1))] for sign in (1, -1))
+CAMERAS = {
+    "scaled": Mounted(Pose(2.0, 0.0, 1.5, 0, 5), tuple(AHEAD), factor=0.5),
+    "cropped": Mounted(
+        Pose(1.9, 0.5, 1.5, 40, 6, 2), ((1, 5, 0), (1, 10, 0), (1, 15, 0)), 100, native=(1280, 960), top=130
+    ),
+    "mirrored": Mounted(Pose(-0.9, 0.0, 1.4, 180, 8), tuple(BEHIND), roi=(200, 60, 880, 495)),
+    "fisheye": Mounted(Pose(3.7, 0.0, 1.2, 0, 25), tuple(AHEAD), 130, "fisheye"),
+}
+
+
+def paint(world: Path) -> None:
+    """Build the street with its marks around where the drive begins."""
+    from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, plan_course, shrink
+
+    build_world(SECONDS, world)
+    course = plan_course(SECONDS)
+    atlas = open_atlas(course, world, "r+")  # type: ignore[arg-type]
+    luma, per_m = level_of(atlas, GROUND, 0)[0], float(atlas.per_m[GROUND])
+    at_x, at_y, heading = course.at(0)
+    cos, sin = math.cos(heading), math.sin(heading)
+    along, aside = np.meshgrid(np.arange(-2, 2, 0.004), np.arange(-0.5, 0.5, 0.004))  # m, of a mark
+    white = np.where((along < 0) == (aside < 0), 230, 25)
+    for sign, far, side in (*AHEAD, *BEHIND):
+        ahead = (CAR.front_m + far if sign > 0 else -CAR.rear_m - far) + along
+        left = CAR.width_m / 2 * (1 + 2 * side) + aside
+        x, y = at_x + cos * ahead - sin * left, at_y + sin * ahead + cos * left
+        rows, columns = (np.floor(per_m * each).astype(int) for each in (y, x))
+        texels = rows % luma.shape[0] * luma.shape[1] + columns % luma.shape[1]
+        which, samples = np.unique(texels, return_inverse=True)  # the edges lie within texels, which are 1 cm wide
+        means = np.bincount(samples.ravel(), white.ravel()) / np.bincount(samples.ravel())
+        luma[which // luma.shape[1], which % luma.shape[1]] = np.rint(means)
+    shrink(atlas, GROUND)
+
+
+def native_pictures(world: Path) -> Iterator[tuple[str, bytes]]:
+    """The first picture of each camera, I420 of the native size; nothing stands on the ground, which is sharp."""
+    from runner.synthetic import picture
+
+    def flat(course: Any) -> Any:
+        faces = stand_faces(course)
+        return replace(faces, height_m=np.zeros_like(faces.height_m))
+
+    stand_faces = picture.stand_faces
+    with patch.object(picture, "stand_faces", flat), patch.object(picture, "SOFT", 0.0):
+        for name, camera in CAMERAS.items():
+            yield name, next(picture.pictures(camera.view, SECONDS, world))
+
+
+def ends_of(lines: Sequence[Any], ends: Sequence[End]) -> dict[End, tuple[float, float]]:
+    """Where those ends are in a picture with these guides, see guides.js."""
+    points = {}
+    for sign, far, side in ends:
+        line = [line for line in lines if line["metres"] == far][0 if sign > 0 else -1]
+        point = line["pieces"][side][side]
+        points[sign, far, side] = (point["x"], point["y"])
+    return points
+
+
+def found(picture: Any, near: tuple[float, float], others: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Where a picture is most like a saddle around a point: the middle of a mark, px. others: where others are"""
+    import cv2
+
+    around = round(min([AROUND_PX, *(0.6 * math.dist(near, other) for other in others)]))
+
+    smooth = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    along = {order: cv2.Sobel(smooth, cv2.CV_64F, *order, ksize=5) for order in ((2, 0), (0, 2), (1, 1))}
+    saddle = np.maximum(0, along[1, 1] ** 2 - along[2, 0] * along[0, 2])
+    left, top = (max(0, round(each) - around) for each in near)
+    part = saddle[top : top + 2 * around, left : left + 2 * around]
+    row, column = np.unravel_index(part.argmax(), part.shape)
+    rows, columns = np.mgrid[top + row - 2 : top + row + 3, left + column - 2 : left + column + 3]
+    weights = saddle[rows, columns]
+    return float((columns * weights).sum() / weights.sum() + 0.5), float((rows * weights).sum() / weights.sum() + 0.5)
