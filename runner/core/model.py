@@ -463,7 +463,7 @@ class RosQos:
 
     reliability: str | None = None
     durability: str | None = None
-    depth: int = 2
+    depth: int = 10
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,8 @@ LOOK_S = 0.5  # how often topics are looked for
 CLOSE_NS, TRIES = 100_000, 10  # clocks read within this count as read at once, or else the closest of so many readings
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, its node not yet
 ABSENT_S = 5.0  # a topic without a picture for so long is reported
+LATE_NS = 200_000_000  # of pictures that wait for this node, those so much older than the newest are left out
+COUNT_S, MOST_LOST = 5.0, 0.01  # pictures are counted over so long; if more of them are lost, that is reported
 
 
 class Port:
@@ -70,6 +72,45 @@ class Port:
                 yield json.loads(order)
 
 
+class Losses:
+    """Counts the pictures of a topic that come to this node, and those that are lost before it passes them on."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bytes, int] = {}  # by publisher, number of its newest picture
+        self._since = time.monotonic()
+        self._lossy = False  # as reported
+        self._begin()
+
+    def _begin(self) -> None:
+        self._came = self._missing = 0  # the latter by the publishers' numbers
+        self.untransported = 0  # of those missing, as far as the middleware knows
+        self.late = 0  # of those that came
+
+    def add(self, info: dict[str, Any]) -> None:
+        """What comes with a picture. Not every middleware numbers pictures."""
+        self._came += 1
+        publisher, number = info.get("publisher_gid"), info.get("publication_sequence_number")
+        if publisher and number is not None:
+            last = self._newest.get(publisher["data"], number - 1)
+            self._missing += max(0, number - last - 1)
+            self._newest[publisher["data"]] = number
+
+    def take_news(self) -> str:
+        """Whether pictures are lost, and where; "" if nothing has changed. To be called every LOOK_S."""
+        if time.monotonic() - self._since < COUNT_S:
+            return ""
+        self._since = time.monotonic()
+        missing = max(self._missing, self.untransported)
+        lost, all_of_them = missing + self.late, missing + self._came
+        were, self._lossy = self._lossy, lost > MOST_LOST * all_of_them
+        here = lost - self.untransported
+        where = f"{self.untransported} between publisher and node, {here} since the node ran late"
+        self._begin()
+        if self._lossy and not were:
+            return f"{lost} of {all_of_them} pictures were lost, {where}; docs/ros.md states what helps"
+        return "no pictures are lost any more" if were and not self._lossy else ""
+
+
 class Topic:
     """A topic with pictures: subscribes once it has a publisher, and reports what is wrong with it, once each.
 
@@ -81,6 +122,7 @@ class Topic:
         self._subscribed: tuple[str, QoSProfile] | None = None
         self._subscription: Any = None
         self._heard = time.monotonic()  # when the last picture came
+        self._losses = Losses()
         self._faults: set[str] = set()
 
     def look(self) -> None:
@@ -95,6 +137,8 @@ class Topic:
         if time.monotonic() - self._heard > ABSENT_S and not self._faults:
             why = "its publisher sends no picture" if publishers else "no publisher"
             self._fail(f"{why} for {ABSENT_S:g} s")
+        if news := self._losses.take_news():
+            self._port.say("report", topic=self._name, text=news)
 
     def _profile(self, publishers: list[Any]) -> QoSProfile:
         """What is asked for, otherwise what all publishers can serve."""
@@ -118,9 +162,11 @@ class Topic:
 
         if self._subscription:
             self._node.destroy_subscription(self._subscription)
-        message, take = (Image, self._on_image) if kind == IMAGE else (CompressedImage, self._on_compressed)
-        events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible, use_default_callbacks=False)
-        self._subscription = self._node.create_subscription(message, self._name, take, profile, event_callbacks=events)
+        message = Image if kind == IMAGE else CompressedImage
+        on = {"incompatible_qos": self._on_incompatible, "message_lost": self._on_lost}
+        events = SubscriptionEventCallbacks(**on, use_default_callbacks=False)
+        subscription = self._node.create_subscription(message, self._name, self._take, profile, event_callbacks=events)
+        self._subscription = subscription
         self._subscribed = kind, profile
 
     def _on_incompatible(self, event: Any) -> None:
@@ -130,14 +176,24 @@ class Topic:
         if asked := self._asked.get(policy):  # otherwise the next look subscribes with what is offered now
             self._fail(f"incompatible QoS: ros.qos asks for {policy} {asked}, its publisher offers less")
 
-    def _on_image(self, message: Any) -> None:
-        form = {"encoding": message.encoding, "width": message.width, "height": message.height, "step": message.step}
-        self._pass_on(message, **form, big=bool(message.is_bigendian))
+    def _on_lost(self, event: Any) -> None:
+        self._losses.untransported += event.total_count_change
 
-    def _on_compressed(self, message: Any) -> None:
-        self._pass_on(message, stated=message.format)
+    def _take(self, message: Any, info: dict[str, Any]) -> None:
+        """Pass on a picture and those that wait behind it. Where this node runs late, the newest win."""
+        waiting, handle = [(message, info)], self._subscription.handle
+        with handle:
+            while len(waiting) < self._asked["depth"] and (newer := handle.take_message(type(message), False)):
+                waiting.append(newer)
+        newest = waiting[-1][1]["source_timestamp"]
+        for picture, about in waiting:
+            self._losses.add(about)
+            if newest - about["source_timestamp"] > LATE_NS:
+                self._losses.late += 1
+            else:
+                self._pass_on(picture)
 
-    def _pass_on(self, message: Any, **form: Any) -> None:
+    def _pass_on(self, message: Any) -> None:
         """With its age by the node's clock, which may be that of a simulation; None: it has no stamp."""
         at, now = self._read_clocks()
         stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
@@ -148,7 +204,7 @@ class Topic:
             self._port.say("report", topic=self._name, text=f"pictures come again, after {silent_s:.0f} s")
         self._heard = time.monotonic()
         data = memoryview(message.data)
-        self._port.send_picture(data, topic=self._name, size=len(data), at=at, age=age, **form)
+        self._port.send_picture(data, topic=self._name, size=len(data), at=at, age=age, **form_of(message))
 
     def _read_clocks(self) -> tuple[int, int]:
         """CLOCK_MONOTONIC and the node's clock, ns; again if this process did not run between the two."""
@@ -162,6 +218,14 @@ class Topic:
         if why not in self._faults:
             self._faults.add(why)
             self._port.say("report", topic=self._name, text=why)
+
+
+def form_of(message: Any) -> dict[str, Any]:
+    """What is known about the data of an Image or a CompressedImage."""
+    if not hasattr(message, "encoding"):
+        return {"stated": message.format}
+    form = {"encoding": message.encoding, "width": message.width, "height": message.height, "step": message.step}
+    return {**form, "big": bool(message.is_bigendian)}
 
 
 class Input:
