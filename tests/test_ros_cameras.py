@@ -158,7 +158,7 @@ def test_doctor_names_what_makes_the_environment(tod):
 
 def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", counted=None):
     """What is told after COUNT_S about pictures with these numbers."""
-    counted = counted or node.Losses()
+    counted = counted or node.PictureCount()
     for number in numbers:
         counted.add({"publisher_gid": {"data": publisher}, "publication_sequence_number": number})
     counted.untransported, counted.late = untransported, late
@@ -168,7 +168,7 @@ def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", cou
 
 
 def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypatch):
-    counted, told = node.Losses(), "pictures were lost"
+    counted, told = node.PictureCount(), "pictures were lost"
     assert losses(monkeypatch, range(7, 107), counted=counted) == ""
     assert losses(monkeypatch, range(108, 208), counted=counted) == ""  # 1 of 101, below one in a hundred
     where = "3 between publisher and node, 2 since the node ran late; docs/ros.md states what helps"
@@ -179,7 +179,7 @@ def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypa
 
 
 def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_knows(monkeypatch):
-    counted = node.Losses()
+    counted = node.PictureCount()
     for _ in range(9):
         counted.add({"publisher_gid": None, "publication_sequence_number": None})
     told = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
