@@ -487,6 +487,7 @@ class RosSettings:
     qos           by topic
     position      topic with the vehicle's position, for the verb `ros`; None: none
     prediction    predictions, for the verb `ros`; None: none
+    pictures      whether the operator's side publishes what it decodes
     """
 
     python: str = ".venv-ros2/bin/python"
@@ -498,6 +499,7 @@ class RosSettings:
     qos: Mapping[str, RosQos] = field(default_factory=dict)
     position: str | None = None
     prediction: RosPrediction | None = None
+    pictures: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
