@@ -36,7 +36,7 @@ CLOSE_NS, TRIES = 100_000, 10  # clocks read within this count as read at once, 
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, its node not yet
 ABSENT_S = 5.0  # a topic without a picture for so long is reported
 LATE_NS = 200_000_000  # of pictures that wait for this node, those so much older than the newest are left out
-COUNT_S, MOST_LOST = 5.0, 0.01  # pictures are counted over so long; if more of them are lost, that is reported
+COUNT_S, MOST_LOST = 5.0, 0.05  # pictures are counted over so long; if more of them are lost, that is reported
 
 
 class Port:
