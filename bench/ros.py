@@ -40,7 +40,7 @@ NODE = "/tod_runner_operator"
 
 
 class Row(NamedTuple):
-    """A camera: pictures published and delivered between the first and the last that were delivered.
+    """A camera: pictures published and delivered with a stamp, between the first and the last of these.
 
     sizes    before and after the change of the mode, px
     late_ms  latencies from stamp to subscriber, ms
@@ -136,12 +136,13 @@ def ended(process: subprocess.Popen[str]) -> dict[str, list[Any]]:
 
 
 def row(camera: str, published: Sequence[float], delivered: Sequence[Sequence[float]]) -> Row:
-    if not delivered:
-        return Row(camera, len(published), 0, ("-", "-"), [])
-    first, last = delivered[0][0] - 0.01, delivered[-1][0] + 0.01  # stamps change a little on their way
-    sizes = [f"{width}x{height}" for _, width, height, _ in delivered]
+    stamped = [one for one in delivered if one[0]]  # a picture whose capture time is unknown has a stamp of 0
+    if not stamped:
+        return Row(camera, len(published), len(delivered), ("-", "-"), [])
+    first, last = stamped[0][0] - 0.01, stamped[-1][0] + 0.01  # stamps change a little on their way
+    sizes = [f"{width}x{height}" for _, width, height, _ in stamped]
     sent = sum(first <= stamp <= last for stamp in published)
-    return Row(camera, sent, len(delivered), (sizes[len(sizes) // 4], sizes[-1]), [1e3 * one[3] for one in delivered])
+    return Row(camera, sent, len(stamped), (sizes[len(sizes) // 4], sizes[-1]), [1e3 * one[3] for one in stamped])
 
 
 def show(rows: Sequence[Row]) -> None:
