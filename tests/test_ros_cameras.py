@@ -11,6 +11,7 @@ from runner.bag.pictures import SECOND_NS
 from runner.configuration.config import configuration
 from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
+from runner.ros import node
 from runner.ros.cameras import CameraStream
 from runner.ros.process import check_discovery
 
@@ -153,3 +154,33 @@ def test_doctor_names_what_makes_the_environment(tod):
     assert done.status == 1
     why = "[Errno 2] No such file or directory: 'no/python'; `make ros2` makes .venv-ros2, see docs/ros.md"
     assert f"MISSING rclpy for ros.python no/python: {why}" in done.out.splitlines()
+
+
+def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", counted=None):
+    """What is told after COUNT_S about pictures with these numbers."""
+    counted = counted or node.PictureCount()
+    for number in numbers:
+        counted.add({"publisher_gid": {"data": publisher}, "publication_sequence_number": number})
+    counted.untransported, counted.late = untransported, late
+    later = node.time.monotonic() + node.COUNT_S
+    monkeypatch.setattr(node.time, "monotonic", lambda: later)
+    return counted.take_news()
+
+
+def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypatch):
+    counted, told = node.PictureCount(), "pictures were lost"
+    assert losses(monkeypatch, range(7, 107), counted=counted) == ""
+    assert losses(monkeypatch, range(112, 208), counted=counted) == ""  # 5 of 101, not more than one in twenty
+    where = "3 between publisher and node, 3 since the node ran late; docs/ros.md states what helps"
+    assert losses(monkeypatch, range(212, 311), untransported=3, late=2, counted=counted) == f"6 of 103 {told}, {where}"
+    assert losses(monkeypatch, [320], counted=counted) == ""  # told already
+    assert losses(monkeypatch, [1, 2], publisher=b"b", counted=counted) == "no pictures are lost any more"
+    assert counted.take_news() == ""
+
+
+def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_knows(monkeypatch):
+    counted = node.PictureCount()
+    for _ in range(9):
+        counted.add({"publisher_gid": None, "publication_sequence_number": None})
+    told = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
+    assert losses(monkeypatch, [], untransported=1, counted=counted).startswith(told)

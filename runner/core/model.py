@@ -509,7 +509,7 @@ class RosQos:
 
     reliability: str | None = None
     durability: str | None = None
-    depth: int = 2
+    depth: int = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -533,6 +533,7 @@ class RosSettings:
     qos           by topic
     position      topic with the vehicle's position, for the verb `ros`; None: none
     prediction    predictions, for the verb `ros`; None: none
+    pictures      whether the operator's side publishes what it decodes
     """
 
     python: str = ".venv-ros2/bin/python"
@@ -544,6 +545,7 @@ class RosSettings:
     qos: Mapping[str, RosQos] = field(default_factory=dict)
     position: str | None = None
     prediction: RosPrediction | None = None
+    pictures: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

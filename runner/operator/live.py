@@ -35,6 +35,7 @@ from runner.system.service import notify
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
     from runner.configuration.experiment import TimedRequest
+    from runner.ros.pictures import DecodedPictures
 
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
@@ -194,6 +195,18 @@ class _Measured(Listener):
         self._metrics.take(sample)
 
 
+def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
+    """The node of ROS 2 that publishes decoded pictures; None: none does.
+
+    raises  UserError
+    """
+    if not vehicle.ros.pictures:
+        return None
+    from runner.ros.pictures import DecodedPictures
+
+    return DecodedPictures(vehicle, station.note)
+
+
 @contextmanager
 def live_operator(
     overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
@@ -217,12 +230,20 @@ def live_operator(
         station.listeners.append(DriveLog(station, drive))
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
 
+    pictures = _ros_pictures(vehicle, station)
+
+    def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
+        assert pictures
+        state = station.state
+        pictures.put(camera, captured, width, height, data, state.cameras.get(camera) if state else None)
+
     def build(on_unit: OnUnit | None) -> OperatorSide:
         logged = log is not None
         return apply.OperatorSide(
             plans,
             station.report,
             on_unit,
+            publish if pictures else None,
             arrivals=logged,
             video=video,
             operator=station.identity,
@@ -234,8 +255,12 @@ def live_operator(
     metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port)
     station.listeners.append(_Measured(metrics))
     try:
+        if pictures:
+            pictures.start()
         metrics.serve(operator.problem)
         yield operator
     finally:
         operator.stop()
+        if pictures:
+            pictures.close()
         metrics.close()

@@ -1,7 +1,8 @@
-"""The control link of a vehicle as topics of ROS 2: state out, requests in, answers out."""
+"""The control link of a vehicle as topics and services of ROS 2: state out, requests in, answers out."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
@@ -24,6 +25,7 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
+from runner.ros.inputs import PRESENCE, OperatorInput, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
 from runner.security.keyring import Keyring
 
@@ -37,7 +39,9 @@ class Bridge:
     keyring    whose name and role requests have; None: for a broker that does not ask, under an id of its own
     on_report  called with one line on what is wrong, from any thread
 
-    It does not state that an operator is present: who sends requests through it does, by the event operator_connected.
+    It does not state by itself that an operator is present: who sends requests through it does, by the event
+    operator_connected or messages of PRESENCE. It refuses these where it reports positions or predictions, too, since
+    the vehicle takes any message for a sign that the operator is still there.
     """
 
     def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
@@ -47,6 +51,10 @@ class Bridge:
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
         self._answer_s = answer_s(vehicle.expires_s)
         self._pending: dict[str, float] = {}  # by id of a request of somebody, until when it may be answered
+        self._calls: dict[str, str] = {}  # by id of a request, the call of a service that waits for its answer
+        self._numbers = itertools.count(1)  # of requests without an id of their own
+        self._topics, self._services = input_topics(vehicle), input_services(vehicle)
+        self._reports = bool(vehicle.ros.position or vehicle.ros.prediction)
         self._due: dict[str, float] = {}  # by event, when the next may be sent
         self._told: set[str] = set()
         self._requests = topic(vehicle.name, "request", self.identity)
@@ -57,12 +65,16 @@ class Bridge:
         }
         will = (self._requests, OPERATOR_GONE)
         self._link = ControlLink(vehicle.control, will, listen, lambda here: None, on_report, login)
-        inputs = {REQUEST: "text"}
+        inputs = {REQUEST: "text", **{name: its.kind for name, its in self._topics.items()}}
+        if not self._reports:
+            inputs[PRESENCE] = "sign"
         if vehicle.ros.position:
             inputs[vehicle.ros.position] = "fix"
         if vehicle.ros.prediction:
-            inputs[vehicle.ros.prediction.topic] = "number"
-        self._node = NodeProcess(vehicle.ros, self._on_message, self._on_node_report, inputs=inputs)
+            inputs[vehicle.ros.prediction.topic] = "newest_number"
+        services = {name: its.kind for name, its in self._services.items()}
+        take, report = self._on_message, self._on_node_report
+        self._node = NodeProcess(vehicle.ros, take, report, inputs=inputs, services=services)
 
     def start(self) -> None:
         """raises RunError if the node does not start"""
@@ -98,7 +110,7 @@ class Bridge:
     def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)
         if self._pending.pop(reply.id, None) is not None:
-            self._node.publish(REPLY, message.payload.decode())
+            self._answer(reply.id, reply.result, reply.reason, reply.t)
         elif reply.result != "applied":
             self._tell(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
 
@@ -110,8 +122,25 @@ class Bridge:
                 self._on_request(message["text"])
             case "fix" if message["fixed"] and math.isfinite(message["lat"]) and math.isfinite(message["lon"]):
                 self._report("position_reported", lat=message["lat"], lon=message["lon"])
-            case "number" if self._may_predict(message["nodes"]) and math.isfinite(message["number"]):
+            case "newest_number" if self._may_predict(message["nodes"]) and math.isfinite(message["number"]):
                 self._report("bitrate_predicted", kbps=message["number"])
+            case "sign":
+                self._report("operator_connected")
+            case "call":
+                identity = f"{message['topic']} {next(self._numbers)}"
+                self._calls[identity] = message["call"]
+                self._on_input(identity, self._services[message["topic"]], message)
+            case "number" | "region":
+                identity = f"{message['topic']} {next(self._numbers)}"
+                self._on_input(identity, self._topics[message["topic"]], message)
+
+    def _on_input(self, identity: str, its: OperatorInput, message: Message) -> None:
+        try:
+            event = its.event(message)
+        except ValueError as error:
+            self._answer(identity, "refused", str(error))
+        else:
+            self._request(identity, event)
 
     def _may_predict(self, nodes: list[str]) -> bool:
         """Whether only the named node publishes predictions; not, as long as names are unknown."""
@@ -131,11 +160,18 @@ class Bridge:
         identity = event.pop("id", None)
         if not isinstance(identity, str) or not identity:
             self._answer("", "refused", "id: must be given, as text")
-        elif not self._is_online():
-            self._answer(identity, "refused", "the vehicle is offline")
+        elif self._reports and event.get("event") == "operator_connected":
+            rule = "reports positions or predictions, which count as signs of life: start another for the operator"
+            self._answer(identity, "refused", f"this node {rule}")
         else:
+            self._request(identity, event)
+
+    def _request(self, identity: str, event: Mapping[str, Any]) -> None:
+        if self._is_online():
             self._pending[identity] = time.monotonic() + self._answer_s
             self._send(identity, event)
+        else:
+            self._answer(identity, "refused", "the vehicle is offline")
 
     def _report(self, event: str, **values: Any) -> None:
         """An event that nobody waits for an answer to."""
@@ -154,9 +190,13 @@ class Bridge:
         as_of = round(t + time.monotonic() - came, 6)
         self._link.publish(self._requests, {**event, "id": identity, "as_of": as_of})
 
-    def _answer(self, identity: str, result: str, reason: str) -> None:
-        reply = {"id": identity, "t": self._vehicle_time[0], "result": result, "reason": reason}
-        self._node.publish(REPLY, json.dumps(reply))
+    def _answer(self, identity: str, result: str, reason: str, t: float | None = None) -> None:
+        """Answer a request; t: the vehicle's time, now if it is not given."""
+        if call := self._calls.pop(identity, None):
+            self._node.answer(call, result == "applied", f"{result}: {reason}" if reason else result)
+            return
+        t = self._vehicle_time[0] if t is None else t
+        self._node.publish(REPLY, json.dumps({"id": identity, "t": t, "result": result, "reason": reason}))
 
     def _on_node_report(self, name: str, what: str) -> None:
         self._on_report(f"{name}: {what}" if name else what)
@@ -166,9 +206,3 @@ class Bridge:
         if what not in self._told:
             self._told.add(what)
             self._on_report(what)
-
-
-def ros_name(camera: str) -> str:
-    """A camera's name as part of the name of a topic, where a hyphen is not allowed, nor a digit in front."""
-    name = camera.replace("-", "_")
-    return f"_{name}" if name[0].isdigit() else name

@@ -1,12 +1,12 @@
 """usage: python -P node.py SOCKET
 
-A node of ROS 2 that subscribes to topics, and publishes text. Run by a Python that has rclpy; apart from that it needs
-the standard library alone. SOCKET is the number of an open socket to the process that starts it (AF_UNIX,
-SOCK_SEQPACKET), over which JSON passes.
+A node of ROS 2 that subscribes to topics, offers services, and publishes text. Run by a Python that has rclpy; apart
+from that it needs the standard library alone. SOCKET is the number of an open socket to the process that starts it
+(AF_UNIX, SOCK_SEQPACKET), over which JSON passes.
 
-To the node: first its task, then what it is to publish, each with topic, text and whether that is kept for late
-subscribers. From the node: messages with the key "kind"; a picture comes with a file descriptor of the memory that
-holds its data, see `Port.send_picture`. The node ends with its socket.
+To the node: first its task, then orders: texts to publish, each with topic and whether it is kept for late
+subscribers, pictures to publish, and answers to calls of services. From the node: messages with the key "kind". Either
+way a picture comes with a file descriptor of the memory that holds its data. The node ends with its socket.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ import socket
 import sys
 import threading
 import time
+import uuid
+from array import array
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,6 +35,8 @@ LOOK_S = 0.5  # how often topics are looked for
 CLOSE_NS, TRIES = 100_000, 10  # clocks read within this count as read at once, or else the closest of so many readings
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, its node not yet
 ABSENT_S = 5.0  # a topic without a picture for so long is reported
+LATE_NS = 200_000_000  # of pictures that wait for this node, those so much older than the newest are left out
+COUNT_S, MOST_LOST = 5.0, 0.05  # pictures are counted over so long; if more of them are lost, that is reported
 
 
 class Port:
@@ -52,10 +57,8 @@ class Port:
 
         If the other side is behind, the picture is lost: later ones count more.
         """
-        memory = os.memfd_create("picture")
+        memory = shared_memory(data)
         try:
-            while data:
-                data = data[os.write(memory, data) :]
             message = json.dumps({"kind": "picture", **values}).encode()
             socket.send_fds(self._socket, [message], [memory], socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -63,11 +66,71 @@ class Port:
         finally:
             os.close(memory)
 
-    def orders(self) -> Iterator[dict[str, Any]]:
-        """What is to be published, until the other side closes the connection, or is gone."""
+    def orders(self) -> Iterator[tuple[dict[str, Any], int]]:
+        """What is to be published or answered, until the other side closes the connection, or is gone.
+
+        yields  with the memory of a picture, to be closed; -1: it is none
+        """
         with suppress(OSError):
-            while order := self._socket.recv(MAX_MESSAGE_BYTES):
-                yield json.loads(order)
+            while True:
+                order, memory, _, _ = socket.recv_fds(self._socket, MAX_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC)
+                if not order:
+                    return
+                yield json.loads(order), memory[0] if memory else -1
+
+
+def shared_memory(data: memoryview | bytes) -> int:
+    """The file descriptor of new memory without a name that holds some data.
+
+    raises  OSError
+    """
+    memory, data = os.memfd_create("picture"), memoryview(data)
+    try:
+        while data:
+            data = data[os.write(memory, data) :]
+    except OSError:
+        os.close(memory)
+        raise
+    return memory
+
+
+class PictureCount:
+    """Counts the pictures of a topic that come to this node, and those that are lost before it passes them on."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bytes, int] = {}  # by publisher, number of its newest picture
+        self._since = time.monotonic()
+        self._lossy = False  # as reported
+        self._begin()
+
+    def _begin(self) -> None:
+        self._came = self._missing = 0  # the latter by the publishers' numbers
+        self.untransported = 0  # of those missing, as far as the middleware knows
+        self.late = 0  # of those that came
+
+    def add(self, info: dict[str, Any]) -> None:
+        """What comes with a picture. Not every middleware numbers pictures."""
+        self._came += 1
+        publisher, number = info.get("publisher_gid"), info.get("publication_sequence_number")
+        if publisher and number is not None:
+            last = self._newest.get(publisher["data"], number - 1)
+            self._missing += max(0, number - last - 1)
+            self._newest[publisher["data"]] = number
+
+    def take_news(self) -> str:
+        """Whether pictures are lost, and where; "" if nothing has changed. To be called every LOOK_S."""
+        if time.monotonic() - self._since < COUNT_S:
+            return ""
+        self._since = time.monotonic()
+        missing = max(self._missing, self.untransported)
+        lost, all_of_them = missing + self.late, missing + self._came
+        were, self._lossy = self._lossy, lost > MOST_LOST * all_of_them
+        here = lost - self.untransported
+        where = f"{self.untransported} between publisher and node, {here} since the node ran late"
+        self._begin()
+        if self._lossy and not were:
+            return f"{lost} of {all_of_them} pictures were lost, {where}; docs/ros.md states what helps"
+        return "no pictures are lost any more" if were and not self._lossy else ""
 
 
 class Topic:
@@ -81,6 +144,7 @@ class Topic:
         self._subscribed: tuple[str, QoSProfile] | None = None
         self._subscription: Any = None
         self._heard = time.monotonic()  # when the last picture came
+        self._losses = PictureCount()
         self._faults: set[str] = set()
 
     def look(self) -> None:
@@ -95,6 +159,8 @@ class Topic:
         if time.monotonic() - self._heard > ABSENT_S and not self._faults:
             why = "its publisher sends no picture" if publishers else "no publisher"
             self._fail(f"{why} for {ABSENT_S:g} s")
+        if news := self._losses.take_news():
+            self._port.say("report", topic=self._name, text=news)
 
     def _profile(self, publishers: list[Any]) -> QoSProfile:
         """What is asked for, otherwise what all publishers can serve."""
@@ -118,9 +184,11 @@ class Topic:
 
         if self._subscription:
             self._node.destroy_subscription(self._subscription)
-        message, take = (Image, self._on_image) if kind == IMAGE else (CompressedImage, self._on_compressed)
-        events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible, use_default_callbacks=False)
-        self._subscription = self._node.create_subscription(message, self._name, take, profile, event_callbacks=events)
+        message = Image if kind == IMAGE else CompressedImage
+        on = {"incompatible_qos": self._on_incompatible, "message_lost": self._on_lost}
+        events = SubscriptionEventCallbacks(**on, use_default_callbacks=False)
+        subscription = self._node.create_subscription(message, self._name, self._take, profile, event_callbacks=events)
+        self._subscription = subscription
         self._subscribed = kind, profile
 
     def _on_incompatible(self, event: Any) -> None:
@@ -130,14 +198,24 @@ class Topic:
         if asked := self._asked.get(policy):  # otherwise the next look subscribes with what is offered now
             self._fail(f"incompatible QoS: ros.qos asks for {policy} {asked}, its publisher offers less")
 
-    def _on_image(self, message: Any) -> None:
-        form = {"encoding": message.encoding, "width": message.width, "height": message.height, "step": message.step}
-        self._pass_on(message, **form, big=bool(message.is_bigendian))
+    def _on_lost(self, event: Any) -> None:
+        self._losses.untransported += event.total_count_change
 
-    def _on_compressed(self, message: Any) -> None:
-        self._pass_on(message, stated=message.format)
+    def _take(self, message: Any, info: dict[str, Any]) -> None:
+        """Pass on a picture and those that wait behind it. Where this node runs late, the newest win."""
+        waiting, handle = [(message, info)], self._subscription.handle
+        with handle:
+            while len(waiting) < self._asked["depth"] and (newer := handle.take_message(type(message), False)):
+                waiting.append(newer)
+        newest = waiting[-1][1]["source_timestamp"]
+        for picture, about in waiting:
+            self._losses.add(about)
+            if newest - about["source_timestamp"] > LATE_NS:
+                self._losses.late += 1
+            else:
+                self._pass_on(picture)
 
-    def _pass_on(self, message: Any, **form: Any) -> None:
+    def _pass_on(self, message: Any) -> None:
         """With its age by the node's clock, which may be that of a simulation; None: it has no stamp."""
         at, now = self._read_clocks()
         stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
@@ -148,7 +226,7 @@ class Topic:
             self._port.say("report", topic=self._name, text=f"pictures come again, after {silent_s:.0f} s")
         self._heard = time.monotonic()
         data = memoryview(message.data)
-        self._port.send_picture(data, topic=self._name, size=len(data), at=at, age=age, **form)
+        self._port.send_picture(data, topic=self._name, size=len(data), at=at, age=age, **form_of(message))
 
     def _read_clocks(self) -> tuple[int, int]:
         """CLOCK_MONOTONIC and the node's clock, ns; again if this process did not run between the two."""
@@ -164,43 +242,95 @@ class Topic:
             self._port.say("report", topic=self._name, text=why)
 
 
+def form_of(message: Any) -> dict[str, Any]:
+    """What is known about the data of an Image or a CompressedImage."""
+    if not hasattr(message, "encoding"):
+        return {"stated": message.format}
+    form = {"encoding": message.encoding, "width": message.width, "height": message.height, "step": message.step}
+    return {**form, "big": bool(message.is_bigendian)}
+
+
 class Input:
     """A topic whose messages are passed on as they come.
 
-    kind  text: std_msgs/String, number: std_msgs/Float64, fix: sensor_msgs/NavSatFix. Of numbers and positions only the
-          newest counts
+    kind  text: std_msgs/String, number: std_msgs/Float64, region: sensor_msgs/RegionOfInterest, all of which count;
+          fix: sensor_msgs/NavSatFix, newest_number: std_msgs/Float64, sign: std_msgs/Empty, of which the newest counts
     """
 
     def __init__(self, node: Node, port: Port, name: str, kind: str) -> None:
         from rclpy.qos import QoSProfile, ReliabilityPolicy
-        from sensor_msgs.msg import NavSatFix
-        from std_msgs.msg import Float64, String
+        from sensor_msgs.msg import NavSatFix, RegionOfInterest
+        from std_msgs.msg import Empty, Float64, String
 
         self._node, self._port, self._name, self._kind = node, port, name, kind
+        each = QoSProfile(depth=10)
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # is compatible with any publisher
         message, qos = {
-            "text": (String, QoSProfile(depth=10)),
-            "number": (Float64, newest),
+            "text": (String, each),
+            "number": (Float64, each),
+            "region": (RegionOfInterest, each),
+            "newest_number": (Float64, newest),
             "fix": (NavSatFix, newest),
+            "sign": (Empty, newest),
         }[kind]
         node.create_subscription(message, name, self._on_message, qos)
 
     def _on_message(self, message: Any) -> None:
-        if self._kind == "fix":
-            self._pass_on(lat=message.latitude, lon=message.longitude, fixed=message.status.status >= 0)
-        elif self._kind == "number":
-            self._pass_on(number=message.data)
-        elif len(message.data) <= MAX_TEXT:
-            self._pass_on(text=message.data)
-        else:
-            self._port.say("report", topic=self._name, text=f"a text is longer than {MAX_TEXT}: left out")
+        match self._kind:
+            case "fix":
+                self._pass_on(lat=message.latitude, lon=message.longitude, fixed=message.status.status >= 0)
+            case "newest_number":
+                self._pass_on(number=message.data, nodes=self._publishing_nodes())
+            case "number":
+                self._pass_on(number=message.data)
+            case "region":
+                corner = {"x": message.x_offset, "y": message.y_offset}
+                self._pass_on(**corner, width=message.width, height=message.height)
+            case "sign":
+                self._pass_on()
+            case _ if len(message.data) <= MAX_TEXT:
+                self._pass_on(text=message.data)
+            case _:
+                self._port.say("report", topic=self._name, text=f"a text is longer than {MAX_TEXT}: left out")
 
     def _pass_on(self, **values: Any) -> None:
-        """With the names of all nodes that publish the topic; none as long as one is unknown."""
+        self._port.say(self._kind, topic=self._name, **values)
+
+    def _publishing_nodes(self) -> list[str]:
+        """Names of all nodes that publish the topic; none as long as one is unknown."""
         publishers = self._node.get_publishers_info_by_topic(self._name)
         nodes = {f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers}
-        known = not any(UNKNOWN_NODE in name for name in nodes)
-        self._port.say(self._kind, topic=self._name, nodes=sorted(nodes) if known else [], **values)
+        return [] if any(UNKNOWN_NODE in name for name in nodes) else sorted(nodes)
+
+
+class Services:
+    """Services whose calls the other side of the port answers.
+
+    kinds  by name, trigger: std_srvs/Trigger, or switch: std_srvs/SetBool
+    """
+
+    def __init__(self, node: Node, port: Port, kinds: dict[str, str]) -> None:
+        self._port = port
+        self._waiting: dict[str, Any] = {}
+        if kinds:
+            from std_srvs.srv import SetBool, Trigger
+
+            for name, kind in kinds.items():
+                node.create_service(Trigger if kind == "trigger" else SetBool, name, partial(self._call, name))
+
+    async def _call(self, name: str, request: Any, response: Any) -> Any:
+        from rclpy.task import Future
+
+        call = uuid.uuid4().hex
+        self._waiting[call] = answer = Future()
+        self._port.say("call", topic=name, call=call, value=getattr(request, "data", None))
+        response.success, response.message = await answer
+        return response
+
+    def answer(self, order: dict[str, Any]) -> None:
+        """Calls of a node that ended since are left out."""
+        if answer := self._waiting.pop(order["call"], None):
+            answer.set_result((order["success"], order["text"]))
 
 
 class Outputs:
@@ -221,6 +351,79 @@ class Outputs:
         self._publishers[topic].publish(String(data=order["text"]))
 
 
+class Pictures:
+    """Publishers of sensor_msgs/Image and CameraInfo, made with the first picture for their topics. The newest wins."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._publishers = node, dict[str, tuple[Any, Any]]()
+        self._newest: dict[str, tuple[dict[str, Any], int]] = {}  # by topic: what is known, and the memory
+        self._lock = threading.Lock()
+
+    def put(self, order: dict[str, Any], memory: int) -> bool:
+        """Take a picture and its memory, from any thread. Returns False if one of its topic waits to be published."""
+        with self._lock:
+            before = self._newest.pop(order["picture"], None)
+            self._newest[order["picture"]] = order, memory
+        if before:
+            os.close(before[1])
+        return not before
+
+    def publish(self, topic: str) -> None:
+        """Publish the picture that waits."""
+        with self._lock:
+            order, memory = self._newest.pop(topic)
+        try:
+            image, info = self._publishers_of(topic)
+            header = {"frame_id": order["frame_id"], "stamp": divmod(order["stamp"], 1_000_000_000)}
+            if image.get_subscription_count():
+                image.publish(image_message(image.msg_type(), order, memory, header))
+            if info.get_subscription_count():
+                info.publish(info_message(info.msg_type(), order, header))
+        finally:
+            os.close(memory)
+
+    def _publishers_of(self, topic: str) -> tuple[Any, Any]:
+        from rclpy.qos import QoSProfile
+        from sensor_msgs.msg import CameraInfo, Image
+
+        if topic not in self._publishers:
+            kinds = ((Image, "image"), (CameraInfo, "camera_info"))
+            image, info = (
+                self._node.create_publisher(kind, f"{topic}/{name}", QoSProfile(depth=2)) for kind, name in kinds
+            )
+            self._publishers[topic] = image, info
+        return self._publishers[topic]
+
+
+def fill_header(message: Any, header: dict[str, Any]) -> None:
+    message.header.frame_id = header["frame_id"]
+    message.header.stamp.sec, message.header.stamp.nanosec = header["stamp"]
+
+
+def image_message(message: Any, order: dict[str, Any], memory: int, header: dict[str, Any]) -> Any:
+    fill_header(message, header)
+    message.width, message.height, message.step = order["width"], order["height"], order["step"]
+    message.encoding = order["encoding"]
+    data = array("B", bytes(order["step"] * order["height"]))
+    os.preadv(memory, [data], 0)
+    message.data = data
+    return message
+
+
+def info_message(message: Any, order: dict[str, Any], header: dict[str, Any]) -> Any:
+    """Of a picture whose intrinsics are unknown K is 0: sensor_msgs/CameraInfo."""
+    fill_header(message, header)
+    message.width, message.height = order["width"], order["height"]
+    if lens := order["intrinsics"]:
+        fx, fy, cx, cy = (lens[key] for key in ("fx", "fy", "cx", "cy"))
+        message.distortion_model = lens["model"]
+        message.d = [0.0] * (4 if lens["model"] == "equidistant" else 5)
+        message.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+        message.p = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    return message
+
+
 def run(port: Port, task: dict[str, Any]) -> None:
     """Be the node until the other side of the port closes it."""
     import rclpy
@@ -230,7 +433,7 @@ def run(port: Port, task: dict[str, Any]) -> None:
     topics = [Topic(node, port, name, asked) for name, asked in task["pictures"].items()]
     for name, kind in task["inputs"].items():
         Input(node, port, name, kind)
-    outputs = Outputs(node)
+    outputs, pictures, services = Outputs(node), Pictures(node), Services(node, port, task["services"])
 
     def look() -> None:
         for topic in topics:
@@ -241,8 +444,11 @@ def run(port: Port, task: dict[str, Any]) -> None:
     executor.add_node(node)
 
     def obey() -> None:
-        for order in port.orders():
-            executor.create_task(outputs.publish, order)
+        for order, memory in port.orders():
+            if memory < 0:
+                executor.create_task(services.answer if "call" in order else outputs.publish, order)
+            elif pictures.put(order, memory):
+                executor.create_task(pictures.publish, order["picture"])
         closed.set()
         executor.wake()
 

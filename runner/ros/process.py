@@ -24,6 +24,9 @@ RETRY_S = (1.0, 10.0)  # between two starts: doubled from the first value up to 
 END_S = 2.0
 LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
 
+PROFILE = Path(node.__file__).with_name("fastdds.xml")
+OWN_TRANSPORTS = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+
 Message = Mapping[str, Any]
 NOTHING: Mapping[str, str] = {}
 
@@ -46,7 +49,9 @@ class NodeProcess:
                 memory, which is then the callee's to close
     on_report   called with a topic and one line about it; "" stands for the node itself
     pictures    topics with pictures, to subscribe to
-    inputs      other topics to subscribe to, with the kind of their messages: text, number, fix
+    inputs      other topics to subscribe to, with the kind of their messages, see `runner.ros.node.Input`
+    services    to offer, with the kind of their calls, see `runner.ros.node.Services`; each is answered by `answer`
+    publishes   whether it publishes pictures, too, for which the middleware needs more shared memory than it takes
 
     Both are called from one thread.
     """
@@ -59,11 +64,17 @@ class NodeProcess:
         *,
         pictures: Iterable[str] = (),
         inputs: Mapping[str, str] = NOTHING,
+        services: Mapping[str, str] = NOTHING,
+        publishes: bool = False,
     ) -> None:
         self._settings, self._on_message, self._on_report = settings, on_message, on_report
         asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
         own = {key: getattr(settings, key) for key in ("node", "namespace", "use_sim_time")}
-        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, "inputs": dict(inputs)}
+        offered = {"inputs": dict(inputs), "services": dict(services)}
+        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, **offered}
+        self._environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
+        if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
+            self._environment["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
         self._kept: dict[str, str] = {}  # text by topic
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None  # while there is a process
@@ -95,14 +106,32 @@ class NodeProcess:
         with self._lock:
             if kept:
                 self._kept[topic] = text
-            self._send(topic, text, kept)
+            self._send(topic=topic, text=text, kept=kept)
 
-    def _send(self, topic: str, text: str, kept: bool) -> None:
+    def answer(self, call: str, success: bool, text: str) -> None:
+        """Answer a call of a service, from any thread."""
+        with self._lock:
+            self._send(call=call, success=success, text=text)
+
+    def publish_picture(self, picture: str, data: bytes, **about: Any) -> None:
+        """Publish a picture as PICTURE/image and PICTURE/camera_info, from any thread.
+
+        about  see `runner.ros.node.Pictures`
+        raises  OSError
+        """
+        memory = node.shared_memory(data)
+        try:
+            with self._lock:
+                self._send(memory, picture=picture, **about)
+        finally:
+            os.close(memory)
+
+    def _send(self, *memory: int, **values: Any) -> None:
         """Under the lock."""
-        order = json.dumps({"topic": topic, "text": text, "kept": kept}).encode()
+        order = json.dumps(values).encode()
         if self._socket and self._is_ready and len(order) <= node.MAX_MESSAGE_BYTES:
             with suppress(OSError):  # the node is behind, or has just ended
-                self._socket.send(order, socket.MSG_DONTWAIT)
+                socket.send_fds(self._socket, [order], memory, socket.MSG_DONTWAIT)
 
     def close(self) -> None:
         self._closing.set()
@@ -144,7 +173,7 @@ class NodeProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,  # what rclpy prints is in its own log, too
-                env={**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": self._settings.discovery.upper()},
+                env={**os.environ, **self._environment},
                 pass_fds=[its.fileno()],
                 start_new_session=True,
             )
@@ -178,7 +207,7 @@ class NodeProcess:
                 with self._lock:
                     self._is_ready = True
                     for topic, text in self._kept.items():
-                        self._send(topic, text, True)
+                        self._send(topic=topic, text=text, kept=True)
                 if self._fault:
                     self._fault = ""
                     self._on_report("", "the ROS node works again")

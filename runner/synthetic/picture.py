@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.clips import View
+from runner.core.intrinsics import focal_px
 from runner.core.model import Pose
 from runner.synthetic.world import (
     GROUND,
@@ -96,16 +97,12 @@ def directions(view: View) -> Array:
     i = np.arange(0, view.width + 1, 2)[None, :] + 0.5 - view.width / 2
     j = np.arange(0, view.height + 1, 2)[:, None] + 0.5 - view.height / 2
     radius = np.hypot(i, j)
-    angle = radius / focal_px(view) if view.lens == "fisheye" else np.arctan(radius / focal_px(view))
+    angle = radius / focal_px(view.lens, view.fov_deg, view.width)
+    if view.lens != "fisheye":
+        angle = np.arctan(angle)
     aside = np.sin(angle) / radius
     unit: Array = np.cos(angle)[..., None] * forward + (aside * i)[..., None] * right + (aside * j)[..., None] * down
     return unit
-
-
-def focal_px(view: View) -> float:
-    """Focal length: px per unit of tangent (pinhole) or per radian (equidistant fisheye)."""
-    half = math.radians(view.fov_deg / 2)
-    return view.width / 2 / (half if view.lens == "fisheye" else math.tan(half))
 
 
 def cast_rays(view: View, ground_per_m: float, sky_per_m: float) -> Rays:
@@ -161,7 +158,7 @@ def pictures(view: View, seconds: float, world: Path) -> Iterator[bytes]:
         x, y, heading = course.at(frame / frames)
         cos, sin = math.cos(heading), math.sin(heading)
         eye = np.array([x + cos * mount.x_m - sin * mount.y_m, y + sin * mount.x_m + cos * mount.y_m, mount.z_m])
-        pixel = 0.8 / focal_px(view)
+        pixel = 0.8 / focal_px(view.lens, view.fov_deg, view.width)
         cover(
             layers, distance, planes, faces.ends, faces.along_m, faces.texture,
             eye, cos, sin, compass, pixel, atlas.per_m,

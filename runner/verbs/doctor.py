@@ -92,7 +92,8 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
     subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
-    if verb == "ros" or (subscribes and verb in ("vehicle", "demo")):
+    publishes = vehicle.ros.pictures and verb in ("operator", "demo")
+    if verb == "ros" or publishes or (subscribes and verb in ("vehicle", "demo")):
         yield _rclpy(vehicle.ros.python)
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
 import threading
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
-from ros_domain import MARKS, PYTHON, domain  # noqa: F401
+from ros_domain import MARKS, NODE, PYTHON, client, domain  # noqa: F401
 
 from keyed import VEHICLE, WATCHER, issue
 from rig import SMALL_ROBOT, Operator, children_named, free_port, process, until, watching
@@ -21,49 +18,7 @@ from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
 pytestmark = MARKS
-NODE = "/tod_runner"
 HEARD = [f"{NODE}/{name}" for name in ("state", "telemetry", "reply", "url/front", "url/rear")]
-
-
-class Client:
-    """A node of ROS 2 in its own process; see ros_client.py."""
-
-    def __init__(self, name, *topics):
-        script = Path(__file__).with_name("ros_client.py")
-        self.process = subprocess.Popen(
-            [str(PYTHON), "-P", str(script), name, *topics], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        self.heard = []  # topic, text
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self):
-        for line in self.process.stdout:
-            self.heard.append(tuple(json.loads(line)))
-
-    def publish(self, topic, **value):
-        self.process.stdin.write(json.dumps({"topic": topic, **value}) + "\n")
-        self.process.stdin.flush()
-
-    def texts(self, topic):
-        return [text for name, text in tuple(self.heard) if name == f"{NODE}/{topic}"]
-
-    def newest(self, topic):
-        return json.loads(until(lambda: self.texts(topic))[-1])
-
-    def ask(self, **event):
-        before = len(self.texts("reply"))
-        self.publish(f"{NODE}/request", text=json.dumps(event))
-        return json.loads(until(lambda: self.texts("reply")[before:])[0])
-
-
-@contextmanager
-def client(name, *topics):
-    node = Client(name, *topics)
-    try:
-        yield node
-    finally:
-        node.process.stdin.close()
-        node.process.wait(20)
 
 
 @pytest.fixture
@@ -87,7 +42,8 @@ def bridged(lines, *words, keys=None):
         process("vehicle", *both, *of[0]) as vehicle,
         process("ros", *both, *of[1], *words) as bridge,
     ):
-        threading.Thread(target=lambda: lines.extend(bridge.stdout), daemon=True).start()
+        for side in (vehicle, bridge):
+            threading.Thread(target=lambda side=side: lines.extend(side.stdout), daemon=True).start()
         until(lambda: told(lines, "requests have the id"))
         yield both, broker, (vehicle, bridge)
 
@@ -122,6 +78,44 @@ def test_requests_are_answered_and_a_late_subscriber_knows_all(lines):
         reply = until(lambda: offline(operator))
         assert reply["result"] == "refused"
     assert told(lines, "Traceback") == []
+
+
+def test_operator_inputs_are_topics_and_services(lines):
+    """Of an interface that knows nothing of this project's JSON."""
+    remap = f"ros.remap={{{NODE}/camera/front/kbps: /operator/bitrate, {NODE}/mode/single: /operator/manual}}"
+    with bridged(lines, remap) as (_, _, (vehicle, _)), client("interface", *HEARD) as operator:
+        until(lambda: operator.texts("telemetry"))
+        assert operator.call("mode/collective") == [True, "applied"]
+        reply = operator.set("total_kbps", number=2500.0)
+        assert (reply["id"], reply["result"]) == ("~/total_kbps 2", "applied")
+        assert operator.call("/operator/manual") == [True, "applied"]
+        assert operator.set("/operator/bitrate", number=700.0)["result"] == "applied"
+        assert operator.set("camera/front/scaling", number=0.5)["result"] == "applied"
+        assert operator.set("camera/front/roi", region=[16, 20, 160, 90])["result"] == "applied"
+        decided = until(lambda: with_roi(operator, {"x": 16, "y": 20, "width": 160, "height": 90}))
+        assert (decided["kbps"], decided["scaling"]) == (700, 0.5)
+        assert operator.set("camera/front/roi", region=[0, 0, 0, 0])["result"] == "applied"
+        until(lambda: with_roi(operator, {"x": 0, "y": 0, "width": 320, "height": 180}))
+        switched = operator.call("camera/rear/switch", False)
+        assert switched == [True, "applied: nobody watches rear: kept until somebody does"]
+        until(lambda: not operator.newest("state")["cameras"]["rear"]["on"])
+
+        for number, reason in ((float("nan"), "nan: must be a number"), (-1.0, "kbps: -1")):
+            reply = operator.set("/operator/bitrate", number=number)
+            assert reply["result"] == "refused"
+            assert reason in reply["reason"]
+        until(lambda: [operator.publish(f"{NODE}/operator_connected", empty=True), told(lines, "is present")][-1])
+        until(lambda: told(lines, "has been silent for 1 s"))  # nobody else speaks for it
+
+        vehicle.terminate()
+        until(lambda: operator.texts("state")[-1] == '{"online": false}')
+        until(lambda: operator.call("/operator/manual") == [False, "refused: the vehicle is offline"])
+    assert told(lines, "Traceback") == []
+
+
+def with_roi(operator, roi):
+    decided = operator.newest("state")["cameras"]["front"]
+    return decided if decided["roi"] == roi else None
 
 
 def offline(operator):
@@ -167,6 +161,10 @@ def test_requests_have_the_role_of_their_keys(lines, tmp_path):
     assert told(lines, f"requests have the id {WATCHER}")
 
 
+def position(reader):
+    return reader.newest("telemetry").get("position")
+
+
 def predicted(reader):
     return reader.newest("telemetry")["predicted_kbps"]
 
@@ -175,9 +173,12 @@ def test_positions_and_predictions_of_one_named_node(lines):
     words = ["ros.position=/gps/fix", "ros.prediction={topic: /pqos/kbps, node: /pqos}"]
     with bridged(lines, *words) as (_, broker, _), client("pqos") as pqos, client("interface", *HEARD) as reader:
         reader.newest("telemetry")
+        reply = reader.ask(id="one", event="operator_connected")
+        assert (reply["result"], reply["reason"][:34]) == ("refused", "this node reports positions or pre")
         pqos.publish("/gps/fix", fix=[1.0, 2.0, -1])  # without a fix
-        pqos.publish("/gps/fix", fix=[48.25, 11.5, 0])
-        until(lambda: reader.newest("telemetry").get("position") == {"lat": 48.25, "lon": 11.5})
+        here = {"lat": 48.25, "lon": 11.5}
+        # Best effort: what is published before the node has discovered the publisher is lost.
+        until(lambda: [pqos.publish("/gps/fix", fix=[48.25, 11.5, 0]), position(reader) == here][-1], every_s=0.1)
         # Its node is discovered a moment after its topic.
         until(lambda: [pqos.publish("/pqos/kbps", number=2345.0), predicted(reader) == 2345][-1], every_s=0.1)
         with client("impostor") as other:

@@ -1,0 +1,161 @@
+"""A clip as image topics of ROS 2, through vehicle and operator, to a subscriber: what arrives, how large, how late.
+
+  python bench/ros.py CLIP.mp4
+  python bench/ros.py CLIP.mp4 --cameras 2 --fps 2 --seconds 20
+
+Starts a node that publishes the clip as topics of 480x270 (reliable, all at once), the demo with source=ros and
+ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C with a
+fifth of the bitrate, and smaller pictures. Needs `make ros2`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+from rig import CHECKOUT, free_port
+from runner.configuration.config import configuration
+from runner.ros.inputs import ros_name
+from runner.ros.process import PROFILE
+
+PYTHON = CHECKOUT / ".venv-ros2/bin/python"
+WIDTH, HEIGHT = 480, 270
+PICTURES = 100  # of the clip, which repeat
+KBPS = 500  # for each camera in mode A
+END_S = 20.0
+NODE = "/tod_runner_operator"
+
+
+class Row(NamedTuple):
+    """A camera: pictures published and delivered with a stamp, between the first and the last of these.
+
+    sizes    before and after the change of the mode, px
+    late_ms  latencies from stamp to subscriber, ms
+    """
+
+    camera: str
+    published: int
+    delivered: int
+    sizes: tuple[str, str]
+    late_ms: list[float]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clip", type=Path)
+    for name, default in (("cameras", 8), ("fps", 10), ("seconds", 30)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    asked = parser.parse_args()
+    if not PYTHON.is_file():
+        print(f"{PYTHON}: no such file; `make ros2` makes it", file=sys.stderr)
+        return 1
+    cameras = list(configuration([]).vehicle().cameras)[: asked.cameras]
+    os.environ |= {"ROS_DOMAIN_ID": str(random.randrange(1, 100)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with tempfile.NamedTemporaryFile(suffix=".bgr") as file:
+        try:
+            file.write(pictures_of(asked.clip))
+        except ValueError as error:
+            print(error, file=sys.stderr)
+            return 1
+        file.flush()
+        topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
+        decoded = {name: f"{NODE}/camera/{ros_name(name)}/image" for name in cameras}
+        form = map(str, (file.name, WIDTH, HEIGHT, asked.fps))
+        with node("publish", *form, *topics.values()) as publisher, node("subscribe", *decoded.values()) as subscriber:
+            status = subprocess.run(demo(topics, asked.fps, asked.seconds), check=False, cwd=CHECKOUT).returncode
+            delivered, published = ended(subscriber), ended(publisher)
+    if status == 0:
+        show([row(name, published[topics[name]], delivered[decoded[name]]) for name in cameras])
+    return status
+
+
+def pictures_of(clip: Path) -> bytes:
+    """The first pictures of a clip, as BGR.
+
+    raises  ValueError if there are none
+    """
+    video, rows = cv2.VideoCapture(str(clip)), []
+    while len(rows) < PICTURES and (read := video.read())[0]:
+        rows.append(cv2.resize(read[1], (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).tobytes())
+    if not rows:
+        raise ValueError(f"{clip}: no pictures can be read")
+    return b"".join(rows)
+
+
+def demo(topics: Mapping[str, str], fps: int, seconds: int) -> list[str]:
+    left_out = [f"~cameras.{name}" for name in configuration([]).vehicle().cameras if name not in topics]
+    mounted = [f"cameras.{name}.topic={topic}" for name, topic in topics.items()]
+    size = [f"cameras.{name}.{key}" for name in topics for key in (f"width_px={WIDTH}", f"height_px={HEIGHT}")]
+    total = KBPS * len(topics)
+    change = f"{{at_s: {seconds // 2}, request: {{event: mode_selected, mode: collective}}}}"
+    less = f"{{at_s: {seconds // 2}, request: {{event: total_set, kbps: {total // 5}}}}}"
+    # A little more than the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
+    own = [
+        "source=ros",
+        "modes=paper",
+        f"fps_max={fps * 1.2:g}",
+        f"ros.python={PYTHON}",
+        "ros.pictures=true",
+        "page.serve=false",
+    ]
+    own += ["pqos=constant", f"pqos.kbps={total}", f"+experiment.requests=[{change}, {less}]"]
+    own += ["+experiment.about='Image topics of ROS 2'", f"+experiment.duration_s={seconds}"]
+    own += [f"media.port={free_port()}", f"control.port={free_port()}", f"duration_s={seconds}"]
+    return [sys.executable, "-m", "runner", "demo", *left_out, *mounted, *size, *own]
+
+
+@contextmanager
+def node(*words: str) -> Iterator[subprocess.Popen[str]]:
+    command = [str(PYTHON), "-P", str(Path(__file__).with_name("ros_node.py")), *words]
+    environment = {**os.environ, "FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen[str]) -> dict[str, list[Any]]:
+    """What a node has seen, by topic."""
+    seen: dict[str, list[Any]] = json.loads(process.communicate(timeout=END_S)[0])
+    return seen
+
+
+def row(camera: str, published: Sequence[float], delivered: Sequence[Sequence[float]]) -> Row:
+    stamped = [one for one in delivered if one[0]]  # a picture whose capture time is unknown has a stamp of 0
+    if not stamped:
+        return Row(camera, len(published), len(delivered), ("-", "-"), [])
+    first, last = stamped[0][0] - 0.01, stamped[-1][0] + 0.01  # stamps change a little on their way
+    sizes = [f"{width}x{height}" for _, width, height, _ in stamped]
+    sent = sum(first <= stamp <= last for stamp in published)
+    return Row(camera, sent, len(stamped), (sizes[len(sizes) // 4], sizes[-1]), [1e3 * one[3] for one in stamped])
+
+
+def show(rows: Sequence[Row]) -> None:
+    every = [late for one in rows for late in one.late_ms]
+    total = Row("all", sum(one.published for one in rows), sum(one.delivered for one in rows), ("", ""), every)
+    heads = ("published", "delivered", "", "mode A", "mode C", "p50 ms", "p95 ms")
+    print(f"{'camera':14}" + "".join(f"{head:>10}" for head in heads))
+    for one in (*rows, total):
+        late = [f"{np.percentile(one.late_ms, percent):.1f}" if one.late_ms else "-" for percent in (50, 95)]
+        share = f"{100 * one.delivered / one.published:.1f} %" if one.published else "-"
+        cells = (one.published, one.delivered, share, *one.sizes, *late)
+        print(f"{one.camera:14}" + "".join(f"{cell:>10}" for cell in cells))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,19 @@
+"""A package of ROS 2 without code of its own: launch files."""
+
+from glob import glob
+from xml.etree import ElementTree
+
+from setuptools import setup
+
+NAME = "tod_runner_launch"
+
+setup(
+    name=NAME,
+    version=ElementTree.parse("package.xml").findtext("version"),
+    packages=[],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.xml"))),
+    ],
+)

@@ -1,0 +1,89 @@
+"""Decoded pictures as topics of ROS 2: of a real vehicle, through a real operator's side, with real rclpy."""
+
+from __future__ import annotations
+
+import time
+from math import radians, tan
+
+import pytest
+from ros_domain import MARKS, PYTHON, client, domain  # noqa: F401
+
+from rig import Operator, free_port, process, until
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+pytestmark = MARKS
+NODE = "/tod_runner_operator"
+IMAGE, INFO = f"{NODE}/camera/front/image", f"{NODE}/camera/front/camera_info"
+SPOT, NATIVE = (204, 204), (1280, 960)  # centre of a white square of 8 px, in the native picture
+EDGES = (
+    f"{{left: {4 - SPOT[0]}, right: {SPOT[0] + 4 - NATIVE[0]}, top: {4 - SPOT[1]}, bottom: {SPOT[1] + 4 - NATIVE[1]}}}"
+)
+ELEMENTS = ", ".join(
+    (
+        "{name: source, element: videotestsrc, properties: {is-live: true, pattern: white}}",
+        "{name: small, element: capsfilter, properties: "
+        "{caps: 'video/x-raw,format=I420,width=8,height=8,framerate=10/1'}}",
+        f"{{name: spot, element: videobox, properties: {EDGES}}}",
+        "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}",
+    )
+)
+FOCAL = {"pinhole": 640 / tan(radians(50)), "fisheye": 640 / radians(50)}  # of 100 degrees
+WORDS = (
+    *("vehicle=delivery_robot", "~cameras.rear", "~cameras.mast", "cameras.front.width_px=320"),
+    *(
+        "cameras.front.height_px=180",
+        "cameras.front.fov_deg=100",
+        "source=test",
+        f"source.elements=[{ELEMENTS}]",
+        "fps_max=10",
+        "modes=open_loop",
+    ),
+    *("pqos=constant", "pqos.kbps=3000", "page.serve=false"),
+)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_a_point_is_where_camera_info_says(lens):
+    """After the crop of the native picture, and then with a region of interest and a factor, too."""
+    broker = Endpoint("127.0.0.1", free_port())
+    words = [*WORDS, f"cameras.front.lens={lens}", f"control.port={broker.port}", f"media.port={free_port()}"]
+    asker = None
+    with (
+        private_broker(broker),
+        process("vehicle", *words),
+        process("operator", *words, "ros.pictures=true", f"ros.python={PYTHON}"),
+        client("viewer", IMAGE, INFO) as viewer,
+    ):
+        until(lambda: close(viewer, lens), every_s=0.2)
+        image = viewer.texts(IMAGE)[-1]
+        assert (image["frame_id"], image["encoding"]) == ("front_optical_frame", "rgb8")
+        assert 0 < time.time() - image["stamp"] < 20
+        asker = Operator(broker)
+        region = {"x": 104, "y": 34, "width": 160, "height": 90}
+        for event in (
+            {"event": "mode_selected", "mode": "single"},
+            {"event": "camera_configured", "camera": "front", "kbps": 1000, "scaling": 0.5},
+            {"event": "roi_set", "camera": "front", **region},
+        ):
+            assert asker.ask("x", **event)["result"] == "applied"
+        until(lambda: close(viewer, lens) == (80, 46), every_s=0.2)
+        asker.link.close()
+
+
+def close(viewer, lens):
+    """The size of the newest picture if its spot is within 1 px of where its camera_info says, otherwise None."""
+    infos = {info["stamp"]: info for info in viewer.texts(INFO)}
+    both = [(image, infos[image["stamp"]]) for image in viewer.texts(IMAGE) if image["stamp"] in infos]
+    if not both or not both[-1][1]["k"][0]:
+        return None
+    image, info = both[-1]
+    fx, cx, fy, cy = (info["k"][place] for place in (0, 2, 4, 5))
+    assert info["model"] == {"pinhole": "plumb_bob", "fisheye": "equidistant"}[lens]
+    assert (info["width"], info["height"]) == (image["width"], image["height"])
+    # In units of the native focal length the spot is as far from the axis in both lenses' models.
+    across, down = ((spot - side / 2) / FOCAL[lens] for spot, side in zip(SPOT, NATIVE, strict=True))
+    found = image["spot"]
+    if not found or max(abs(found[0] - fx * across - cx), abs(found[1] - fy * down - cy)) >= 1:
+        return None
+    return image["width"], image["height"]
