@@ -24,7 +24,7 @@ from runner.errors import ConfigError
 MOUNT = "validated"  # name under which a kind of camera is mounted
 # Groups whose files fill the key of their name.
 SECTIONS = tuple(group for group in GROUPS if group not in (*WHOLE, "cameras"))
-OF_A_VEHICLE = ("name", "cameras")  # keys
+OF_A_VEHICLE = ("name", "cameras", "dimensions")  # keys
 REFERENCE = re.compile(r"\$\{\s*(\w+)")
 Choices = Mapping[str, str]  # file by group
 
@@ -77,7 +77,8 @@ class Combinations:
         if "cameras" in own:
             own["cameras"] = {**base["cameras"], MOUNT: own["cameras"]}
         vehicle = own.pop("vehicle", None) or {}
-        document = {**base, **own, **vehicle}
+        others = {key for key in OF_A_VEHICLE if vehicle} - vehicle.keys()  # of the vehicle that the overrides name
+        document = {key: value for key, value in {**base, **own, **vehicle}.items() if key not in others}
         return Composed(document, [Part("", (), document)])
 
     @cached_property

@@ -90,6 +90,8 @@ def soak(seed: int, scale: float) -> list[str]:
     dice, problems = random.Random(seed), []
     with running("mode=single", "page.serve=false") as (system, operator):
         problems += _measured(system, "resizes", round(RESIZES * scale), _resized(operator, dice))
+        problems += system.tracebacks()
+    with running("mode=single", "page.serve=false") as (system, _):
         problems += _measured(system, "reconnects", round(RECONNECTS * scale), _reconnected(system, dice, problems))
         problems += system.tracebacks()
     with TemporaryDirectory(prefix="tod-soak-conf-") as conf, Door() as door:
