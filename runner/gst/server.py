@@ -421,7 +421,7 @@ class CameraServer:
         """
         for name in cameras:
             for connection in self._watching(name):
-                transport = connection.cameras[name]
+                transport = connection.cameras.get(name)  # which its client's thread may have left in the meantime
                 if transport:
                     transport.message_sent()
 
