@@ -289,7 +289,7 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size
-        full = camera.crop or camera.full_roi
+        full = camera.in_source
         left, top = full.x + value.x, full.y + value.y
         right, bottom = native_width - left - value.width, native_height - top - value.height
         return {"left": left, "right": right, "top": top, "bottom": bottom}

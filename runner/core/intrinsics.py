@@ -51,13 +51,12 @@ def delivered_intrinsics(camera: Camera, roi: Roi, width: int, height: int) -> I
     if camera.lens != "fisheye" and camera.fov_deg >= PINHOLE_DEG:
         return None
     native_width, native_height = camera.source_size
-    left, top = (camera.crop.x, camera.crop.y) if camera.native and camera.crop else (0, 0)
     across, down = width / roi.width, height / roi.height
     focal = focal_px(camera.lens, camera.fov_deg, native_width)
     return Intrinsics(
         "equidistant" if camera.lens == "fisheye" else "plumb_bob",
         focal * across,
         focal * down,
-        (native_width / 2 - left - roi.x) * across - 0.5,
-        (native_height / 2 - top - roi.y) * down - 0.5,
+        (native_width / 2 - camera.in_source.x - roi.x) * across - 0.5,
+        (native_height / 2 - camera.in_source.y - roi.y) * down - 0.5,
     )

@@ -394,6 +394,11 @@ class Camera:
         return self.native or (self.width, self.height)
 
     @property
+    def in_source(self) -> Roi:
+        """The full image within the source's image."""
+        return self.crop or self.full_roi
+
+    @property
     def topic(self) -> str | None:
         """The topic of ROS 2 that its source subscribes to; None: it does not, or none is named."""
         topic = self.mount.get("topic", self.source.settings.get("topic"))

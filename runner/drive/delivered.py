@@ -252,7 +252,7 @@ def _scenes(
     if clip is None:
         size = (camera.width, camera.height)
         return {ns: picture for ns, picture in videos.pictures(sent, size) if ns in wanted}
-    crop = camera.crop or camera.full_roi
+    crop = camera.in_source
     width, height = camera.source_size
     window = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
     clipped = [_thumbnail(picture[window]) for _, picture in videos.decode(clip, width, height)]

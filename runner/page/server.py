@@ -447,8 +447,7 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
 def _native(camera: Camera) -> dict[str, int]:
     """The source's image, and where the full image begins in it, px."""
     width, height = camera.source_size
-    left, top = (camera.crop.x, camera.crop.y) if camera.crop else (0, 0)
-    return {"width": width, "height": height, "left": left, "top": top}
+    return {"width": width, "height": height, "left": camera.in_source.x, "top": camera.in_source.y}
 
 
 def _tls(keyring: Keyring) -> ssl.SSLContext:

@@ -103,7 +103,7 @@ def to_yaml(measured: Measured) -> str:
     ]
     if camera.native:
         width, height = camera.native
-        left, top = (camera.crop.x, camera.crop.y) if camera.crop else (0, 0)
+        left, top = camera.in_source.x, camera.in_source.y
         lines.append(f"native: {{width_px: {width}, height_px: {height}, left_px: {left}, top_px: {top}}}")
     lines += [
         "rate_quality:",

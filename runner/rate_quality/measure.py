@@ -105,7 +105,7 @@ def _sweep(
     except ModelError as error:
         raise UserError("command line", error.key, str(error.found), error.rule) from None
     plan = compile_graph(camera, vehicle.media)
-    roi = camera.crop or camera.full_roi
+    roi = camera.in_source
     before, behind = cut(plan)
     mask = study.masks.get(name)
     key_interval = round(float(camera.graph.settings.get("key_interval_s", 0)) * float(camera.fps))

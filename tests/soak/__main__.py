@@ -80,7 +80,7 @@ def main(chosen: Sequence[str]) -> int:
     if len(chosen) == 1:
         return _run(chosen[0], seed, scale)
     print(f"seed {seed}, scale {scale:g}", flush=True)
-    os.environ["SOAK_SEED"] = str(seed)
+    os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1"}  # of the parts, whose lines are to come at once
     lanes = [[name for name in chosen or PARTS if (name in ASIDE) == aside] for aside in (False, True)]
     with ThreadPoolExecutor(len(lanes)) as pool:
         failed = [name for names in pool.map(_run_each, lanes) for name in names]
