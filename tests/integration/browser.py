@@ -99,16 +99,24 @@ BOXES = """() => {
   const isCut = ({ scrollWidth, clientWidth }) => clientWidth && scrollWidth > clientWidth + 1;
   const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
-  const { scrollWidth, scrollHeight } = document.scrollingElement;
-  return [
-    Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
-    {
-      outside: find(".tile, .picture, #header > *, #side, #drive *").filter((each) => isOutside(box(each))).map(named),
-      cut: find("#drive *, .tile .head, .tile .head *, .tile .caption, #header *").filter(isCut).map(named),
-      low: find("#drive > *").filter(isLow).map(named),
-      scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
-    },
-  ];
+  const seen = ".tile, .picture, #header > *, #side, #drive *";
+  const measured = () => {
+    const { scrollWidth, scrollHeight } = document.scrollingElement;
+    return [
+      Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
+      {
+        outside: find(seen).filter((each) => isOutside(box(each))).map(named),
+        cut: find("#drive *, .tile .head, .tile .head *, .tile .caption, #header *").filter(isCut).map(named),
+        low: find("#drive > *").filter(isLow).map(named),
+        scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
+      },
+    ];
+  };
+  // The page places its pictures in a ResizeObserver, between layout and paint. This observer runs after that one;
+  // at any other time the layout may be one that is never painted, as when a banner has just appeared.
+  return new Promise((done) => {
+    new ResizeObserver((_, self) => (self.disconnect(), done(measured()))).observe(document.documentElement);
+  });
 }"""
 
 
