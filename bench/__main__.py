@@ -16,7 +16,7 @@ from pathlib import Path
 
 from table import machine, show, write
 
-BENCHES = ("cost", "live", "link", "page", "replay", "validate", "pqos_map")
+BENCHES = ("cost", "memory", "live", "link", "page", "replay", "validate", "pqos_map")
 
 
 def main(words: list[str]) -> int:

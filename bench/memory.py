@@ -1,0 +1,87 @@
+"""Where the memory of the vehicle's process lies: by step of its start, by camera, and by element of a pipeline.
+
+  python bench/memory.py                                  three cameras, three runs: three minutes
+  python bench/memory.py vehicle=tum_q7 fps_max=0         Table I
+
+Each row is what a step added to the resident memory, median of the runs. Steps of the vehicle follow each other in one
+process, as in its start. Elements are those of the first camera, in bare pipelines that are cut off behind each of
+them; what one frees for a later one, such as a pool of pictures, is not seen. Words are overrides of the vehicle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from cost import WORDS
+from table import Row, show
+
+from runner.apply import check_plan
+from runner.configuration.config import configuration
+from runner.core.commands import wanted
+from runner.core.model import Endpoint
+from runner.graph import launch, turn_elements
+from runner.mqtt.broker import private_broker
+from runner.plans import compile_plans
+from runner.verbs.print import decide
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+from rig import free_port
+
+RUNS = 3
+LIMIT_S = 120.0
+STEPS = Path(__file__).parent / "memory_steps.py"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=RUNS)
+    parser.add_argument("words", nargs="*")
+    given = parser.parse_args()
+    show(rows(given.runs, given.words))
+
+
+def rows(runs: int = RUNS, words: Sequence[str] = ()) -> list[Row]:
+    words = [*WORDS, *words]
+    steps = _vehicle(words, runs)
+    whole = Row("memory: vehicle's process, all of it", sum(row.value for row in steps), "MB")
+    return [*steps, whole, *_elements(words, runs)]
+
+
+def _vehicle(words: Sequence[str], runs: int) -> list[Row]:
+    grown = []
+    for _ in range(runs):
+        broker = Endpoint("127.0.0.1", free_port())
+        with private_broker(broker):
+            grown.append(_output("vehicle", *words, f"media.port={free_port()}", f"control.port={broker.port}"))
+    return [Row(f"memory: {step}", median(each[step] for each in grown), "MB") for step in grown[0]]
+
+
+def _elements(words: Sequence[str], runs: int) -> list[Row]:
+    vehicle = configuration(words, check=check_plan).vehicle()
+    plan = compile_plans(vehicle)[0]
+    knobs = wanted(decide(vehicle, None).settings[plan.camera.name])
+    elements = turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs)
+    rows, before = [], 0.0
+    for count, element in enumerate(elements, start=1):
+        line = f"{launch(elements[:count])} ! fakesink sync=false"
+        now = median(_output("pipeline", line) for _ in range(runs))
+        named = element.factory if count > 1 else f"interpreter, GStreamer and {element.factory}"
+        rows.append(Row(f"memory: pipeline of {plan.camera.name}: {named}", now - before, "MB"))
+        before = now
+    return rows
+
+
+def _output(*command: str) -> Any:
+    done = subprocess.run([sys.executable, STEPS, *command], check=True, stdout=subprocess.PIPE, timeout=LIMIT_S)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+if __name__ == "__main__":
+    main()
