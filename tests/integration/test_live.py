@@ -12,6 +12,7 @@ import pytest
 from rig import CLIPS, ROBOT, SHARED, SMALL_ROBOT, Operator, free_port, process, run, until
 from runner.core.events import BitratePredicted, CameraSwitched
 from runner.core.model import Endpoint
+from runner.drive.log import FILES
 from runner.drive.read import read_drive
 from runner.errors import RunError
 from runner.mqtt.broker import private_broker
@@ -271,6 +272,29 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
     again = run("demo", *words)
     assert again.returncode == 2
     assert again.stderr.startswith(f"command line: output: '{tmp_path / 'out'}': must be a new or an empty directory")
+
+
+@pytest.mark.soak
+def test_a_sweep_drives_each_of_its_runs_as_if_started_alone(tmp_path):
+    ports = ("page.serve=false", f"media.port={free_port()}", f"control.port={free_port()}")
+    words = (*ROBOT, *ports, "duration_s=3", "cameras.front.weight=1,3")
+    wrong = run("demo", "-m", *words, "modes=paper,nothing", f"log={tmp_path / 'wrong'}")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert not (tmp_path / "wrong").exists()  # nothing ran
+
+    done = run("demo", "-m", *words, f"log={tmp_path / 'log'}", f"output={tmp_path / 'out'}")
+    assert done.returncode == 0, done.stderr
+    for directory in (tmp_path / "log", tmp_path / "out"):
+        lines = [json.loads(line) for line in (directory / "runs.jsonl").read_text().splitlines()]
+        assert [line["directory"] for line in lines] == ["0", "1"]
+        assert [line["overrides"][-1] for line in lines] == ["cameras.front.weight=1", "cameras.front.weight=3"]
+    for name, weight in (("0", 1), ("1", 3)):
+        drive = read_drive(tmp_path / "log" / name)
+        assert (sorted(drive.sides), drive.warnings) == (["operator", "vehicle"], [])
+        assert [*drive.sides["operator"].of(Sample)][-1].cameras["front"].frames > 0
+        first = json.loads((tmp_path / "log" / name / FILES["vehicle"]).read_text().splitlines()[0])
+        assert first["config"]["cameras"]["front"]["weight"] == weight
+        assert (tmp_path / "out" / name / "index.html").exists()
 
 
 @pytest.mark.skipif(not CLIPS, reason="needs the recorded clips")
