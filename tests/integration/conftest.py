@@ -18,7 +18,16 @@ from runner.mqtt.broker import private_broker
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
 # Started first, so that no worker is left with a long file at the end.
-LONGEST = ("test_docs", "test_page", "test_live", "test_secure", "test_server", "test_control", "test_ip_camera")
+LONGEST = (
+    "test_feedback",
+    "test_docs",
+    "test_page",
+    "test_live",
+    "test_secure",
+    "test_server",
+    "test_control",
+    "test_ip_camera",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

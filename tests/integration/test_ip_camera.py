@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import threading
 import time
 from contextlib import ExitStack, contextmanager
 
+import pytest
+
 from rig import free_port, ip_camera, streaming, until, watching
 from runner.core.commands import Command
 
-FROZEN_S = 15
 WORDS = ("vehicle=delivery_robot", "source=rtsp", "fps_max=15")
 
 
@@ -52,7 +54,8 @@ def ffmpeg(vehicle, transport):
             reader.join(5)
 
 
-def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session():
+@pytest.mark.parametrize("frozen_s", [4, pytest.param(15, marks=pytest.mark.soak)])
+def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s):
     with (
         driving() as (camera, side, vehicle, plan, reported),
         watching(plan) as client,
@@ -68,7 +71,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session():
         camera.send_signal(signal.SIGSTOP)
         until(side.sources)
         assert side.sources() == {"rear": "source: no frame for 1 s"}
-        time.sleep(FROZEN_S - 1)
+        time.sleep(frozen_s - 1)
         frozen = counts()
         camera.send_signal(signal.SIGCONT)
         until(lambda: not side.sources(), seconds=12)  # 10 s between two attempts, at most
@@ -76,7 +79,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session():
         assert client.errors == []
         messages = [line.removeprefix("rear: ") for line in reported]
     assert messages[:2] == ["pipeline built", "source: no frame for 1 s"]
-    assert messages[-1].startswith("works again after 1")
+    assert int(re.match(r"works again after (\d+)", messages[-1])[1]) >= frozen_s - 1
     assert len(set(messages)) == len(messages) <= 5  # each reason once, however many attempts
 
 

@@ -28,7 +28,7 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     path, report = tmp_path / "drive", tmp_path / "report"
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     speed = ("latency.fixed_ms=60", "latency.limit_ms=150")
-    done = run("demo", *ROBOT, *SLOW, *ports, *speed, f"log={path}", "duration_s=10", env=env)
+    done = run("demo", *ROBOT, *SLOW, *ports, *speed, f"log={path}", "duration_s=8", env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     drive = read_drive(path)
     samples = [sample for sample in drive.sides["operator"].of(Sample) if sample.t > 2]

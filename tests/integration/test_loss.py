@@ -17,7 +17,7 @@ pytestmark = pytest.mark.gst
 SENDING = {"front_left": True}
 
 
-@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
+@pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("openh264_rtsp", marks=pytest.mark.soak)])
 def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
     from runner.apply import OperatorSide
     from runner.gst import Gst
@@ -132,7 +132,7 @@ def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeyp
     assert (median(arrived - captured for arrived, captured in arrivals) < 1 / 3 / 2) is by_time
 
 
-@pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
+@pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("openh264_rtsp", marks=pytest.mark.soak)])
 def test_a_picture_that_is_damaged_for_good_is_whole_again_after_a_key_frame(graph, monkeypatch):
     """Long before the next refresh wave or key frame."""
     from runner.apply import OperatorSide

@@ -512,11 +512,12 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     assert page.inner_text("#advised") == "no speed advised"
     until(lambda: re.match(r"Automatic · \d+( of \d+)? kbit/s · \w+", page.inner_text("#line")))
     page.evaluate("dispatchEvent(new Event('blur'))")
-    assert page.inner_text("#attention") == "OUT OF FOCUS: keys do not reach this page; click it"
-    time.sleep(0.6)  # nobody is told of a shorter absence
+    # On a busy machine the page may be slow at any time, which it states first.
+    until(lambda: page.inner_text("#attention") == "OUT OF FOCUS: keys do not reach this page; click it")
+    time.sleep(0.6)  # a shorter absence is not reported
     page.evaluate("dispatchEvent(new Event('focus'))")
-    assert page.locator("#attention").is_hidden()
-    assert re.search(r"No key reached this page for \d+ s", page.inner_text("#toasts"))
+    until(page.locator("#attention").is_hidden)
+    until(lambda: re.search(r"No key reached this page for \d+ s", page.inner_text("#toasts")))
 
 
 def test_pictures_that_stand_still_are_named_and_heard_in_the_drive_view(chromium, demo):
@@ -565,13 +566,17 @@ def test_keys_of_the_drive_view(page):
         page.keyboard.press(key)
         return page.locator(".tile.selected").get_attribute("data-camera")
 
+    def is_at(camera, place):
+        """As soon as no banner moves the pictures."""
+        until(lambda: page.locator(f"[data-camera={camera}]").bounding_box() == box[place])
+
     keys = ("ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown")
     assert [selected_by(key) for key in keys] == ["front_left", "front_center", "front_right", "rear_center"]
     page.keyboard.press("Enter")
-    assert page.locator("[data-camera=rear_center]").bounding_box() == box["front_center"]
-    assert page.locator("[data-camera=front_center]").bounding_box() == box["rear_center"]
+    is_at("rear_center", "front_center")
+    is_at("front_center", "rear_center")
     page.keyboard.press("Escape")
-    assert page.locator("[data-camera=rear_center]").bounding_box() == box["rear_center"]
+    is_at("rear_center", "rear_center")
     page.keyboard.press("Shift+F")
     until(lambda: page.evaluate("document.fullscreenElement !== null"))
     page.keyboard.press("Shift+F")

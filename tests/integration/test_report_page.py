@@ -92,8 +92,13 @@ def hovered(page: Any, figure: str, part: int, curve: int, point: int) -> str:
     return " ".join(chart.locator(".hoverlayer text").all_text_contents())
 
 
-@pytest.mark.parametrize("width", [1280, 1920])
-@pytest.mark.parametrize("scheme", ["dark", "light"])
+OTHER_PAGES = (("light", 1280), ("dark", 1920))
+
+
+@pytest.mark.parametrize(
+    ("scheme", "width"),
+    [("dark", 1280), ("light", 1920), *(pytest.param(*other, marks=pytest.mark.soak) for other in OTHER_PAGES)],
+)
 def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, screenshots: Path, width: int, scheme: str) -> None:
     with opened(chromium, single, width, scheme) as page:
         traces = {(figure, part): count for figure, _, part, count in page.evaluate(TRACES)}

@@ -104,11 +104,12 @@ def test_a_url_that_is_no_text_is_refused_without_a_traceback(line, capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_pause_loses_no_packet_of_what_follows():
+@pytest.mark.parametrize("pauses", [3, pytest.param(20, marks=pytest.mark.soak)])
+def test_a_pause_loses_no_packet_of_what_follows(pauses):
     """Over UDP and TCP at once: queues stand between the stream and its sinks. Each frame has several packets."""
     with serving() as vehicle, watched(vehicle) as over_udp, watched(vehicle, udp=False) as over_tcp:
         vehicle.turn(bitrate=4000)
-        for _ in range(8):
+        for _ in range(pauses):
             vehicle.turn(sending=False)
             time.sleep(1.2)
             seen = over_udp.frames, over_tcp.frames
