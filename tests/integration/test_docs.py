@@ -22,7 +22,8 @@ DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
 # `make test` runs this; test_api.py installs the wheel; a player needs a screen, and test_lines.py plays without one
 NOT_RUN = ("make", "pip", "ffplay")
-LONG = ("tod-runner demo experiment=", "tod-runner model vehicle=")  # `make soak` runs these
+# `make soak` runs these; test_live.py drives over each graph.
+LONG = ("tod-runner demo experiment=", "tod-runner demo graph=", "tod-runner model vehicle=")
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
 SMALL = [
     f"cameras.{name}.{key}"

@@ -175,7 +175,7 @@ def test_a_given_duration_begins_when_the_vehicle_is_online(broker, tmp_path):
 @pytest.mark.alone
 def test_the_operator_sees_what_was_decided_and_returns_after_a_crash(broker):
     ports = (f"control.port={broker.port}", f"media.port={free_port()}")
-    with process("operator", *ROBOT, *ports, "duration_s=14") as operator:
+    with process("operator", *ROBOT, *ports, "duration_s=11") as operator:
         with process("vehicle", *ROBOT, *ports) as first:
             watching = Operator(broker)
             watching.state(lambda state: state["online"] and all(c["applied"] for c in state["cameras"].values()))

@@ -106,12 +106,13 @@ def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
 
 
 @pytest.mark.alone
-def test_a_station_that_starts_again_is_found_at_once(chromium):
+@pytest.mark.parametrize("attempts", [12, pytest.param(25, marks=pytest.mark.soak)])
+def test_a_station_that_starts_again_is_found_at_once(chromium, attempts):
     """However many attempts have failed: browsers delay WebSockets that failed often."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
         all_live(page)
         operator.kill()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 25)
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= attempts)
         with process(*operator.args[3:]):
             until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
             found_again(page)
