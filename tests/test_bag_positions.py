@@ -15,7 +15,8 @@ from runner.core.model import ModelError
 from runner.drive.positions import reader
 from runner.drive.series import series
 from runner.errors import UserError
-from runner.pqos.track import build_track, of_bag
+from runner.pqos import build_track
+from runner.pqos.track import of_bag
 
 BEGAN_NS = round(EPOCH * 1e9)
 STORE = typestore("mcap")

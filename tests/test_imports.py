@@ -45,10 +45,9 @@ RUNNING = {  # modules of the project and heavy packages; `validate` reads maps 
     "validate": (84, COMPOSING | {"numpy", "gi"}),
 }
 HELP = {
-    "vehicle": {"numpy", "paho"},
+    "vehicle": {"paho"},
     "operator": {"rich", "paho"},
     "latency": {"paho"},
-    "demo": {"numpy"},
     "map": {"numpy"},
 }
 

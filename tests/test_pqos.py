@@ -20,8 +20,9 @@ from shared_data import ROOT, shared
 
 from runner.core.events import BitratePredicted, ClockAdvanced, OperatorConnected, PositionReported
 from runner.core.model import ModelError
-from runner.pqos import MapPqos, Pqos, build_pqos
+from runner.pqos import Pqos, build_pqos
 from runner.pqos.bandwidth_map import EARTH_M, BandwidthMap, Way, offset
+from runner.pqos.on_map import MapPqos
 
 CONF = ROOT / "conf"
 SCHEMA = json.loads((ROOT / "schemas" / "pqos.schema.json").read_text())

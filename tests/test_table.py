@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from runner.core.model import ModelError
-from runner.pqos.table import LAT, LON, RATE, TIME, find_file, number, read_map, read_table, within
+from runner.pqos.settings import find_file, number, within
+from runner.pqos.table import LAT, LON, RATE, TIME, read_map, read_table
 
 MATRIX = (
     "%YAML:1.0\n---\nbandwidth_map: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n"

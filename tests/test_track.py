@@ -17,11 +17,11 @@ from shared_data import ROOT, shared
 
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
-from runner.pqos import build_pqos
+from runner.pqos import build_pqos, build_track
 from runner.pqos.bandwidth_map import EARTH_M, offset
 from runner.pqos.route import route
 from runner.pqos.table import read_map
-from runner.pqos.track import Track, build_track, drive
+from runner.pqos.track import Track, drive
 
 CONF = ROOT / "conf"
 ROUTE = {"kind": "route", "speed_mps": 8, "loop": True}

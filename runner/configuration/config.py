@@ -70,8 +70,7 @@ class Configuration:
 
     def pqos(self) -> tuple[Pqos, Track | None]:
         """The source of predictions, and the drive that gives positions if no GPS does."""
-        from runner.pqos import build_pqos
-        from runner.pqos.track import build_track
+        from runner.pqos import build_pqos, build_track
 
         part = self._builder.part
         pqos = part(("pqos",), lambda settings: build_pqos(settings, self._bases))

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from runner.core.events import ClockAdvanced, Event
 from runner.core.model import Kbps, ModelError, exact
 from runner.link.limit import Limit, Reverse, TcpFlows
-from runner.pqos import Pqos, build_pqos, trace
-from runner.pqos.table import find_file, within
-from runner.pqos.track import Track, build_track
+from runner.pqos import Pqos, build_pqos, build_track, trace
+from runner.pqos.settings import find_file, within
 from runner.schema import event_problem
+
+if TYPE_CHECKING:
+    from runner.pqos.track import Track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
 STEP_S = 0.1  # interval at which the rate of a link follows a map

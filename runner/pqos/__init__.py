@@ -2,26 +2,24 @@
 
 The paper reads its predictions from a pre-recorded bandwidth map by GPS position (section V). No clock, no threads,
 no log here: time comes from the events, and a file is read only while a source is built. Rates are kbit/s.
+NumPy is loaded with the first file: a vehicle that gets predictions and positions live does without it.
 """
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from runner.core.events import BitratePredicted, Event, PositionReported
-from runner.core.model import Kbps, ModelError, exact, plain
-from runner.pqos.bandwidth_map import BandwidthMap, Way, offset
-from runner.pqos.table import RATE, TIME, find_file, number, read_map, read_table
+from runner.core.events import BitratePredicted, Event
+from runner.core.model import Kbps, ModelError, exact
+from runner.pqos.settings import find_file, find_path, number, within
 
-SLOWEST_MPS = 1.0  # below this speed the direction of movement is mostly GPS noise
-BASELINE_S = 0.5  # movement is measured over at least this long, otherwise a 20 Hz GPS gives noise again
-REACH_M = 10_000.0  # the map's plane fits the Earth about this far; also limits an absurd speed
+if TYPE_CHECKING:
+    from runner.pqos.track import Track
 
 
 class Pqos(Protocol):
@@ -33,67 +31,6 @@ class Pqos(Protocol):
 
     def observe(self, event: Event) -> BitratePredicted | None:
         """The prediction that follows from this event, stamped with the event's own t; None: nothing new."""
-
-
-class _Motion:
-    """Speed and heading, as reported or otherwise from the movement between positions."""
-
-    def __init__(self) -> None:
-        self._last: PositionReported | None = None
-        self._speed = 0.0  # m/s, taken as 0 before the second position
-        self._course: float | None = None  # degrees, of the movement
-        self._heading: float | None = None  # degrees, the one in force
-
-    def way(self, event: PositionReported, look_ahead_s: float) -> Way:
-        """Path from here to where the vehicle will be; just the position if no heading is known."""
-        self._measure(event)
-        speed = self._speed if event.speed_mps is None else event.speed_mps
-        course = self._course if event.heading_deg is None else event.heading_deg
-        if speed >= SLOWEST_MPS and course is not None:
-            self._heading = course
-        if self._heading is None:
-            return Way(event.lat, event.lon)
-        ahead, angle = min(speed * look_ahead_s, REACH_M), math.radians(self._heading)
-        return Way(event.lat, event.lon, ahead * math.sin(angle), ahead * math.cos(angle))
-
-    def _measure(self, event: PositionReported) -> None:
-        last = self._last = self._last or event
-        elapsed = event.t - last.t
-        if elapsed >= BASELINE_S:
-            self._last = event
-        elif elapsed <= 0 or self._course is not None:  # a first guess may come earlier
-            return
-        east, north = offset(last.lat, last.lon, event.lat, event.lon)
-        self._speed = math.hypot(east, north) / elapsed
-        if self._speed >= SLOWEST_MPS:
-            self._course = math.degrees(math.atan2(east, north)) % 360
-
-
-class MapPqos:
-    """Predicts, for each position, the lowest rate of the map around the path ahead; off the map a small fixed one."""
-
-    def __init__(self, points: BandwidthMap, look_ahead_s: float, off_map: Kbps, valid_s: float | None = None) -> None:
-        self._points, self._look_ahead_s, self._off_map, self._valid_s = points, look_ahead_s, off_map, valid_s
-        self._motion = _Motion()
-        self.warnings: tuple[str, ...] = ()
-
-    def observe(self, event: Event) -> BitratePredicted | None:
-        if not isinstance(event, PositionReported):
-            return None
-        lowest = self._points.lowest(self._motion.way(event, self._look_ahead_s))
-        if lowest is None:
-            self.warnings = self.warnings or self._swapped(event)
-        kbps = self._off_map if lowest is None else exact(lowest)
-        return BitratePredicted(t=event.t, kbps=kbps, valid_s=self._valid_s)
-
-    def _swapped(self, event: PositionReported) -> tuple[str, ...]:
-        """A defect that looks like a dead spot: lon and lat swapped in the map or in the reported positions."""
-        if abs(event.lon) > 90 or self._points.lowest(Way(event.lon, event.lat)) is None:
-            return ()
-        return (
-            f"position lat {event.lat}, lon {event.lon} is off the map, but lat {event.lon}, lon {event.lat} is on it: "
-            f"lon and lat appear swapped in the map or in the positions; predicting {plain(self._off_map)} kbit/s",
-        )
 
 
 class TimedPqos:
@@ -160,6 +97,8 @@ def trace(path: Path, loop: bool, off_trace: Kbps | None) -> Callable[[float], K
 
     path  CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop restarts
     """
+    from runner.pqos.table import RATE, TIME, read_table
+
     table = read_table(path, (TIME, RATE))
     if len(table) < 2:
         raise ModelError("file", path, "must have at least two rows, else the duration of a rate is unknown")
@@ -190,6 +129,9 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
 def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
     match kind := settings.get("kind"):
         case "map":
+            from runner.pqos.on_map import BandwidthMap, MapPqos
+            from runner.pqos.table import read_map
+
             lon, lat, kbps = read_map(find_file(settings, "file", bases)).T
             points = BandwidthMap(lat, lon, kbps, number(settings, "radius_m", positive=True))
             look_ahead_s, off_map = number(settings, "look_ahead_s"), exact(number(settings, "off_map_kbps"))
@@ -205,3 +147,35 @@ def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
         case "live":
             return LivePqos()
     raise ModelError("kind", kind, "must be map, trace, constant or live")
+
+
+def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | None:
+    """The drive that `position` in the `pqos` section describes; None: positions arrive as events.
+
+    settings  the composed section; bases: directories in which a relative file is looked up
+    raises    ModelError with the key, the value found and the rule
+    """
+    position = settings.get("position") or {"kind": "live"}
+    loop = bool(position.get("loop"))
+    match kind := position.get("kind"):
+        case "route":
+            if settings.get("kind") != "map":
+                raise ModelError("position.kind", kind, "needs kind: map, whose points it drives through")
+            with within("position"):
+                speed = number(position, "speed_mps", positive=True)
+            from runner.pqos.table import read_map
+            from runner.pqos.track import drive
+
+            return drive(read_map(find_file(settings, "file", bases)), speed, loop)
+        case "track":
+            with within("position"):
+                path = find_path(position, "file", bases)
+                from runner.bag import is_bag
+                from runner.pqos.track import of_bag, recorded
+
+                if is_bag(path):
+                    return of_bag(path, position.get("topic"), loop)
+                return recorded(find_file(position, "file", bases), loop)
+        case "live":
+            return None
+    raise ModelError("position.kind", kind, "must be route, track or live")

@@ -1,27 +1,23 @@
-"""Tables of numbers named by a setting: bandwidth maps, traces, GPS tracks; checked in full before use."""
+"""Tables of numbers: bandwidth maps, traces, GPS tracks; checked in full before use."""
 
 from __future__ import annotations
 
 import csv
-import math
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.core.model import ModelError
 from runner.schema import shown
-from runner.system.files import file_problem
 
 FINITE = sys.float_info.max
-MOST_BYTES = 200_000_000  # a month at 1 Hz
 LONGEST_HEADER = 10_000  # characters
 
 
@@ -55,52 +51,6 @@ class _Text(NamedTuple):
     values: NDArray[np.float64] | None
     names: Sequence[str]
     rows: Iterator[tuple[int, Sequence[str]]]
-
-
-def find_path(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
-    """The path that a setting names: an absolute one as it is, otherwise in the first of the directories that has it.
-
-    raises  ModelError
-    """
-    name = settings.get(key)
-    if not isinstance(name, str) or not name:
-        raise ModelError(key, name, "must name a file")
-    paths = [base / name for base in bases] or [Path(name)]
-    path = next((path for path in paths if path.exists()), None)
-    if path is None:
-        raise ModelError(key, name, f"no such file in {', '.join(dict.fromkeys(str(path.parent) for path in paths))}")
-    return path
-
-
-def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
-    """The file of limited size that a setting names, see `find_path`.
-
-    raises  ModelError
-    """
-    path = find_path(settings, key, bases)
-    if not path.is_file():
-        raise ModelError(key, settings[key], file_problem(path))
-    if path.stat().st_size > MOST_BYTES:
-        raise ModelError(key, settings[key], f"must be at most {MOST_BYTES // 1_000_000} MB long")
-    return path
-
-
-def number(settings: Mapping[str, Any], key: str, *, positive: bool = False) -> float:
-    """A setting that is a finite number, 0 or more (`positive`: above 0). Raises ModelError."""
-    value: Any = settings.get(key)
-    finite = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not finite or value < 0 or (positive and value == 0):
-        raise ModelError(key, value, f"must be a number {'above 0' if positive else 'of 0 or more'}")
-    return float(value)
-
-
-@contextmanager
-def within(section: str) -> Iterator[None]:
-    """Report the keys of errors raised inside as keys of a section of the settings."""
-    try:
-        yield
-    except ModelError as error:
-        raise ModelError(f"{section}.{error.key}", error.found, error.rule) from None
 
 
 def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
-from runner.pqos import SLOWEST_MPS
 from runner.pqos.bandwidth_map import Floats, offset
+from runner.pqos.on_map import SLOWEST_MPS
 from runner.pqos.route import route
-from runner.pqos.table import LAT, LON, SPEED, TIME, find_file, find_path, header, number, read_map, read_table, within
+from runner.pqos.table import LAT, LON, SPEED, TIME, header, read_table
 
 
 class Track:
@@ -54,34 +52,6 @@ class Track:
             speed_mps=0.0 if ended else float(speed),
             heading_deg=self._heading[row],
         )
-
-
-def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | None:
-    """The drive that `position` in the `pqos` section describes; None: positions arrive as events.
-
-    settings  the composed section; bases: directories in which a relative file is looked up
-    raises    ModelError with the key, the value found and the rule
-    """
-    position = settings.get("position") or {"kind": "live"}
-    loop = bool(position.get("loop"))
-    match kind := position.get("kind"):
-        case "route":
-            if settings.get("kind") != "map":
-                raise ModelError("position.kind", kind, "needs kind: map, whose points it drives through")
-            with within("position"):
-                speed = number(position, "speed_mps", positive=True)
-            return drive(read_map(find_file(settings, "file", bases)), speed, loop)
-        case "track":
-            with within("position"):
-                path = find_path(position, "file", bases)
-                from runner.bag import is_bag
-
-                if is_bag(path):
-                    return of_bag(path, position.get("topic"), loop)
-                return recorded(find_file(position, "file", bases), loop)
-        case "live":
-            return None
-    raise ModelError("position.kind", kind, "must be route, track or live")
 
 
 def recorded(path: Path, loop: bool) -> Track:

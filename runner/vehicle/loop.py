@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from msgspec import UNSET
 
@@ -31,7 +31,6 @@ from runner.core.step import Run, start, step
 from runner.drive.log import Log, log_run
 from runner.mqtt.messages import APPLY_S
 from runner.pqos import Pqos
-from runner.pqos.track import Track
 from runner.records import (
     CameraState,
     CameraTelemetry,
@@ -49,6 +48,9 @@ from runner.vehicle.access import Access
 from runner.vehicle.inbox import WAITING, Answer, Inbox, Item, Reported, Request
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.uplink import MeasuredUplink
+
+if TYPE_CHECKING:
+    from runner.pqos.track import Track
 
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
