@@ -56,12 +56,15 @@ class Watched:
             self.loop.stop()
             thread.join(10)
 
-    def breathe(self, seconds: float, name: str = "driver") -> None:
-        """Signs of life of an operator."""
-        end = time.monotonic() + seconds
+    def breathe(self, seconds: float, name: str = "driver") -> float:
+        """Signs of life of an operator. Returns the longest time between two, s: it is longer on a busy machine."""
+        longest, last = 0.0, time.monotonic()
+        end = last + seconds
         while time.monotonic() < end:
             self.loop.take(Request(name, {"event": "operator_connected"}))
+            longest, last = max(longest, time.monotonic() - last), time.monotonic()
             time.sleep(SILENT_S / 5)
+        return longest
 
 
 def until(condition: Callable[[], Any]) -> None:
@@ -129,6 +132,12 @@ def test_a_state_that_has_to_wait_is_published_later() -> None:
 
 def test_operators_are_present_after_the_loop_itself_stood_still(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their messages of that time were waiting."""
+    while (silent_s := _stand_still(monkeypatch)) > SILENT_S / 2:  # this process did: the operator was silent indeed
+        assert silent_s < 20
+
+
+def _stand_still(monkeypatch: pytest.MonkeyPatch) -> float:
+    """Returns for how long the operator was silent, s."""
     watched = Watched()
     turn, stood = watched.side.turn, threading.Event()
 
@@ -141,10 +150,12 @@ def test_operators_are_present_after_the_loop_itself_stood_still(monkeypatch: py
     with watched.running():
         watched.breathe(0.3)
         monkeypatch.setattr(watched.side, "turn", stand_still)
-        watched.breathe(4 * SILENT_S)
-    assert stood.is_set()
-    assert watched.reports.count("operator driver is present") == 1
-    assert not [line for line in watched.reports if "silent" in line]
+        silent_s = watched.breathe(4 * SILENT_S)
+    if silent_s <= SILENT_S / 2:
+        assert stood.is_set()
+        assert watched.reports.count("operator driver is present") == 1
+        assert not [line for line in watched.reports if "silent" in line]
+    return silent_s
 
 
 def test_a_steering_angle_is_published_at_once_with_its_time_and_at_most_every_50_ms() -> None:
