@@ -129,7 +129,8 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
 def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
     match kind := settings.get("kind"):
         case "map":
-            from runner.pqos.on_map import BandwidthMap, MapPqos
+            from runner.pqos.bandwidth_map import BandwidthMap
+            from runner.pqos.on_map import MapPqos
             from runner.pqos.table import read_map
 
             lon, lat, kbps = read_map(find_file(settings, "file", bases)).T
