@@ -72,8 +72,8 @@ def _elements(words: Sequence[str], runs: int) -> list[Row]:
     for count, element in enumerate(elements, start=1):
         line = f"{launch(elements[:count])} ! fakesink sync=false"
         now = median(_output("pipeline", line) for _ in range(runs))
-        named = element.factory if count > 1 else f"interpreter, GStreamer and {element.factory}"
-        rows.append(Row(f"memory: pipeline of {plan.camera.name}: {named}", now - before, "MB"))
+        named = element.factory if count > 1 else f"Python, GStreamer, {element.factory}"
+        rows.append(Row(f"memory of a pipeline: {named}", now - before, "MB"))
         before = now
     return rows
 

@@ -37,12 +37,12 @@ def vehicle(*words: str) -> None:
     from runner.live import live_vehicle
 
     steps.took("modules of the project and its libraries")
-    from runner.apply import check_plan
+    from runner.apply import check_vehicle
 
     steps.took("GStreamer and its bindings")
     from runner.configuration.config import configuration
 
-    described = configuration(words, check=check_plan).vehicle()
+    described = configuration(words, check=check_vehicle).vehicle()
     steps.took("configuration composed, plugins loaded")
     with ExitStack() as stack:
         live = stack.enter_context(live_vehicle(words, say=lambda _: None))

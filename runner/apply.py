@@ -23,7 +23,14 @@ from runner.gst.outage import Gathered
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
-from runner.gst.registry import check_plan, missing_plugins, missing_recorders, versions
+from runner.gst.registry import (
+    check_operator,
+    check_plan,
+    check_vehicle,
+    missing_plugins,
+    missing_recorders,
+    versions,
+)
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
 from runner.gst.video_files import VideoFile, VideoFiles
@@ -55,8 +62,10 @@ __all__ = [
     "VehicleSide",
     "VideoFiles",
     "check_machine",
+    "check_operator",
     "check_plan",
     "check_recorders",
+    "check_vehicle",
     "decode_video",
     "discover",
     "missing_plugins",

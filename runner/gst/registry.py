@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 
@@ -25,6 +25,7 @@ PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plu
     "nvidia-l4t-gstreamer": "nvvidconv nvv4l2h264enc",
 }
 HARDWARE = {"vah264enc": "va", "nvh264enc": "nvcodec"}  # plugin by element that exists only with its hardware
+PARTS = ("vehicle", "operator", "recording")  # of a plan
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
 
 
@@ -62,22 +63,35 @@ def versions(elements: Iterable[Element]) -> dict[str, str]:
     return found
 
 
-def check_plan(plan: Plan) -> list[ModelError]:
+def check_plan(plan: Plan, parts: Collection[str] = PARTS) -> list[ModelError]:
     """Everything the registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
 
     Known elements that are not installed are reported by `missing_plugins` and `missing_recorders`.
+
+    parts  of the plan; the plugins of the others are not loaded: a decoder takes 30 MB of a vehicle's memory
     """
-    parts = {
-        "source.elements": plan.source,
-        "graph.vehicle": plan.vehicle,
-        "graph.operator": plan.operator,
-        "graph.wire.vehicle": plan.wire_vehicle,
-        "graph.wire.operator": plan.wire_operator,
-        "recording.elements": plan.recorder,
-    }
-    found = [error for where, elements in parts.items() for error in _check_elements(elements, where)]
-    found += _check_knobs(plan)
-    return found or _check_links(plan)
+    elements = [
+        ("vehicle", "source.elements", plan.source),
+        ("vehicle", "graph.vehicle", plan.vehicle),
+        ("operator", "graph.operator", plan.operator),
+        ("vehicle", "graph.wire.vehicle", plan.wire_vehicle),
+        ("operator", "graph.wire.operator", plan.wire_operator),
+        ("recording", "recording.elements", plan.recorder),
+    ]
+    found = [error for part, where, its in elements if part in parts for error in _check_elements(its, where)]
+    if "vehicle" in parts:
+        found += _check_knobs(plan)
+    return found or _check_links(plan, parts)
+
+
+def check_vehicle(plan: Plan) -> list[ModelError]:
+    """What `check_plan` finds in the vehicle's part, for the side that runs it alone."""
+    return check_plan(plan, ("vehicle",))
+
+
+def check_operator(plan: Plan) -> list[ModelError]:
+    """What `check_plan` finds in the operator's part, for the side that runs it alone."""
+    return check_plan(plan, ("operator",))
 
 
 def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[ModelError]:
@@ -124,27 +138,32 @@ def _may_change(element: Gst.Element, key: str) -> bool:
     return bool(int(element.find_property(key).flags) & Gst.PARAM_MUTABLE_PLAYING)
 
 
-def _check_links(plan: Plan) -> list[ModelError]:
+def _check_links(plan: Plan, parts: Collection[str]) -> list[ModelError]:
     """Check that neighbouring elements can be linked."""
     errors: dict[str, str] = {}
-    for where, line in _lines(plan):
+    for where, line in _lines(plan, parts):
         if where not in errors and (message := _unlinkable(line)):
             errors[where] = message
     return [ModelError(where, None, message) for where, message in errors.items()]
 
 
-def _lines(plan: Plan) -> Iterator[tuple[str, str]]:
+def _lines(plan: Plan, parts: Collection[str]) -> Iterator[tuple[str, str]]:
     """The plan's pipelines as GStreamer parses them, except those with an element that this machine lacks.
 
     After a filter all sources are alike: the source becomes one line, which many graphs share, and the rest another.
     """
     filtered = bool(plan.source) and plan.source[-1].factory == "capsfilter"
     rest = replace(plan, source=plan.source[-1:]) if filtered else plan
-    streams, records = not missing_plugins(plan), plan.recorder and not missing_recorders(plan)
-    if filtered and (streams or records):
-        yield "graph.vehicle" if streams else "recording.elements", launch(plan.source)
-    if streams:
-        yield from (("graph.vehicle", rest.pipeline), ("graph.operator", plan.receiver))
+    sides = [side for side in ("vehicle", "operator") if side in parts]
+    streams = not missing_plugins(plan, sides)
+    sends, receives = ("vehicle" in sides and streams), ("operator" in sides and streams)
+    records = "recording" in parts and plan.recorder and not missing_recorders(plan)
+    if filtered and (sends or records):
+        yield "graph.vehicle" if sends else "recording.elements", launch(plan.source)
+    if sends:
+        yield "graph.vehicle", rest.pipeline
+    if receives:
+        yield "graph.operator", plan.receiver
     if records:
         yield "recording.elements", rest.recording("/dev/null")
 

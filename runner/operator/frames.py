@@ -95,7 +95,7 @@ def live_frames(
     """
     from runner import apply
 
-    vehicle = configuration(overrides, conf, runnable=False, check=apply.check_plan).vehicle()
+    vehicle = configuration(overrides, conf, runnable=False, check=apply.check_operator).vehicle()
     for name in cameras or ():
         if name not in vehicle.cameras:
             raise UserError("cameras", "", name, f"unknown camera{suggest(name, vehicle.cameras)}")

@@ -219,7 +219,7 @@ def live_operator(
     """
     from runner import apply
 
-    config = configuration(overrides, conf, runnable=False, check=apply.check_plan)
+    config = configuration(overrides, conf, runnable=False, check=apply.check_operator)
     vehicle, document = config.vehicle(), config.document
     plans = compile_plans(vehicle)
     keyring = viewer_keyring(vehicle)

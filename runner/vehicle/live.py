@@ -330,7 +330,7 @@ def live_vehicle(
     """
     from runner import apply
 
-    config = configuration(overrides, conf, check=apply.check_plan)
+    config = configuration(overrides, conf, check=apply.check_vehicle)
     (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
     keyring = vehicle_keyring(vehicle)
     _check_ros(vehicle)

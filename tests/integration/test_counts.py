@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from contextlib import ExitStack
 
 import pytest
 
-from rig import free_port, until
+from rig import CHECKOUT, free_port, until
 from runner.apply import OperatorSide, VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
@@ -92,3 +94,21 @@ def test_a_change_writes_what_differs_and_nothing_else(streaming, writes):
     assert turned("bitrate", 540) == {}
     assert turned("size", (320, 180)) == {"size.caps": cameras}
     assert turned("size", (320, 180)) == {}
+
+
+@pytest.mark.parametrize(
+    ("check", "loads"),
+    [("check_vehicle", "libgstx264"), ("check_operator", "libgstlibav")],
+    ids=["vehicle", "operator"],
+)
+def test_a_side_loads_the_plugins_of_its_own_part_only(check, loads):
+    """Codecs are the largest: tens of MB each."""
+    code = f"""
+from runner import apply
+from runner.configuration.config import configuration
+configuration({ROBOT!r}, check=apply.{check}).vehicle()
+mapped = open("/proc/self/maps").read()
+print([name for name in ("libgstx264", "libgstlibav") if name in mapped])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=CHECKOUT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == repr([loads])
