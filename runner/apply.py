@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -124,6 +125,12 @@ class _Glib:
     def __init__(self) -> None:
         load_types()
         self._loop = GLib.MainLoop()
+        self._calls: deque[Callable[[], None]] = deque()
+        # One watch for all calls: see runner/gst/one_shot.py.
+        self._called = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._watch = GLib.unix_fd_add_full(
+            GLib.PRIORITY_DEFAULT_IDLE, self._called, GLib.IOCondition.IN, self._on_called
+        )
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
         self._thread.start()
 
@@ -136,19 +143,25 @@ class _Glib:
         done = threading.Event()
         raised: list[BaseException] = []
 
-        def once() -> bool:
+        def once() -> None:
             try:
                 function()
             except BaseException as error:
                 raised.append(error)
             done.set()
-            return False
 
-        GLib.idle_add(once)
+        self._calls.append(once)
+        os.eventfd_write(self._called, 1)
         if not done.wait(CALL_S):
             raise RunError(f"GStreamer hangs: {what} takes more than {CALL_S:g} s")
         if raised:
             raise raised[0]
+
+    def _on_called(self, *_: object) -> bool:
+        os.eventfd_read(self._called)
+        while self._calls:
+            self._calls.popleft()()
+        return True
 
     def end(self, stop: Callable[[], None]) -> None:
         """Run the last function, let state changes finish, end the loop. Whatever hangs by then is left alone."""
@@ -161,6 +174,9 @@ class _Glib:
     def _quit(self) -> None:
         self._loop.quit()
         self._thread.join(timeout=5)
+        if not self._thread.is_alive():
+            GLib.source_remove(self._watch)
+            os.close(self._called)
 
 
 def _kept(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
@@ -174,6 +190,10 @@ def _kept(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequenc
     if missing := dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, (side,))):
         raise RunError("\n".join(missing))
     return plans
+
+
+def _captured(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
+    return captured_at(pad, buffer.pts)
 
 
 class VehicleSide:
@@ -312,7 +332,7 @@ class VehicleSide:
         elif problem := log_in(pipeline, plan):
             self._on_report(name, problem)
         if self._video:
-            VideoFile(self._video, name, "vehicle", captured_at, self._on_report).follow(pipeline)
+            VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
             pipeline, plan, self._wanted_of(name), self._turned, lambda what: self._on_report(name, what), source
         )

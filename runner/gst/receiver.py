@@ -13,6 +13,7 @@ from gi.repository import GObject, Gst, GstSdp
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import KEPT, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.caps import structure
+from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -129,7 +130,7 @@ class Receiver:
         self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
-        self._built = self._inspects = False
+        self._built = False
         self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
         self._silent = time.monotonic()  # when the camera was last not expected to send
         self._was_sending = False  # expected to, as of the last sample
@@ -169,9 +170,7 @@ class Receiver:
             self._supervised.restart(f"no frame for {self._stall_s:g} s")
         else:
             return received
-        if not self._inspects:  # only one frame in many: no Python runs for the others
-            self._inspects = True
-            self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
+        self._next_picture.arm()
         return received
 
     def _is_expected(self) -> bool:
@@ -231,7 +230,8 @@ class Receiver:
         self._moved = (self._frames, time.monotonic())
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
-        self._begun = self._inspects = False
+        self._next_picture = OneShot(self._sink.get_static_pad("sink"), self._on_frame)
+        self._begun = False
         for buffer in self._buffers:
             buffer.close()
         self._buffers, self._over_udp, self._feedback = [], False, False
@@ -303,15 +303,13 @@ class Receiver:
             rebuilt=self._supervised.rebuilt,
         )
 
-    def _on_frame(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        buffer, now = info.get_buffer(), time.monotonic()
-        self._inspects = False
-        captured, (pts, arrived) = capture_time(buffer), self._entered
-        if captured is not None:
-            self._latency.set(1000 * (time.time() - captured))
-        if buffer.pts == pts:
+    def _on_frame(self, _pad: Gst.Pad, picture: PassingBuffer) -> bool:
+        now, reference_ns, (pts, arrived) = time.monotonic(), picture.reference_ns, self._entered
+        if reference_ns is not None:
+            self._latency.set(1000 * (time.time() - unix_s(reference_ns)))
+        if picture.pts == pts:
             self._decode.set(1000 * (now - arrived))
-        return Gst.PadProbeReturn.REMOVE
+        return True
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         """An access unit has arrived: page and log share its times; the vehicle receives them in a report."""
@@ -385,4 +383,9 @@ def take_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambd
 def capture_time(buffer: Gst.Buffer) -> float | None:
     """Capture time of a frame, s since 1970 by the vehicle's clock; None if the transport does not carry it."""
     meta = buffer.get_reference_timestamp_meta(None)
-    return meta.timestamp / Gst.SECOND - NTP_EPOCH_S if meta else None
+    return unix_s(meta.timestamp) if meta else None
+
+
+def unix_s(reference_ns: int) -> float:
+    """A reference timestamp, s since 1970: those of RTP are of NTP's time."""
+    return float(reference_ns / Gst.SECOND - NTP_EPOCH_S)

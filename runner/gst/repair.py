@@ -8,6 +8,7 @@ from collections import deque
 from gi.repository import GObject, Gst
 
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, read_packet
+from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.system.recent import RecentValue
 
 REORDER_MS = 5  # a packet that is missing for longer was lost, not overtaken
@@ -41,7 +42,7 @@ class RepairBuffer:
         self._asked = False  # the next packet was requested
         self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames whose last packet came: stamp, when
         self._waited = RecentValue[float]()  # how long a frame waited here, ms
-        self._timing, self._timer = False, 0  # whether the end of the next frame is awaited; the last probe that did
+        self._passing = OneShot(buffer.get_static_pad("src"), self._on_passed)
         self._counted = (0, 0)  # packets that came, and that were missing
         self._recent: tuple[float, ...] = (0.0, 0.0)  # of these, lately
         self._full = False  # nothing is requested
@@ -64,29 +65,22 @@ class RepairBuffer:
 
     def waited_ms(self) -> float | None:
         """How long the end of a frame waited here lately; requests that of the next. A few times a second."""
-        if not self._timing:
-            self._timing = True
-            self._timer = self._buffer.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_passed)
+        self._passing.arm()
         return self._waited.get()
 
     def close(self) -> None:
         """Let go of a buffer whose pipeline has ended: its pads hold this object, which holds them, for ever."""
         self._pad.remove_probe(self._probe)
-        if self._timing:
-            self._buffer.get_static_pad("src").remove_probe(self._timer)
 
-    def _on_passed(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        buffer, now = info.get_buffer(), time.monotonic()
-        packet = read_packet(buffer.extract_dup(0, HEADER_BYTES), buffer.get_size())
-        if not packet.last:
-            return Gst.PadProbeReturn.OK
+    def _on_passed(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
+        now = time.monotonic()
+        packet = read_packet(buffer.extract(0, HEADER_BYTES), buffer.size)
         # A copy: the thread of arriving packets adds to it.
         came = next((at for stamp, at in tuple(self._ends) if stamp == packet.stamp), None)
-        if came is None:
-            return Gst.PadProbeReturn.OK
+        if not packet.last or came is None:
+            return False
         self._waited.set(1000 * (now - came))
-        self._timing = False
-        return Gst.PadProbeReturn.REMOVE
+        return True
 
     def _look(self) -> None:
         """Whether the link is full."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from gi.repository import Gst
 
 from runner.gst.caps import structure
+from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.gst.outage import Outage
 
 SLICES, SLICE_BYTES = 16, 8192  # of a picture that are compared: the noise of a sensor is everywhere
@@ -24,24 +25,22 @@ class RepeatedPicture:
     """
 
     def __init__(self, pad: Gst.Pad, after_s: float | None, on_report: Callable[[str], None]) -> None:
-        self._pad, self._after_s = pad, after_s
+        self._after_s = after_s
+        self._next = OneShot(pad, self._on_picture)
         self.outage = Outage(on_report)
-        self._armed = False
         self._digest: int | None = None
         self._since, self._looks = 0.0, 0
 
     def look(self) -> None:
         """Request a look at the next picture; to be called a few times a second, from one thread."""
-        if self._after_s is not None and not self._armed:
-            self._armed = True
-            self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_picture)
+        if self._after_s is not None:
+            self._next.arm()
 
-    def _on_picture(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        self._armed = False
+    def _on_picture(self, pad: Gst.Pad, picture: PassingBuffer) -> bool:
         caps, now = pad.get_current_caps(), time.monotonic()
         if not caps or not _is_readable(caps):
-            return Gst.PadProbeReturn.REMOVE
-        digest = _digest(info.get_buffer())
+            return True
+        digest = _digest(picture)
         if digest != self._digest:
             self._digest, self._since, self._looks = digest, now, 1
             self.outage.over(now)
@@ -49,7 +48,7 @@ class RepeatedPicture:
             self._looks += 1
             if now - self._since >= (self._after_s or 0.0) and self._looks >= LOOKS:
                 self.outage.failed("source: repeats the same picture", self._since)
-        return Gst.PadProbeReturn.REMOVE
+        return True
 
 
 def _is_readable(caps: Gst.Caps) -> bool:
@@ -57,9 +56,9 @@ def _is_readable(caps: Gst.Caps) -> bool:
     return bool(in_memory and structure(caps).get_name() == "video/x-raw")
 
 
-def _digest(picture: Gst.Buffer) -> int:
-    step = max(0, picture.get_size() - SLICE_BYTES) / (SLICES - 1)
+def _digest(picture: PassingBuffer) -> int:
+    step = max(0, picture.size - SLICE_BYTES) / (SLICES - 1)
     digest = 0
     for number in range(SLICES):
-        digest = zlib.crc32(picture.extract_dup(round(number * step), SLICE_BYTES), digest)
+        digest = zlib.crc32(picture.extract(round(number * step), SLICE_BYTES), digest)
     return digest

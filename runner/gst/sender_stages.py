@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gi.repository import Gst
 
 from runner.gst.clocks import captured_at
+from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.system.recent import RecentValue
 
 SAME_S = 1e-4  # capture times of the same picture on both sides of the encoder differ by less
@@ -30,9 +31,9 @@ class EncoderWatch:
 
     def __init__(self, elements: Iterable[Gst.Element]) -> None:
         encoder = next((element for element in elements if _is_encoder(element)), None)
-        self._into: Any = encoder.get_static_pad("sink") if encoder else None
-        self._out: Any = encoder.get_static_pad("src") if encoder else None
-        self._armed = False
+        self._into = OneShot(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
+        self._out = OneShot(encoder.get_static_pad("src"), self._on_coded) if encoder else None
+        self._awaited = False
         self._left = 0
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
         self._measured = RecentValue[SenderStages]()
@@ -42,30 +43,31 @@ class EncoderWatch:
 
         To be called a few times a second, from one thread.
         """
-        if self._into and not self._armed:
-            self._armed = True
-            self._into.add_probe(Gst.PadProbeType.BUFFER, self._on_raw)
+        if self._into and not self._awaited:
+            self._awaited = True
+            self._into.arm()
         return self._measured.get()
 
-    def _on_raw(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        if info.get_buffer().pts == Gst.CLOCK_TIME_NONE:
-            return Gst.PadProbeReturn.OK
-        captured, self._left = captured_at(pad, info.get_buffer()), PATIENCE
+    def _on_raw(self, pad: Gst.Pad, picture: PassingBuffer) -> bool:
+        if picture.pts is None:
+            return False
+        captured, self._left = captured_at(pad, picture.pts), PATIENCE
         self._entered = (captured, 1000 * (time.time() - captured))
-        self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_coded)
-        return Gst.PadProbeReturn.REMOVE
+        assert self._out
+        self._out.arm()
+        return True
 
-    def _on_coded(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_coded(self, pad: Gst.Pad, picture: PassingBuffer) -> bool:
         now = time.time()
         captured, capture_ms = self._entered
-        ahead_s = captured_at(pad, info.get_buffer()) - captured
+        ahead_s = captured_at(pad, picture.pts or 0) - captured
         self._left -= 1
         if ahead_s < -SAME_S and self._left:
-            return Gst.PadProbeReturn.OK  # one that the encoder took earlier
+            return False  # one that the encoder took earlier
         if abs(ahead_s) < SAME_S:  # else the encoder has dropped the picture
             self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
-        self._armed = False
-        return Gst.PadProbeReturn.REMOVE
+        self._awaited = False
+        return True
 
 
 def _is_encoder(element: Gst.Element) -> bool:

@@ -1,0 +1,155 @@
+"""Looking at a buffer now and then: what is read is what GStreamer's own binding reads, and no memory is kept."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from rig import SMALL_ROBOT, free_port, until
+from runner.apply import OperatorSide, VehicleSide
+from runner.configuration.config import configuration
+from runner.core.commands import Command
+from runner.gst import GLib, Gst
+from runner.gst.one_shot import OneShot
+from runner.plans import compile_plans
+
+LOOKS = 20_000
+STAMPED = 3_900_000_000 * Gst.SECOND
+FED = "appsrc name=fed format=time ! identity name=seen ! fakesink sync=false"
+MADE = "videotestsrc ! video/x-raw,width=40,height=30 ! identity name=seen ! fakesink sync=false"
+
+
+@contextmanager
+def running(line):
+    """A pipeline, and a pad that its buffers pass."""
+    pipeline = Gst.parse_launch(line)
+    try:
+        yield pipeline, pipeline.get_by_name("seen").get_static_pad("src")
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+@pytest.fixture
+def playing():
+    """One that makes pictures as fast as it can."""
+    with running(MADE) as parts:
+        yield parts
+
+
+def resident_kb():
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["RssAnon"].split()[0])
+
+
+def fed_buffers():
+    """With a timestamp, without one, and with a reference timestamp; of different sizes."""
+    for number, pts in enumerate((5, Gst.CLOCK_TIME_NONE, 7)):
+        buffer = Gst.Buffer.new_wrapped(bytes(range(40 + number)))
+        buffer.pts = pts
+        if pts == 7:
+            reference = Gst.Caps.from_string("timestamp/x-ntp")
+            buffer.add_reference_timestamp_meta(reference, STAMPED, Gst.CLOCK_TIME_NONE)
+        yield buffer
+
+
+def test_it_reads_what_the_binding_reads():
+    stated, read, both = [], [], threading.Event()
+
+    def on_binding(_pad, info):
+        buffer = info.get_buffer()
+        meta, size = buffer.get_reference_timestamp_meta(None), buffer.get_size()
+        pts = None if buffer.pts == Gst.CLOCK_TIME_NONE else buffer.pts
+        ends = buffer.extract_dup(0, 16), buffer.extract_dup(size - 8, 16)
+        stated.append((pts, size, *ends, meta.timestamp if meta else None))
+        return Gst.PadProbeReturn.OK
+
+    def on_buffer(_pad, buffer):
+        ends = buffer.extract(0, 16), buffer.extract(buffer.size - 8, 16)
+        read.append((buffer.pts, buffer.size, *ends, buffer.reference_ns))
+        if len(read) == 3:
+            both.set()
+        return len(read) >= 3
+
+    with running(FED) as (pipeline, pad):
+        shot = OneShot(pad, on_buffer)
+        pad.add_probe(Gst.PadProbeType.BUFFER, on_binding)  # probes of a pad are called in order
+        shot.arm()
+        pipeline.set_state(Gst.State.PLAYING)
+        for buffer in fed_buffers():
+            pipeline.get_by_name("fed").emit("push-buffer", buffer)
+        assert both.wait(20)
+    assert read == stated
+    assert [(one[0], one[1], one[4]) for one in read] == [(5, 40, None), (None, 41, None), (7, 42, STAMPED)]
+    assert read[0][2:4] == (bytes(range(16)), bytes(range(32, 40)))  # there are no more bytes
+
+
+def test_looking_keeps_no_memory(playing):
+    pipeline, pad = playing
+    looks = [0]
+
+    def on_buffer(_pad, _buffer):
+        looks[0] += 1
+        return True
+
+    shot = OneShot(pad, on_buffer)
+    pipeline.set_state(Gst.State.PLAYING)
+
+    def look(count):
+        def looked():
+            shot.arm()
+            return looks[0] >= count
+
+        until(looked, every_s=0)
+        return resident_kb()
+
+    begun = look(LOOKS // 4)
+    assert look(LOOKS) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
+
+
+def test_an_owner_that_is_gone_is_called_no_more(playing):
+    pipeline, pad = playing
+    seen = []
+    shot = OneShot(pad, lambda _pad, _buffer: seen.append(1))
+    shot.arm()
+    del shot
+    last = OneShot(pad, lambda _pad, _buffer: True)
+    pipeline.set_state(Gst.State.PLAYING)
+    last.arm()
+    until(lambda: not last._armed)
+    assert seen == []
+
+
+def counting(made, name, function):
+    def counted(*words, **options):
+        made[name] += 1
+        return function(*words, **options)
+
+    return counted
+
+
+def test_sides_that_are_sampled_make_no_callback(monkeypatch):
+    """Each would be kept for good."""
+    made = Counter()
+    for owner, name in ((Gst.Pad, "add_probe"), (GLib, "idle_add"), (GLib, "timeout_add")):
+        monkeypatch.setattr(owner, name, counting(made, name, getattr(owner, name)))
+    vehicle = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).vehicle()
+    plans = compile_plans(vehicle)
+    side = VehicleSide(plans, vehicle.media, lambda *_: None)
+    viewer = OperatorSide(plans, lambda *_: None)
+    try:
+        side.turn(Command(name, "bitrate", 500) for name in vehicle.cameras)
+        until(lambda: all(one.frames > 20 for one in viewer.sample({}).values()))
+        until(lambda: all(side.stages().values()))
+        made.clear()
+        sampled = [viewer.sample({}) and side.stages() for _ in range(50)]
+        latencies = viewer.sample({}).values()
+    finally:
+        viewer.stop()
+        side.stop()
+    assert made == {}
+    assert all(sampled[-1].values())
+    assert all(one.latency_ms is not None for one in latencies)
