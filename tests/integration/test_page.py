@@ -18,7 +18,20 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from browser import all_live, boxes, luma, measure, opened, send, shot, state, state_when, take_control, until
+from browser import (
+    all_live,
+    boxes,
+    luma,
+    measure,
+    opened,
+    send,
+    shot,
+    state,
+    state_when,
+    take_control,
+    until,
+    viewing,
+)
 from rig import WAIT_S, answers, free_port, process
 from runner.page.server import EVENTS
 
@@ -94,13 +107,6 @@ def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
     with suppress(AssertionError):
         until(lambda: not waiting(), seconds)
     assert waiting() == {}
-
-
-def viewing(page, view):
-    """Choose a view by its key."""
-    if page.evaluate("tod.view") != view:
-        page.locator("body").press("v")
-    assert page.evaluate("tod.view") == view
 
 
 def choose(page, mode):
@@ -453,7 +459,11 @@ def test_without_webcodecs_one_sentence_names_what_it_needs(chromium, demo):
 
 def test_keys_choose_modes_cameras_and_help(page):
     page.locator("body").press("Shift+C")
-    state_when(page, lambda now: now["mode"] == "collective")
+    total = state_when(page, lambda now: now["mode"] == "collective")["total_kbps"]
+    page.locator("body").press("-")
+    lower = state_when(page, lambda now: abs(now["total_kbps"] - 0.9 * total) < 1)["total_kbps"]
+    page.locator("body").press("+")
+    state_when(page, lambda now: abs(now["total_kbps"] - 1.1 * lower) < 1)
     page.locator("body").press("4")
     page.locator("body").press("o")
     state_when(page, lambda now: not now["cameras"]["rear_center"]["on"])
@@ -464,6 +474,50 @@ def test_keys_choose_modes_cameras_and_help(page):
     shot(page, "help")
     page.keyboard.press("Escape")
     page.wait_for_selector("dialog[open]", state="hidden")
+
+
+NAMED = (
+    "article",
+    "button",
+    "dialog",
+    "figure",
+    "image",
+    "radio",
+    "radiogroup",
+    "slider",
+    "spinbutton",
+    "switch",
+    "tab",
+)
+
+
+def test_screen_readers_find_a_name_for_everything(page):
+    """In both views; a name of an element without a role would not be read."""
+    reader = page.context.new_cdp_session(page)
+
+    def nameless(least):
+        nodes = reader.send("Accessibility.getFullAXTree")["nodes"]
+        found = [node for node in nodes if not node["ignored"] and node["role"]["value"] in NAMED]
+        assert len(found) >= least
+        return [described(node) for node in found if not node.get("name", {}).get("value", "").strip()]
+
+    def described(node):
+        element = reader.send("DOM.describeNode", {"backendNodeId": node["backendDOMNodeId"]})["node"]
+        return node["role"]["value"], element["nodeName"], element.get("attributes")
+
+    without_role = page.locator("[aria-label]:is(div, span, p, i, b):not([role])")
+    assert without_role.evaluate_all("all => all.map(({ outerHTML }) => outerHTML.slice(0, 99))") == []
+    page.locator("#tab-charts").click()
+    assert nameless(least=40) == []
+    viewing(page, "drive")
+    page.locator("body").press("d")
+    assert nameless(least=40) == []
+    page.locator("body").press("?")
+    page.wait_for_selector("dialog[open]")
+    assert nameless(least=3) == []
+    page.keyboard.press("Escape")
+    page.wait_for_selector("dialog[open]", state="hidden")
+    page.locator("#tab-camera").click()
 
 
 SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
@@ -572,6 +626,14 @@ def test_keys_of_the_drive_view(page):
     assert page.locator("[data-camera=front_center]").bounding_box() == box["rear_center"]
     page.keyboard.press("Escape")
     assert page.locator("[data-camera=rear_center]").bounding_box() == box["rear_center"]
+    for front, rear in (("rear_center", "front_center"), ("front_center", "rear_center")):  # backwards, and forwards
+        assert selected_by("r") == front
+        assert page.locator(f"[data-camera={front}]").bounding_box() == box["front_center"]
+        assert page.locator(f"[data-camera={rear}]").bounding_box() == box["rear_center"]
+    page.keyboard.press("p")
+    assert page.locator("#map-panel").is_visible()
+    page.keyboard.press("p")
+    assert not page.locator("#map-panel").is_visible()
     page.keyboard.press("Shift+F")
     until(lambda: page.evaluate("document.fullscreenElement !== null"))
     page.keyboard.press("Shift+F")
