@@ -459,11 +459,7 @@ def test_without_webcodecs_one_sentence_names_what_it_needs(chromium, demo):
 
 def test_keys_choose_modes_cameras_and_help(page):
     page.locator("body").press("Shift+C")
-    total = state_when(page, lambda now: now["mode"] == "collective")["total_kbps"]
-    page.locator("body").press("-")
-    lower = state_when(page, lambda now: abs(now["total_kbps"] - 0.9 * total) < 1)["total_kbps"]
-    page.locator("body").press("+")
-    state_when(page, lambda now: abs(now["total_kbps"] - 1.1 * lower) < 1)
+    state_when(page, lambda now: now["mode"] == "collective")
     page.locator("body").press("4")
     page.locator("body").press("o")
     state_when(page, lambda now: not now["cameras"]["rear_center"]["on"])
@@ -514,7 +510,7 @@ def test_screen_readers_find_a_name_for_everything(page):
     assert nameless(least=40) == []
     page.locator("body").press("?")
     page.wait_for_selector("dialog[open]")
-    assert nameless(least=3) == []
+    assert nameless(least=2) == []
     page.keyboard.press("Escape")
     page.wait_for_selector("dialog[open]", state="hidden")
     page.locator("#tab-camera").click()

@@ -36,11 +36,11 @@ function send(kbps) {
   request("total", { event: "total_set", kbps }, `total ${kbps} kbit/s`);
 }
 
-/** Set the total to so many times what it is set to, or about to be. */
+/** Set the total to so many times what it is about to be; a lower one to less than what a rule has left of it. */
 export function changeTotal(times) {
   const reason = whyNot();
   if (reason) return complain(reason);
-  const from = pending("total")?.event.kbps ?? wished();
+  const from = pending("total")?.event.kbps ?? (times < 1 ? store.state?.total_kbps : wished());
   send(Math.max(1, Math.min(most(), Math.round(times * from))));
 }
 
