@@ -335,7 +335,7 @@ def test_notice_a_lost_front_view(page, drive):
             until(lambda: share(page, "front", RED) > 0.05)
         drive.let("front", "moves")
     within("lost front view, marked as frozen", frozen, drive.noticed_ms)
-    within("lost front view, marked as lost", lost, LOST_MS + MORE_MS)
+    within("lost front view, marked as lost", lost, LOST_MS + drive.noticed_ms)
 
 
 def test_notice_a_picture_that_is_repeated_as_new(page, drive):
