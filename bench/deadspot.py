@@ -142,7 +142,7 @@ def draw_statuses(axes: Any, drive: Watched, t: float) -> None:
     """A row per camera."""
     for row, name in enumerate(reversed(drive.statuses)):
         for begin, end, status in drive.spans(name):
-            axes.barh(row, end - begin, left=begin, height=0.8, color=COLOURS.get(status, OTHER))
+            axes.barh(row, end - begin, left=begin, height=0.8, color=COLOURS.get(status.split()[0], OTHER))
     axes.set_yticks(range(len(drive.statuses)), [*reversed(drive.statuses)], fontsize=8)
     axes.axvline(t, color="black", lw=1)
 

@@ -1,6 +1,7 @@
-"""From source to screen: delay of a frame on its way into the browser, by stage, and whether eight tiles keep up.
+"""From source to screen: delay of a frame on its way into the browser, by stage, and whether the page keeps up.
 
-  python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each
+  python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each;
+                                            what one, two, four and eight cameras skip; what overlays add
   python bench/page.py --seconds 60 --show  with a window instead of headless
 
 The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
@@ -15,19 +16,21 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 from table import Row, show, spread
 from usage import processor_s
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
-from rig import CHROMIUM_FLAGS, answers, free_port, process, until
+from rig import CHROMIUM_FLAGS, Operator, answers, free_port, process, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
@@ -36,6 +39,16 @@ from runner.plans import render_missing
 STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
 SETTLE_S = 5
 ROUNDS = 8
+ONE, EIGHT = (
+    ("one camera 960x540 at 30 Hz", 1, (960, 540, 30), 2500),
+    ("eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000),
+)
+COUNTS = (1, 2, 4, 8)  # of cameras, for what is skipped
+PAIRS = 10  # of blocks with and without overlays
+BLOCK_SETTLE_S = 0.3
+STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and how far it goes: the path is drawn anew in each picture
+# The frame of a region is the page's own, which shows it only until a new region is on the picture.
+OVERLAYS = ".bare #drive { visibility: hidden } body:not(.bare) .roi-drag { display: block !important; inset: 20% }"
 
 
 def main() -> None:
@@ -51,8 +64,10 @@ def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
         flags = CHROMIUM_FLAGS
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), headless=headless, args=flags)
         found = [
-            *measure(browser, "one camera 960x540 at 30 Hz", 1, (960, 540, 30), 2500, seconds),
-            *measure(browser, "eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000, seconds),
+            *measure(browser, *ONE, seconds),
+            *measure(browser, *EIGHT, seconds),
+            *(skipped(browser, count, seconds / 2) for count in COUNTS),
+            *(row for form in (ONE, EIGHT) for row in overlays(browser, *form, seconds)),
         ]
         browser.close()
     return found
@@ -62,10 +77,8 @@ def measure(
     browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
     """Drive a vehicle of some equal cameras and measure its page."""
-    with tempfile.TemporaryDirectory() as directory:
-        words = _configuration(Path(directory), count, *form, kbps)
-        render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
-        rounds = [_round(browser, [*words, f"conf={directory}"], seconds / ROUNDS) for _ in range(ROUNDS)]
+    with _vehicle(count, form, kbps) as words:
+        rounds = [_round(browser, words, seconds / ROUNDS) for _ in range(ROUNDS)]
     cameras = [frames for one in rounds for frames in one.frames]
     for number, stage in enumerate(STAGES):
         took = [frame[number + 1] - frame[number] for frames in cameras for frame in frames]
@@ -80,11 +93,81 @@ def measure(
     yield Row(f"{what}: operator's process", sum(one.cores for one in rounds) / ROUNDS, "cores")
 
 
+def skipped(browser: Browser, count: int, seconds: float) -> Row:
+    """Of the pictures that reached the page, the share that was not drawn."""
+    with _vehicle(count, (640, 360, 30), 1500 * count) as words:
+        one = _round(browser, words, seconds)
+    note = f"drawn, slowest camera {min(one.rates):.1f} Hz"
+    return Row(f"640x360 at 30 Hz, cameras: {count}: skipped", 100 * one.skipped, "%", note=note)
+
+
+def overlays(
+    browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float
+) -> Iterator[Row]:
+    """What lines on the ground, figures and frames of regions add from source to screen, by turns in one drive."""
+    with (
+        _vehicle(count, form, kbps) as words,
+        _station(words) as (url, _, broker),
+        browser.new_context(viewport={"width": 1280, "height": 800}) as context,
+    ):
+        page = context.new_page()
+        page.goto(url)
+        until(lambda: page.evaluate("window.tod?.control") == "you")
+        page.keyboard.press("v")
+        page.add_style_tag(content=OVERLAYS)
+        with _steering(broker):
+            time.sleep(SETTLE_S)
+            turns = (True, False, False, True) * (PAIRS // 2)  # a trend of the machine adds to both
+            blocks = [(with_them, _block(page, with_them, seconds / len(turns))) for with_them in turns]
+    medians = {with_them: [median(ages) for each, ages in blocks if each == with_them] for with_them in (True, False)}
+    added = [a - b for a, b in zip(medians[True], medians[False], strict=True)]
+    note = f"{min(added):.2f} to {max(added):.2f} in {len(added)} pairs, to {median(medians[False]):.1f}"
+    yield Row(f"{what}: overlays add", median(added), "ms", most=1, note=note)
+
+
+def _block(page: Page, with_them: bool, seconds: float) -> list[float]:
+    """Source to screen of each picture drawn in some seconds with overlays or without, ms."""
+    shows = bool(page.evaluate("document.querySelector('canvas.guides:not([hidden])') !== null"))
+    if shows != with_them:
+        page.keyboard.press("g")
+    page.evaluate("bare => document.body.classList.toggle('bare', bare)", not with_them)
+    time.sleep(BLOCK_SETTLE_S)
+    began = 1000 * time.time()
+    time.sleep(seconds)
+    if bool(page.evaluate("tod.guides('camera_0')")) != with_them:
+        raise SystemExit(f"lines on the ground are {'not ' if with_them else ''}drawn")
+    cameras = page.evaluate("tod.stages()").values()
+    ages = [frame[-1] - frame[0] for frames in cameras for frame in _since(frames, began)]
+    if not ages:
+        raise SystemExit("no picture was drawn; is the machine idle?")
+    return ages
+
+
+@contextmanager
+def _steering(broker: Endpoint) -> Iterator[None]:
+    """The steering wheel turns from side to side, as the vehicle is told."""
+    ended, driver = threading.Event(), Operator(broker, "bench")
+
+    def turn() -> None:
+        while not ended.wait(STEERING_S):
+            driver.send("steering", event="steering_reported", rad=STEERING_RAD * math.sin(time.time()))
+
+    turning = threading.Thread(target=turn)
+    turning.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        turning.join()
+        driver.link.close()
+
+
 class Round(NamedTuple):
-    """Measurements of one page: frames by camera as times of each stage, ms."""
+    """Measurements of one page: frames by camera as times of each stage, ms; skipped as a share of all pictures."""
 
     frames: list[list[list[float]]]
     rates: list[float]
+    skipped: float
     errors: int
     opened_ms: float
     cores: float
@@ -95,7 +178,7 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
 
     The phase between cameras and screen is constant during a drive, so one drive alone says little.
     """
-    with _station(words) as (url, operator), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
+    with _station(words) as (url, operator, _), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page = context.new_page()
         time.sleep(SETTLE_S)
         page.goto(url)
@@ -105,11 +188,25 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
         after, took = page.evaluate("tod.measure()")["cameras"], time.time() - began
         cores = (processor_s(operator) - used) / took
         stages = page.evaluate("tod.stages()").values()
-    # The first frames of a stream carry no capture time.
-    frames = [[f for f in camera if f[-1] > began * 1000 and math.isfinite(f[0])] for camera in stages]
-    rates = [(after[name]["drawn"] - before[name]["drawn"]) / took for name in after]
+    frames = [_since(camera, began * 1000) for camera in stages]
+    due, drawn = ([after[name][key] - before[name][key] for name in after] for key in ("due", "drawn"))
     opened = max(float(camera["first_drawn_ms"] or "inf") for camera in after.values())
-    return Round(frames, rates, sum(camera["errors"] for camera in after.values()), opened, cores)
+    errors = sum(camera["errors"] for camera in after.values())
+    return Round(frames, [each / took for each in drawn], 1 - sum(drawn) / sum(due), errors, opened, cores)
+
+
+def _since(frames: list[list[float]], began_ms: float) -> list[list[float]]:
+    """Those drawn since; the first ones of a stream carry no capture time."""
+    return [frame for frame in frames if frame[-1] > began_ms and math.isfinite(frame[0])]
+
+
+@contextmanager
+def _vehicle(count: int, form: tuple[int, int, int], kbps: int) -> Iterator[list[str]]:
+    """A vehicle of equal cameras, whose pictures are rendered. Yields the words that choose it."""
+    with tempfile.TemporaryDirectory() as directory:
+        words = _configuration(Path(directory), count, *form, kbps)
+        render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
+        yield [*words, f"conf={directory}"]
 
 
 def _configuration(directory: Path, count: int, width: int, height: int, fps: int, kbps: int) -> list[str]:
@@ -125,24 +222,25 @@ def _configuration(directory: Path, count: int, width: int, height: int, fps: in
     for n, name in enumerate(names):
         place = f"{{row: {n // 3}, column: {n % 3}}}"
         pose = f"{{x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: {n * 360 // count}}}"
-        mounted.append(f"  {name}: {{place: {place}, pose: {pose}}}\n")
-    vehicle = f"# @package _global_\ndefaults:\n{mounts}  - _self_\nname: bench\ncameras:\n{''.join(mounted)}"
-    (directory / "vehicle" / "bench.yaml").write_text(vehicle)
+        mounted.append(f"  {name}: {{place: {place}, pose: {pose}, calibrated: true}}\n")
+    top = f"# @package _global_\ndefaults:\n{mounts}  - _self_\nname: bench\n"
+    car = "{wheelbase_m: 2.9, track_m: 1.65, width_m: 1.92, front_m: 3.65, rear_m: 0.95}"
+    (directory / "vehicle" / "bench.yaml").write_text(f"{top}dimensions: {car}\ncameras:\n{''.join(mounted)}")
     return ["vehicle=bench", "source=synthetic", "pqos=constant", f"pqos.kbps={kbps}"]
 
 
 @contextmanager
-def _station(words: Sequence[str]) -> Iterator[tuple[str, int]]:
-    """Both sides as processes, as the demo runs them. Yields the page's address and the operator's process."""
+def _station(words: Sequence[str]) -> Iterator[tuple[str, int, Endpoint]]:
+    """Both sides as processes, as the demo runs them. Yields the page's address, the operator's process, the broker."""
     media, control, page = (free_port() for _ in range(3))
     own = [*words, f"media.port={media}", f"control.port={control}", f"page.port={page}"]
     with (
-        private_broker(Endpoint("127.0.0.1", control)),
+        private_broker(broker := Endpoint("127.0.0.1", control)),
         process("vehicle", *own, stdout=subprocess.DEVNULL),
         process("operator", *own, stdout=subprocess.DEVNULL) as operator,
     ):
         until(lambda: answers(page), seconds=20)
-        yield f"http://127.0.0.1:{page}/", operator.pid
+        yield f"http://127.0.0.1:{page}/", operator.pid, broker
 
 
 if __name__ == "__main__":

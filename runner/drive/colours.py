@@ -1,9 +1,9 @@
-"""One colour per camera, the same as on the operator's page (runner/page/static/colours.js), after Okabe and Ito."""
+"""One colour per camera, the same as on the operator's page (runner/page/static/colours.js)."""
 
 from __future__ import annotations
 
-DAY = ("#0b6fae", "#a86a00", "#00785a", "#7a6f00", "#a3478a", "#c24100", "#4a4fc4", "#4b5560")
-NIGHT = ("#56b4e9", "#e69f00", "#2fc59a", "#f0e442", "#d98cc0", "#ff7847", "#9aa5ff", "#c9ced4")
+DAY = ("#0b6fae", "#6c2c00", "#10372c", "#8d744d", "#45154f", "#c24100", "#6106af", "#676d7f")
+NIGHT = ("#56b4e9", "#ecac00", "#53f3c5", "#fff269", "#b46b99", "#ff7847", "#828af9", "#c4def9")
 
 # By day, as style.css has them; late values have the colour of the sixth camera.
 NAMED = {

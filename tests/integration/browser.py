@@ -133,3 +133,33 @@ def shot(page, name):
 def send(page, **event):
     """Send a request as the page does; returns the reply."""
     return page.evaluate("event => tod.request(event)", event)
+
+
+def viewing(page, view):
+    """Choose a view by its key."""
+    if page.evaluate("tod.view") != view:
+        page.locator("body").press("v")
+    assert page.evaluate("tod.view") == view
+
+
+# Gamepads that a test plugs in and presses.
+PADS = """() => {
+  globalThis.pads = [];
+  globalThis.shaken = [];
+  globalThis.looks = 0;
+  Object.defineProperty(navigator, "getGamepads", { value: () => (looks++, [...pads, null]) });
+  globalThis.plug = (name) => {
+    const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
+    const vibrationActuator = { playEffect: async (kind, { duration }) => shaken.push([kind, duration]) };
+    pads.push({ index: 0, id: `${name} (Vendor: 046d Product: c24f)`, connected: true, buttons, vibrationActuator });
+    dispatchEvent(Object.assign(new Event("gamepadconnected"), { gamepad: pads[0] }));
+  };
+  globalThis.unplug = () => dispatchEvent(Object.assign(new Event("gamepaddisconnected"), { gamepad: pads.pop() }));
+}"""
+
+
+def press_button(page, button):
+    """Press a button of the first pad until the page has seen it, and release it likewise."""
+    for pressed in ("true", "false"):
+        looks = page.evaluate(f"pads[0].buttons[{button}].pressed = {pressed}, looks")
+        until(lambda looks=looks: page.evaluate("looks") >= looks + 2)

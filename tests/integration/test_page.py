@@ -18,7 +18,20 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from browser import all_live, boxes, luma, measure, opened, send, shot, state, state_when, take_control, until
+from browser import (
+    all_live,
+    boxes,
+    luma,
+    measure,
+    opened,
+    send,
+    shot,
+    state,
+    state_when,
+    take_control,
+    until,
+    viewing,
+)
 from rig import WAIT_S, answers, free_port, process
 from runner.page.server import EVENTS
 
@@ -94,13 +107,6 @@ def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
     with suppress(AssertionError):
         until(lambda: not waiting(), seconds)
     assert waiting() == {}
-
-
-def viewing(page, view):
-    """Choose a view by its key."""
-    if page.evaluate("tod.view") != view:
-        page.locator("body").press("v")
-    assert page.evaluate("tod.view") == view
 
 
 def choose(page, mode):
@@ -466,6 +472,50 @@ def test_keys_choose_modes_cameras_and_help(page):
     page.wait_for_selector("dialog[open]", state="hidden")
 
 
+NAMED = (
+    "article",
+    "button",
+    "dialog",
+    "figure",
+    "image",
+    "radio",
+    "radiogroup",
+    "slider",
+    "spinbutton",
+    "switch",
+    "tab",
+)
+
+
+def test_screen_readers_find_a_name_for_everything(page):
+    """In both views; a name of an element without a role would not be read."""
+    reader = page.context.new_cdp_session(page)
+
+    def nameless(least):
+        nodes = reader.send("Accessibility.getFullAXTree")["nodes"]
+        found = [node for node in nodes if not node["ignored"] and node["role"]["value"] in NAMED]
+        assert len(found) >= least
+        return [described(node) for node in found if not node.get("name", {}).get("value", "").strip()]
+
+    def described(node):
+        element = reader.send("DOM.describeNode", {"backendNodeId": node["backendDOMNodeId"]})["node"]
+        return node["role"]["value"], element["nodeName"], element.get("attributes")
+
+    without_role = page.locator("[aria-label]:is(div, span, p, i, b):not([role])")
+    assert without_role.evaluate_all("all => all.map(({ outerHTML }) => outerHTML.slice(0, 99))") == []
+    page.locator("#tab-charts").click()
+    assert nameless(least=40) == []
+    viewing(page, "drive")
+    page.locator("body").press("d")
+    assert nameless(least=40) == []
+    page.locator("body").press("?")
+    page.wait_for_selector("dialog[open]")
+    assert nameless(least=2) == []
+    page.keyboard.press("Escape")
+    page.wait_for_selector("dialog[open]", state="hidden")
+    page.locator("#tab-camera").click()
+
+
 SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
 
 
@@ -577,6 +627,14 @@ def test_keys_of_the_drive_view(page):
     is_at("front_center", "rear_center")
     page.keyboard.press("Escape")
     is_at("rear_center", "rear_center")
+    for front, rear in (("rear_center", "front_center"), ("front_center", "rear_center")):  # backwards, and forwards
+        assert selected_by("r") == front
+        is_at(front, "front_center")
+        is_at(rear, "rear_center")
+    page.keyboard.press("p")
+    assert page.locator("#map-panel").is_visible()
+    page.keyboard.press("p")
+    assert not page.locator("#map-panel").is_visible()
     page.keyboard.press("Shift+F")
     until(lambda: page.evaluate("document.fullscreenElement !== null"))
     page.keyboard.press("Shift+F")

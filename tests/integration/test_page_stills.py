@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from painted import CAMERAS, CAR, SIZE, WITHIN_PX, ends_of, found, native_pictures, paint
 
-from browser import all_live, opened, shot, until
+from browser import PADS, all_live, opened, shot, until
 from rig import free_port
 from runner.configuration.config import configuration
 from runner.core.events import parse
@@ -25,7 +25,7 @@ from runner.core.model import plain
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
-from runner.records import CameraState, VehicleState, applied_to_json
+from runner.records import CameraState, Sample, VehicleState, applied_to_json
 
 pytestmark = [
     pytest.mark.gst,
@@ -129,11 +129,12 @@ def vehicle_file():
 def served(station):
     """The page's server, which sends the pictures."""
     page, ended = PageServer(station.vehicle, station), threading.Event()
+    page.behind_s = 0.0  # how long ago pictures were captured
 
     def send():
         while not ended.wait(EVERY_S):
             for name, data in station.units.items():
-                page.show(name, read_unit(data, time.time(), time.time()))
+                page.show(name, read_unit(data, time.time() - page.behind_s, time.time()))
 
     page.start()
     sending = threading.Thread(target=send)
@@ -253,20 +254,6 @@ def steering(served, rad):
         reporting.join()
 
 
-PADS = """() => {
-  globalThis.pads = [];
-  globalThis.shaken = [];
-  Object.defineProperty(navigator, "getGamepads", { value: () => [...pads, null] });
-  globalThis.plug = (name) => {
-    const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
-    const vibrationActuator = { playEffect: async (kind, { duration }) => shaken.push([kind, duration]) };
-    pads.push({ index: 0, id: `${name} (Vendor: 046d Product: c24f)`, connected: true, buttons, vibrationActuator });
-    dispatchEvent(Object.assign(new Event("gamepadconnected"), { gamepad: pads[0] }));
-  };
-  globalThis.unplug = () => dispatchEvent(Object.assign(new Event("gamepaddisconnected"), { gamepad: pads.pop() }));
-}"""
-
-
 def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
     page.evaluate(PADS)
     page.evaluate("plug('Wheel')")
@@ -318,6 +305,17 @@ def test_a_pad_vibrates_for_a_picture_that_is_lost(page, station, served):
     served.on_state(None)  # the vehicle is offline
     until(lambda: page.evaluate("shaken"))
     assert page.evaluate("shaken") == [["dual-rumble", 600]], "once for all pictures"
+
+
+def test_a_pad_vibrates_more_gently_for_a_picture_that_is_late(page, served):
+    page.evaluate(PADS)
+    page.evaluate("plug('Pad')")
+    served.on_sample(Sample(1.0, None, 0, 0.0, None, 0, {}, clock_bound_ms=1.0))  # ages are known
+    time.sleep(1)
+    assert page.evaluate("shaken") == []
+    served.behind_s = 0.5
+    until(lambda: page.evaluate("shaken"))
+    assert page.evaluate("shaken")[0] == ["dual-rumble", 200]
 
 
 def test_the_vehicle_is_told_of_a_page_that_is_hidden_or_out_of_focus(page, station):

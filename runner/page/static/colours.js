@@ -1,9 +1,11 @@
-/** One colour per camera, the same in every tile and chart; also for colour-blind users (after Okabe and Ito). */
+/** One colour per camera, the same in every tile and chart; chosen so that colour-blind users tell them apart as well. */
 
-const NIGHT = ["#56b4e9", "#e69f00", "#2fc59a", "#f0e442", "#d98cc0", "#ff7847", "#9aa5ff", "#c9ced4"];
-const DAY = ["#0b6fae", "#a86a00", "#00785a", "#7a6f00", "#a3478a", "#c24100", "#4a4fc4", "#4b5560"];
+const NIGHT = ["#56b4e9", "#ecac00", "#53f3c5", "#fff269", "#b46b99", "#ff7847", "#828af9", "#c4def9"];
+const DAY = ["#0b6fae", "#6c2c00", "#10372c", "#8d744d", "#45154f", "#c24100", "#6106af", "#676d7f"];
 
 export const isDay = () => document.documentElement.dataset.theme === "day";
+
+export const PALETTES = { night: NIGHT, day: DAY };
 
 export const colourOf = (index) => (isDay() ? DAY : NIGHT)[index % NIGHT.length];
 

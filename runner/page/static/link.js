@@ -84,6 +84,9 @@ export function giveGuides(name, element) {
 /** @param {string[]} names of the cameras whose guides are shown */
 export const showGuides = (names) => worker.postMessage({ order: "guided", names });
 
+/** @param {string|null} name of the camera whose picture is drawn first */
+export const drawFirst = (name) => worker.postMessage({ order: "first", name });
+
 /** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
 export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>
   worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view });

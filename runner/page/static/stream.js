@@ -41,7 +41,7 @@ export class Stream {
 
   /**
    * @param {object} camera as in hello
-   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), wake() requests a redraw
+   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), marked(name, mark), wake() requests a redraw
    */
   constructor(camera, station) {
     this.camera = camera;
@@ -78,6 +78,8 @@ export class Stream {
     this.status = this.reported = "synchronising";
     /** @type {string|null} */
     this.painted = ""; // text of the overlay in the canvas, "" for the plain picture
+    this.marked = ""; // what that says of the picture
+    this.last_drawn = 0; // page time
     this.late_age = NaN; // of the last late picture
     this.guides = camera.pose && station.dimensions ? new GuideLayer(camera, station.dimensions) : null;
     /** @type {{x: number, y: number, width: number, height: number, size: {width: number, height: number}}|null} */
@@ -258,6 +260,11 @@ export class Stream {
     this.station.wake();
   }
 
+  /** Whether there is a picture to draw. */
+  get waits() {
+    return this.waiting !== null && this.context !== null;
+  }
+
   /** Draw the newest frame; called in the worker's animation frame. */
   draw() {
     if (!this.waiting || !this.context) return;
@@ -265,6 +272,7 @@ export class Stream {
     this.shown = this.waiting;
     this.waiting = null;
     this.drawn = true;
+    this.last_drawn = now();
     this.damaged = Boolean(this.shown.meta.flags & DAMAGED);
     this.age(this.shown.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
@@ -351,8 +359,13 @@ export class Stream {
 
   overlay(time) {
     if (this.status === "live") return "";
-    const late = this.status === "damaged" && time < this.late_until ? `, ${words("late", 0, this.late_age)}` : "";
+    const late = this.isLateToo(time) ? `, ${words("late", 0, this.late_age)}` : "";
     return words(this.status, time - Math.min(this.arrived, this.failed_at ?? Infinity), this.late_age) + late;
+  }
+
+  /** Whether a damaged picture is late as well. */
+  isLateToo(time) {
+    return this.status === "damaged" && time < this.late_until;
   }
 
   paint(time) {
@@ -365,6 +378,14 @@ export class Stream {
     else blank(context, width, height);
     if (text) drawOverlay(context, this.area(canvas), this.display.view.mirrored, this.status, text);
     this.painted = text;
+    this.tellMark(this.isLateToo(time) ? "damaged late" : this.status);
+  }
+
+  /** Tell what the canvas says of the picture from now on. */
+  tellMark(mark) {
+    if (mark === this.marked) return;
+    this.marked = mark;
+    this.station.marked(this.name, mark);
   }
 
   /**

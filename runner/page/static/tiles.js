@@ -1,11 +1,11 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
 import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
-import { giveCanvas, giveGuides, tellSize } from "./link.js";
+import { drawFirst, giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
 import { heightsOf, rowsOf } from "./layout.js";
-import { arrange } from "./arrange.js";
+import { arrange, rolesOf } from "./arrange.js";
 import { shownWords, WHOLE } from "./framing.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
@@ -106,6 +106,7 @@ export function switchCamera(name) {
 // --- layout -----------------------------------------------------------------------------------------------------------
 
 function lay() {
+  drawFirst(store.enlarged ?? rolesOf(store.hello?.cameras ?? []).front?.name ?? null);
   if (store.view === "drive") return layDrive();
   for (const [name, { element }] of tiles) {
     Object.assign(element.style, { left: "", top: "" });

@@ -8,6 +8,7 @@ import { Clock, now } from "./clock.js";
 import { hasGpu } from "./picture.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
+import { drawInTurn } from "./turns.js";
 // Imported here, though used only by other modules, so that all modules are fetched at once.
 import "./codec.js";
 import "./counter.js";
@@ -26,6 +27,7 @@ const SILENT_MS = 2000; // the station sends four messages a second
 const RECONNECT_MS = 500;
 const TELL_MS = 250;
 const HEADER = 24;
+const LOGGED = 200;
 
 const station = {
   clock: new Clock(),
@@ -39,6 +41,7 @@ const station = {
   counted: null, // name of the camera that films the counter, if the page is to read it
   count: (counter) => send({ counter }),
   resync: (name) => send({ resync: name }),
+  marked: (name, mark) => log.push([now(), name, mark]) > LOGGED && log.shift(),
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
@@ -49,10 +52,12 @@ let streams = []; // in the order of hello, by which the binary messages are ind
 let described = "";
 /** @type {string[]} */
 let guided = []; // cameras whose guides are shown
+/** @type {string|null} */
+let first = null; // camera whose picture is drawn first
 let asleep = true;
 let watched = now();
 let stalled = false; // at the last tick
-const log = [];
+const log = []; // [page time, camera, mark] of each picture whose mark has changed, when that was drawn
 
 const tell = (message) => postMessage(message);
 const find = (name) => streams.find((stream) => stream.name === name);
@@ -163,7 +168,7 @@ function wake() {
   asleep = false;
   requestAnimationFrame(() => {
     asleep = true;
-    for (const stream of streams) stream.draw();
+    if (drawInTurn(streams, first, now)) wake();
   });
 }
 
@@ -180,8 +185,6 @@ function watch() {
 function judgeAll() {
   for (const stream of streams) {
     if (!stream.watch()) continue;
-    log.push([now(), stream.name, stream.status]);
-    if (log.length > 200) log.shift();
     tell({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
   }
 }
@@ -214,6 +217,7 @@ const orders = {
     guided = names;
     guide();
   },
+  first: ({ name }) => (first = name),
   size({ name, ...display }) {
     const stream = find(name);
     if (stream) Object.assign(stream, { display, painted: null });

@@ -4,6 +4,7 @@
  */
 
 import { inControl, listen, publish, store } from "./store.js";
+import { openTab } from "./tabs.js";
 import { by } from "./format.js";
 
 const VIEW = "tod-view";
@@ -32,6 +33,13 @@ export const toggleView = () => choose(store.view === "drive" ? "configure" : "d
 
 export function toggleDrawer() {
   if (store.view === "drive") setDrawer(document.body.dataset.drawer === undefined);
+}
+
+/** Open a tab, and the drawer for it; close the drawer where that tab is open. */
+export function toggleTab(name) {
+  const isOpen = document.body.dataset.drawer !== undefined && by("side").dataset.tab === name;
+  openTab(name);
+  if (store.view === "drive") setDrawer(!isOpen);
 }
 
 function setDrawer(open) {
