@@ -117,6 +117,7 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
         "+cameras.front_left.framing=fit",
         "+cameras.rear_center.calibrated=true",
         f"+cameras.front_left.native={native}",
+        "cameras.rear_center.place.column_span=2",
     )
     with served(*words) as (port, _):
         told = asyncio.run(hello(port))
@@ -129,6 +130,8 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
     optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
     assert {key: cameras["top_left"][key] for key in optics} == optics
     assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
+    assert told["places"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
+    assert told["places"]["rear_center"] == {"row": 1, "column": 1, "row_span": 1, "column_span": 2}
     dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}
     assert told["dimensions"] == dimensions
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]

@@ -423,7 +423,6 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "width": camera.width,
             "height": camera.height,
             "fps": float(camera.fps),
-            "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,
             "lens": camera.lens,
@@ -441,7 +440,15 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
     dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
     limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
     inputs = asdict(vehicle.inputs)
-    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
+    places = {name: camera.place and asdict(camera.place) for name, camera in vehicle.cameras.items()}
+    return {
+        "vehicle": vehicle.name,
+        "cameras": cameras,
+        "places": places,
+        "dimensions": dimensions,
+        "inputs": inputs,
+        **limits,
+    }
 
 
 def _native(camera: Camera) -> dict[str, int]:

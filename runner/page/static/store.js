@@ -11,7 +11,6 @@ const listeners = new Map();
  * @property {number} width px
  * @property {number} height px
  * @property {number} fps
- * @property {{row: number, column: number}|null} place on the page
  * @property {import("./projection.js").Pose|null} pose
  * @property {number} fov_deg
  * @property {"pinhole"|"fisheye"} lens
@@ -22,7 +21,7 @@ const listeners = new Map();
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello answer_s: by then the station has
+ * @typedef {{vehicle: string, cameras: Camera[], places: import("./layout.js").Places, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello answer_s: by then the station has
  *   answered a request; late_ms: an older picture is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|null>}} Inputs by action
  * @typedef {object} Applied what was read back from the elements

@@ -4,7 +4,7 @@ import { decided, enlarge, inControl, listen, publish, select, store } from "./s
 import { giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
-import { heightsOf, rowsOf } from "./layout.js";
+import { bandsOf, boxesOf, heightsOf } from "./layout.js";
 import { arrange } from "./arrange.js";
 import { shownWords, WHOLE } from "./framing.js";
 import { colourOf } from "./colours.js";
@@ -24,8 +24,9 @@ const { canShowVideo } = globalThis.boot;
 const area = by("tiles");
 const scene = by("scene");
 const tiles = new Map();
-let rows = [];
-let described = "";
+/** @type {import("./layout.js").Band[]} */
+let bands = [];
+let described = ""; // the cameras for which there are tiles
 let hinted = false; // whether the way back from an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
@@ -34,16 +35,24 @@ const sizes = new ResizeObserver((entries) => {
 
 // --- building ---------------------------------------------------------------------------------------------------------
 
-function build({ cameras }) {
+function build({ cameras, places }) {
   const text = JSON.stringify(cameras);
-  if (text === described) return;
-  described = text;
-  sizes.disconnect();
-  tiles.clear();
-  rows = rowsOf(cameras);
-  area.replaceChildren(...rows.map((row) => make("div", { class: "row" }, ...row.map(({ camera }) => tile(camera)))));
-  lay();
+  if (text !== described) {
+    described = text;
+    sizes.disconnect();
+    tiles.clear();
+    cameras.forEach(tile);
+  }
+  group(bandsOf(cameras, places));
   refreshAll();
+}
+
+/** Put the tiles into bands. */
+function group(wanted) {
+  bands = wanted;
+  const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map(({ camera }) => tiles.get(camera.name).element));
+  area.replaceChildren(...bands.map(row));
+  lay();
 }
 
 /** Height of a tile without its picture, as in the style sheet. */
@@ -94,7 +103,6 @@ function tile({ name, pose }) {
   }
   dragRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
-  return element;
 }
 
 /** Ask to switch a camera on or off: the opposite of the state that the vehicle reports. */
@@ -111,19 +119,23 @@ function lay() {
     Object.assign(element.style, { left: "", top: "" });
     frame(name, WHOLE);
   }
-  layRows();
+  layBands();
   layEnlarged();
 }
 
-/** Rows as the vehicle's mounts place them. */
-function layRows() {
-  const heights = heightsOf(rows, area.clientWidth, area.clientHeight, chrome());
-  for (const [i, row] of rows.entries()) {
-    for (const { camera: { name, width, height } } of row) {
-      const { box, element } = tiles.get(name);
-      const wide = Math.floor((heights[i] * width) / height);
-      element.style.width = `${wide}px`;
-      box.style.height = `${heights[i]}px`;
+/** Bands as the layout places them. */
+function layBands() {
+  const rest = chrome();
+  const heights = heightsOf(bands, area.clientWidth, area.clientHeight, rest);
+  for (const [i, band] of bands.entries()) {
+    const { column, boxes } = boxesOf(band, heights[i], area.clientWidth, rest);
+    const tracks = band.grid ? { gridTemplateColumns: `repeat(${band.columns}, ${column}px)`, gridTemplateRows: `repeat(${band.rows}, ${heights[i] + rest}px)` } : {};
+    Object.assign(/** @type {HTMLElement} */ (area.children[i]).style, tracks);
+    for (const [j, its] of band.tiles.entries()) {
+      const { box, element } = tiles.get(its.camera.name);
+      const gridArea = `${its.row + 1} / ${its.column + 1} / span ${its.row_span} / span ${its.column_span}`;
+      Object.assign(element.style, { width: `${boxes[j].width}px`, gridArea: band.grid ? gridArea : "" });
+      box.style.height = `${boxes[j].height}px`;
     }
   }
 }
