@@ -367,9 +367,9 @@ class Builder:
     def _check_places(self, cameras: Mapping[str, Camera]) -> None:
         """No tile of the page covers another one."""
         places = {name: camera.place for name, camera in cameras.items() if camera.place}
-        for name, other in overlapping(places):
+        for name, rule in overlapping(places):
             found = self.composed.document["cameras"][name]["place"]
-            self._report(("cameras", name), ModelError("place", found, f"overlaps the place of camera {other}"))
+            self._report(("cameras", name), ModelError("place", found, rule))
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
         """No two listeners on one port. Cameras count up from the first port of their graph."""

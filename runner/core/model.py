@@ -349,11 +349,11 @@ class Place:
 
 
 def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
-    """Cameras whose tile covers part of an earlier camera's, each with the first such camera."""
+    """Cameras whose tile covers part of an earlier camera's, each with the rule that it breaks."""
     for count, (name, place) in enumerate(places.items()):
         covered = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
         if covered is not None:
-            yield name, covered
+            yield name, f"overlaps the place of camera {covered}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,8 @@ import { rolesOf } from "./arrange.js";
 import { toggleGuides } from "./drive.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleView } from "./views.js";
+import { listMonitors } from "./monitors.js";
+import { isEdited } from "./edit.js";
 
 /**
  * @typedef {object} Action
@@ -28,10 +30,11 @@ export const ACTIONS = {
   mode_automatic: { words: "mode Automatic", run: () => selectMode("automatic") },
   mode_collective: { words: "mode Collective", run: () => selectMode("collective") },
   view: { words: "Drive or Configure view", run: toggleView },
-  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view === "drive" && toggleGuides() },
+  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
   drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
   sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
   full_screen: { words: "full screen", run: toggleFullScreen },
+  monitors: { words: "pictures in further windows, for other monitors", run: listMonitors },
   switch: { words: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
   full_image: { words: "full image of the selected camera (mode S)", run: sendFull },
   control: { words: "take or release control", run: toggleControl },
@@ -45,7 +48,7 @@ function look(role) {
 }
 
 function enlargeSelected() {
-  if (store.selected) enlarge(store.enlarged === store.selected ? null : store.selected);
+  if (store.selected && !isEdited()) enlarge(store.enlarged === store.selected ? null : store.selected);
 }
 
 export function selectCamera(name) {

@@ -5,7 +5,7 @@
  * spanning pictures join are a band with a grid, whose columns are equally wide and whose rows are equally high.
  */
 
-const GAP = 8;
+export const GAP = 8;
 const EVEN = 1.25; // a row is at most this much higher than the highest row limited by the width
 const LEAST = 24; // of a picture's height
 
@@ -52,8 +52,19 @@ function bandOf(tiles) {
   return { rows: rows.length, columns: columns.length, grid, tiles: own.sort((a, b) => a.row - b.row || a.column - b.column) };
 }
 
+/**
+ * One grid with all tiles as they are placed, and a free row and column.
+ * @param {Camera[]} cameras  @param {Record<string, Place>} places
+ * @returns {Band}
+ */
+export function gridOf(cameras, places) {
+  const tiles = cameras.map((camera) => ({ camera, ...places[camera.name] }));
+  const free = (side) => 1 + Math.max(0, ...tiles.map((tile) => tile[side] + tile[`${side}_span`]));
+  return { rows: free("row"), columns: free("column"), grid: true, tiles };
+}
+
 /** The rows or columns that any tile covers, rising. */
-function covered(tiles, side) {
+export function covered(tiles, side) {
   const numbers = tiles.flatMap((tile) => Array.from({ length: tile[`${side}_span`] }, (_, i) => tile[side] + i));
   return [...new Set(numbers)].sort((a, b) => a - b);
 }

@@ -1,11 +1,11 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
-import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { camera, decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
 import { giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
-import { bandsOf, boxesOf, heightsOf } from "./layout.js";
-import { arrange } from "./arrange.js";
+import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
+import { arrange, viewOf } from "./arrange.js";
 import { shownWords, WHOLE } from "./framing.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
@@ -27,6 +27,8 @@ const tiles = new Map();
 /** @type {import("./layout.js").Band[]} */
 let bands = [];
 let described = ""; // the cameras for which there are tiles
+/** @type {Record<string, import("./layout.js").Place>|null} */
+let draft = null; // the layout that is being edited
 let hinted = false; // whether the way back from an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
@@ -35,21 +37,29 @@ const sizes = new ResizeObserver((entries) => {
 
 // --- building ---------------------------------------------------------------------------------------------------------
 
-function build({ cameras, places }) {
+function build({ cameras }) {
   const text = JSON.stringify(cameras);
   if (text !== described) {
     described = text;
+    draft = null;
     sizes.disconnect();
     tiles.clear();
     cameras.forEach(tile);
   }
-  group(bandsOf(cameras, places));
+  group();
   refreshAll();
 }
 
+/** Show a layout that is being edited; null: the one in force. */
+export function showDraft(places) {
+  draft = places;
+  group();
+}
+
 /** Put the tiles into bands. */
-function group(wanted) {
-  bands = wanted;
+function group() {
+  const cameras = store.hello?.cameras ?? [];
+  bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
   const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map(({ camera }) => tiles.get(camera.name).element));
   area.replaceChildren(...bands.map(row));
   lay();
@@ -57,6 +67,7 @@ function group(wanted) {
 
 /** Height of a tile without its picture, as in the style sheet. */
 function chrome() {
+  if (store.view === "monitor") return 0;
   const style = getComputedStyle(document.documentElement);
   const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
   return (HEAD + below) * scale;
@@ -116,8 +127,9 @@ export function switchCamera(name) {
 function lay() {
   if (store.view === "drive") return layDrive();
   for (const [name, { element }] of tiles) {
+    const its = camera(name);
     Object.assign(element.style, { left: "", top: "" });
-    frame(name, WHOLE);
+    frame(name, its && store.view === "monitor" ? viewOf(its) : WHOLE);
   }
   layBands();
   layEnlarged();
@@ -172,7 +184,7 @@ function tellFrame(name) {
 
 /** State what is cropped. */
 function refreshShown(name, { box, shown, view }) {
-  const picture = seenRegion(name) ?? store.hello?.cameras.find((camera) => camera.name === name);
+  const picture = seenRegion(name) ?? camera(name);
   const laid = picture && box.clientWidth && box.clientHeight;
   write(shown, laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "");
 }
@@ -191,7 +203,7 @@ function layEnlarged() {
 // --- what is shown ----------------------------------------------------------------------------------------------------
 
 function refreshAll() {
-  for (const [i, { name }] of (store.hello?.cameras ?? []).entries()) refresh(name, i);
+  for (const { name, index } of store.hello?.cameras ?? []) refresh(name, index);
 }
 
 function refresh(name, index) {
@@ -282,6 +294,7 @@ function announce({ camera: name, status }) {
 
 export function startTiles() {
   listen("hello", build);
+  listen("layout", () => draft || group());
   listen("state sample requests control socket theme selected", refreshAll);
   listen("status", announce);
   listen("view", lay);
