@@ -20,6 +20,7 @@ from runner.h264.access_unit import AccessUnit
 pytest.importorskip("aiohttp")
 import aiohttp
 
+from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
 from runner.page.control import KEPT_S, Control, attention_of, page_of
 from runner.page.history import KEPT, History
@@ -297,6 +298,83 @@ def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one():
         await stated("absent")
 
     in_windows(steps)
+
+
+PLACE = {"row": 0, "column": 0, "row_span": 1, "column_span": 2}
+
+
+def test_a_layout_is_saved_by_the_page_in_control_and_told_to_all(tmp_path):
+    file = tmp_path / "layout" / "alice.yaml"
+
+    async def steps(windows, station):
+        page = await windows.open("driver", "here")
+        assert (await told(page, "hello"))["layout"]["problem"] is None
+        watcher = await windows.open("w", "there")
+        monitor = await windows.open("m", "here", show="rear_center")
+        await watcher.send_json({"id": "1", "layout": {"rear_center": PLACE}})
+        await told(watcher, "reply", id="1", reason="this page does not hold control; take it first")
+        assert not file.exists()
+        await page.send_json({"id": "2", "layout": {"rear_center": PLACE}})
+        for window in (page, watcher, monitor):
+            layout = await told(window, "layout")
+            assert {name: place for name, place in layout["places"].items() if place} == {"rear_center": PLACE}
+            assert layout["own"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
+        await told(page, "reply", id="2", result="applied")
+        assert "    rear_center: {row: 0, column: 0, column_span: 2}\n" in file.read_text()
+        later = await told(await windows.open("late", "there"), "hello")
+        assert later["layout"]["places"]["rear_center"] == PLACE
+        await monitor.send_json({"id": "3", "layout": None})  # it has its page's control
+        await told(monitor, "reply", id="3", result="applied")
+        assert (await told(page, "layout"))["places"] == layout["own"]
+        assert file.read_text().endswith("vehicles: {}\n")
+
+    in_windows(steps, layouts=Layouts(tmp_path, "alice"))
+    assert [path.name for path in tmp_path.rglob("*")] == ["layout", "alice.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        ({"layout": {"../x": PLACE}}, "'../x': must be letters, digits, _ and - only"),
+        ({"layout": {"rear": PLACE}}, "'rear': unknown camera, did you mean rear_center?"),
+        ({"layout": {"rear_center": {**PLACE, "row": -1}}}, "rear_center.row: -1: must be at least 0"),
+        ({"layout": "../../x"}, "'../../x': must be a mapping"),
+        ({"layout": {}, "operator": "../bob"}, "operator: unknown key beside layout"),
+        ({"layout": {}, "id": 7}, "id: must be given, as text of at most 64 characters"),
+    ],
+)
+def test_a_layout_that_is_wrong_is_refused_and_nothing_is_written(tmp_path, document, reason):
+    async def steps(windows, station):
+        page = await windows.open("driver", "here")
+        await told(page, "control", holder="you")
+        await page.send_json({"id": "1", **document})
+        assert (await told(page, "reply"))["reason"] == reason
+        await page.send_json({"id": "2", "layout": {}})
+        await told(page, "reply", id="2", result="applied")  # one refusal does not lock the next out
+
+    in_windows(steps, layouts=Layouts(tmp_path / "conf", "alice"))
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["alice.yaml", "conf", "layout"]
+
+
+def test_why_a_layout_cannot_be_saved(tmp_path):
+    (tmp_path / "layout").touch()
+
+    def reason_of(layouts):
+        found = []
+
+        async def steps(windows, station):
+            page = await windows.open("driver", "here")
+            found.append((await told(page, "hello"))["layout"]["problem"])
+            await page.send_json({"id": "1", "layout": {"rear_center": PLACE}})
+            found.append((await told(page, "reply", id="1", result="refused"))["reason"])
+
+        in_windows(steps, layouts=layouts)
+        return found
+
+    assert reason_of(None) == [NOWHERE, NOWHERE]
+    early, late = reason_of(Layouts(tmp_path, "alice"))
+    assert early is None
+    assert late.startswith(f"{tmp_path}/layout/alice.yaml: cannot be written: ")
 
 
 def test_what_windows_state_together():

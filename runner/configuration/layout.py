@@ -32,9 +32,8 @@ def layout_problems(path: Path) -> Iterator[Problem]:
     found = schema.findings(document, LAYOUT)
     yield from (Problem(label(path), schema.dotted(f.path), f.found, f.rule) for f in found)
     wrong = {f.path[:2] for f in found}
-    if any(len(where) < 2 for where in wrong):
-        return
-    for vehicle, cameras in document["vehicles"].items():
+    vehicles = document.get("vehicles") if isinstance(document, dict) else None
+    for vehicle, cameras in vehicles.items() if isinstance(vehicles, dict) else ():
         if ("vehicles", vehicle) not in wrong:
             for name, rule in overlapping(_places(cameras)):
                 yield Problem(label(path), f"vehicles.{vehicle}.{name}", schema.shown(cameras[name]), rule)

@@ -213,17 +213,24 @@ def _misplaced(group: str, relative: Path) -> str | None:
     if group and group not in FOLDERS:
         nested = f"files stand in {first}/ itself, not in folders below" if first in FOLDERS else ""
         return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
+    if group == LAYOUT:
+        return _misplaced_layout(relative)
     if not group and relative.stem != "config":
         return f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
     if relative.suffix != ".yaml":
         return f"would be ignored: Hydra reads {relative.stem}.yaml"
-    if group == LAYOUT:
-        from runner.mqtt.messages import OPERATOR
-
-        return None if OPERATOR.fullmatch(relative.stem) else "would be ignored: no operator can have this name"
     if group and not choosable(relative.stem):
         return "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
     return None
+
+
+def _misplaced_layout(relative: Path) -> str | None:
+    """Why the page of no operator would read a file; None if one would."""
+    from runner.mqtt.messages import OPERATOR
+
+    if relative.suffix != ".yaml":
+        return f"would be ignored: the page reads {relative.stem}.yaml"
+    return None if OPERATOR.fullmatch(relative.stem) else "would be ignored: no operator can have this name"
 
 
 # --- composed configurations ------------------------------------------------------------------------------------------
