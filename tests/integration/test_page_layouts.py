@@ -272,13 +272,13 @@ CONTRAST = """([root, theme, states]) => {
     const [low, high] = [luminance(a), luminance(b)].sort((x, y) => x - y);
     return (high + 0.05) / (low + 0.05);
   };
-  const isPicture = (it) => it.matches(".picture") || (document.body.dataset.view !== "configure" && it.matches(".tile"));
+  const pictures = document.body.dataset.view === "configure" ? ".picture" : ".picture, .tile";
   const grey = (value) => ({ r: value, g: value, b: value, a: 1 });
   const grounds = (element) => {
     const layers = [];
     let below = [grey(255)];
     for (let it = element; it; it = it.parentElement) {
-      if (isPicture(it)) {
+      if (it.matches(pictures)) {
         below = [grey(0), grey(128), grey(255)];
         break;
       }

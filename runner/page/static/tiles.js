@@ -60,7 +60,7 @@ export function showDraft(places) {
 function group() {
   const cameras = store.hello?.cameras ?? [];
   bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
-  const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map(({ camera }) => tiles.get(camera.name).element));
+  const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map((its) => tiles.get(its.camera.name).element));
   area.replaceChildren(...bands.map(row));
   lay();
 }
