@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from runner import schema
+from runner.configuration.files import LAYOUT
 from runner.configuration.yaml_file import label, load_file
 from runner.core.model import Place, Vehicle, overlapping, suggest
 from runner.errors import ConfigError, Problem, UserError
 
-LAYOUT = "layout"  # folder of the files, and name of their schema
 WITHOUT_KEYS = "operator"  # name of an operator who has no keys to be known by
 MOST_NAMED = 5  # unknown cameras in an answer
 NOWHERE = "layouts are saved in a directory of yours: start this side with conf=DIR"
@@ -29,7 +29,7 @@ def layout_problems(path: Path) -> Iterator[Problem]:
     raises  ConfigError if it cannot be read
     """
     document = load_file(path)
-    found = schema.findings(document, LAYOUT)
+    found = schema.findings(document, "layout")
     yield from (Problem(label(path), schema.dotted(f.path), f.found, f.rule) for f in found)
     wrong = {f.path[:2] for f in found}
     vehicles = document.get("vehicles") if isinstance(document, dict) else None

@@ -39,8 +39,7 @@ from runner.configuration.build import PlanCheck
 from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
-from runner.configuration.files import GROUPS, bases_of, built_on, conf_directories, find_file, options
-from runner.configuration.layout import LAYOUT, layout_problems
+from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_directories, find_file, options
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.core.model import ModelError, suggest
@@ -193,6 +192,8 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
         return
     try:
         if group == LAYOUT:
+            from runner.configuration.layout import layout_problems
+
             yield from layout_problems(path)
             return
         load_node(path)
