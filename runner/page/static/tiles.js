@@ -27,6 +27,7 @@ const tiles = new Map();
 /** @type {import("./layout.js").Band[]} */
 let bands = [];
 let described = ""; // the cameras for which there are tiles
+let grouped = ""; // the bands that they are in
 /** @type {Record<string, import("./layout.js").Place>|null} */
 let draft = null; // the layout that is being edited
 let hinted = false; // whether the way back from an enlarged picture was shown
@@ -41,6 +42,7 @@ function build({ cameras }) {
   const text = JSON.stringify(cameras);
   if (text !== described) {
     described = text;
+    grouped = "";
     draft = null;
     sizes.disconnect();
     tiles.clear();
@@ -60,6 +62,9 @@ export function showDraft(places) {
 function group() {
   const cameras = store.hello?.cameras ?? [];
   bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
+  const text = JSON.stringify(bands);
+  if (text === grouped) return lay();
+  grouped = text; // moving a tile takes the focus away
   const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map((its) => tiles.get(its.camera.name).element));
   area.replaceChildren(...bands.map(row));
   lay();
