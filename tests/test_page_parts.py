@@ -336,7 +336,7 @@ def test_a_layout_is_saved_by_the_page_in_control_and_told_to_all(tmp_path):
     ("document", "reason"),
     [
         ({"layout": {"../x": PLACE}}, "'../x': must be letters, digits, _ and - only"),
-        ({"layout": {"rear": PLACE}}, "'rear': unknown camera, did you mean rear_center?"),
+        ({"layout": {"rear_centre": PLACE}}, "'rear_centre': unknown camera, did you mean rear_center?"),
         ({"layout": {"rear_center": {**PLACE, "row": -1}}}, "rear_center.row: -1: must be at least 0"),
         ({"layout": "../../x"}, "'../../x': must be a mapping"),
         ({"layout": {}, "operator": "../bob"}, "operator: unknown key beside layout"),
