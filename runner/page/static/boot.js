@@ -31,7 +31,9 @@ function liveUrl() {
   return url.href;
 }
 
-const random = () => [...crypto.getRandomValues(new Uint8Array(16))].map((b) => b.toString(16).padStart(2, "0")).join("");
+function random() {
+  return [...crypto.getRandomValues(new Uint8Array(16))].map((b) => b.toString(16).padStart(2, "0")).join("");
+}
 
 /** A random name of this browser: its monitors share selection and control with its page. */
 function browser() {
