@@ -164,6 +164,7 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         assert station.asked == [], "no region was dragged, no camera switched"
 
 
+@pytest.mark.soak  # the station's answers are those of tests/test_page_parts.py
 def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
     with served(picture, None) as (server, _), opened(chromium, server.url) as page:
         controlling(page)
