@@ -221,7 +221,7 @@ def test_monitors_are_windows_of_their_page(chromium, picture):
         with opened(chromium, server.url) as other:
             take_control(other)
             until(lambda: monitor.evaluate("tod.control") == "another")
-            assert page.evaluate("tod.control") == "another"
+            until(lambda: page.evaluate("tod.control") == "another")
             until(lambda: station.attention in ("watching", "unfocused"))
         take_control(page)
         until(lambda: station.attention == "hidden")
