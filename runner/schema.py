@@ -210,6 +210,11 @@ def message_problem(kind: str, document: Any) -> str | None:
     return _in_one_line(f"control.schema.json#/$defs/{kind}", document)
 
 
+def places_problem(document: Any) -> str | None:
+    """The problems of places of tiles by camera, in one line; None if they are valid."""
+    return _in_one_line("layout.schema.json#/$defs/places", document)
+
+
 @cache
 def log_kinds() -> tuple[str, ...]:
     return tuple(schema_document("drive")["properties"]["log"]["enum"])
@@ -319,7 +324,7 @@ def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> st
         case "minItems" | "minLength" | "minProperties":
             return "must not be empty" if limit == 1 else f"must have at least {limit} entries"
         case "maxProperties":
-            return "must have one entry"
+            return "must have one entry" if limit == 1 else f"must have at most {limit} entries"
         case "pattern":
             return _PATTERNS.get(limit) or str(schema.get("description", f"must match {limit}"))
         case _:

@@ -334,6 +334,16 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ("name: delivery_robot", "name: my robot", "name: 'my robot': must be letters, digits, _ and - only"),
         ("# @package _global_\n", "", "must begin with the line # @package _global_"),
         ("{row: 0, column: 0}", "{row: 0}", "cameras.front.place.column: missing: must be given"),
+        (
+            "{row: 0, column: 0}",
+            "{row: 0, column: 0, row_span: 0}",
+            "cameras.front.place.row_span: 0: must be at least 1",
+        ),
+        (
+            "{row: 0, column: 0}",
+            "{row: 0, column: 0, row_span: 2}",
+            'cameras.rear.place: {"row": 1, "column": 0}: overlaps the place of camera front',
+        ),
         ("cameras:\n", "cameras: [\n", "line 14: expected ',' or ']', but got ':'"),
         ("cameras:\n", "\tcameras:\n", "line 12: found character '\\t' that cannot start any token"),
         ("defaults:\n", "defaults: robot\nx:\n", "defaults: 'robot': must be a list"),
@@ -448,6 +458,10 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         (["dimensions.front_m=2.5"], "dimensions.front_m: 2.5: must reach the front axle, 2.9 m ahead"),
         (["dimensions.track_m=2"], "dimensions.track_m: 2: must be at most width_m, 1.92"),
         (["dimensions.width=2"], "dimensions.width: unknown key, did you mean width_m?"),
+        (
+            ["cameras.front_left.place.column_span=2"],
+            'cameras.front_center.place: {"row": 0, "column": 1}: overlaps the place of camera front_left',
+        ),
         (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already that of view"),
         (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already that of enlarge"),
         (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or null"),
@@ -458,6 +472,16 @@ def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list
     (problem,) = problems(tod, conf, *words)
     assert problem.startswith("command line: ")
     assert problem.endswith(expected)
+
+
+def test_every_tile_that_lies_on_another_is_reported(conf: UserConf, tod: Command) -> None:
+    words = [f"cameras.{name}.place.row=0" for name in ("rear_center", "top_left", "top_right")]
+    found = [line.removeprefix("command line: cameras.") for line in problems(tod, conf, *words)]
+    assert found == [
+        'rear_center.place: {"row": 0, "column": 1}: overlaps the place of camera front_center',
+        'top_left.place: {"row": 0, "column": 1}: overlaps the place of camera front_center',
+        'top_right.place: {"row": 0, "column": 2}: overlaps the place of camera front_right',
+    ]
 
 
 def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Command) -> None:

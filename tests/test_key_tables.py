@@ -46,6 +46,7 @@ cameras:
     height_px: 480
     fps: 30
     native: {width_px: 1280, height_px: 960}
+    place: {row: 0, column: 0}
     pose: {x_m: 1.0, y_m: 0.5, z_m: 1.5, yaw_deg: 20}
     rate_quality: {scaling: [1.0], b_min_kbps: [0], b_full_kbps: 1000}
 """
@@ -61,7 +62,7 @@ def test_a_default_given_changes_nothing_and_another_value_does(key_tables: Modu
     minimal = camera()
     others: dict[str, Any] = {"lens": "fisheye", "calibrated": "true"}
     stated = [key for keys in key_tables.tables().values() for key in keys if key.default.startswith("`")]
-    assert len(stated) == 9
+    assert len(stated) == 11
     for key in stated:
         assert camera(f"cameras.a.{key.path}={key.default.strip('`')}") == minimal, key.path
         assert camera(f"cameras.a.{key.path}={others.get(key.path, 5)}") != minimal, key.path

@@ -8,8 +8,9 @@ import inspect
 import json
 import math
 import socket
-from contextlib import contextmanager, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from types import SimpleNamespace
+from urllib.parse import urlencode
 
 import pytest
 from helpers import vehicle
@@ -19,11 +20,13 @@ from runner.h264.access_unit import AccessUnit
 pytest.importorskip("aiohttp")
 import aiohttp
 
-from runner.page.control import KEPT_S, Control
+from runner.configuration.layout import NOWHERE, Layouts
+from runner.core.events import Attention
+from runner.page.control import KEPT_S, Control, attention_of, page_of
 from runner.page.history import KEPT, History
 from runner.page.server import PageServer
 from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, PageViewer
-from runner.records import CameraSample, Position, Sample
+from runner.records import CameraSample, Outcome, Position, Sample
 
 UPGRADE = (
     "Connection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -49,13 +52,13 @@ def sent(viewer):
 
 
 @contextmanager
-def served(*overrides):
+def served(*overrides, layouts=None):
     """Port of a page, and its station."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     station = SimpleNamespace(state=None, note=print, answer_s=1.0, attention=None)
-    page = PageServer(vehicle(f"page.port={port}", *overrides), station)
+    page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts)
     page.start()
     try:
         yield port, station
@@ -117,6 +120,7 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
         "+cameras.front_left.framing=fit",
         "+cameras.rear_center.calibrated=true",
         f"+cameras.front_left.native={native}",
+        "cameras.rear_center.place.column_span=2",
     )
     with served(*words) as (port, _):
         told = asyncio.run(hello(port))
@@ -129,6 +133,8 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
     optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
     assert {key: cameras["top_left"][key] for key in optics} == optics
     assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
+    assert told["layout"]["places"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
+    assert told["layout"]["own"]["rear_center"] == {"row": 1, "column": 1, "row_span": 1, "column_span": 2}
     dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}
     assert told["dimensions"] == dimensions
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
@@ -176,8 +182,244 @@ def test_the_station_is_told_whether_the_driver_watches():
         asyncio.run(drive(f"http://localhost:{port}", station))
 
 
+class Windows:
+    """Windows of browsers, as a server's clients see it: a page or a monitor at each end of a WebSocket."""
+
+    def __init__(self, session, stack, own):
+        self._session, self._stack, self._own = session, stack, own
+
+    async def open(self, viewer, browser, **more):
+        query = urlencode({"viewer": viewer, "browser": browser, **more})
+        connecting = self._session.ws_connect(f"{self._own}/live?{query}", origin=self._own)
+        return await self._stack.enter_async_context(connecting)
+
+
+async def told(ws, kind, **wanted):
+    """The next message of a kind that states these values."""
+    while (message := await ws.receive_json(timeout=5))["kind"] != kind or not wanted.items() <= message.items():
+        pass
+    return message
+
+
+def in_windows(steps, *overrides, **more):
+    """Carry out steps with windows and the station of a page."""
+
+    async def run(port, station):
+        async with aiohttp.ClientSession() as session, AsyncExitStack() as stack:
+            await steps(Windows(session, stack, f"http://localhost:{port}"), station)
+
+    with served(*overrides, **more) as (port, station):
+        asyncio.run(run(port, station))
+
+
+def test_a_monitor_has_selection_and_control_of_the_page_of_its_browser():
+    async def steps(windows, station):
+        asked = []
+        station.ask = lambda document, on_reply: (asked.append(document), on_reply(Outcome(0, "applied", "")))
+        monitor = await windows.open("m", "here", show="rear_center,front_left,nothing")
+        hello = await told(monitor, "hello")
+        assert [(camera["name"], camera["index"]) for camera in hello["cameras"]] == [
+            ("front_left", 0),
+            ("rear_center", 3),
+        ]
+        await told(monitor, "control", holder="nobody")  # and it does not take control that is free
+        page = await windows.open("driver", "here")
+        assert (await told(page, "hello"))["selected"] is None
+        await told(page, "control", holder="you")
+        await told(monitor, "control", holder="you")
+        stranger = await windows.open("s", "there", show="rear_center")
+        await told(stranger, "control", holder="another")
+
+        await monitor.send_json({"select": "rear_center"})
+        await told(page, "selection", camera="rear_center")
+        await page.send_json({"select": "top_left"})
+        await told(monitor, "selection", camera="top_left")
+        second = await windows.open("m2", "here", show="top_left")
+        assert (await told(second, "hello"))["selected"] == "top_left"
+        assert (await told(await windows.open("s2", "there", show="top_left"), "hello"))["selected"] is None
+
+        request = {"id": "1", "event": "mode_selected", "mode": "single"}
+        await monitor.send_json(request)
+        await told(monitor, "reply", id="1", result="applied")
+        await stranger.send_json(request)
+        await told(stranger, "reply", id="1", reason="this page does not hold control; take it first")
+        assert asked == [{"event": "mode_selected", "mode": "single"}]
+        for order in ("take_control", "release_control"):
+            await monitor.send_json({order: True})
+            await told(monitor, "reply", result="refused")
+            await stranger.send_json({order: True})
+            await told(stranger, "reply", result="refused")
+
+        other = await windows.open("other", "there")
+        await told(stranger, "control", holder="another")
+        await other.send_json({"take_control": True})
+        await told(stranger, "control", holder="you")
+        await told(monitor, "control", holder="another")
+        await page.send_json({"take_control": True})
+        await told(monitor, "control", holder="you")
+        await page.close()
+        await told(monitor, "control", holder="nobody")
+        await monitor.send_json(request)
+        await told(monitor, "reply", reason="this page does not hold control; take it first")
+
+    in_windows(steps)
+
+
+def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one():
+    async def steps(windows, station):
+        async def stated(attention):
+            for _ in range(500):
+                if station.attention == attention:
+                    return
+                await asyncio.sleep(0.01)
+            assert station.attention == attention
+
+        page = await windows.open("driver", "here")
+        monitor = await windows.open("m", "here", show="rear_center")
+        stranger = await windows.open("s", "there", show="rear_center")
+        await page.send_json({"attention": "watching"})
+        await stated("watching")
+        await told(monitor, "control", elsewhere=True)
+        await stranger.send_json({"attention": "hidden"})
+        await monitor.send_json({"attention": "unfocused"})
+        await page.send_json({"attention": "unfocused"})
+        await stated("unfocused")
+        await told(monitor, "control", elsewhere=False)
+        await monitor.send_json({"attention": "watching"})
+        await stated("watching")
+        await told(page, "control", elsewhere=True)
+        await monitor.send_json({"attention": "slow"})
+        await stated("slow")
+        await monitor.send_json({"attention": "hidden"})
+        await stated("hidden")
+        await monitor.close()
+        await stated("unfocused")
+        await page.close()
+        await stated("absent")
+
+    in_windows(steps)
+
+
+PLACE = {"row": 0, "column": 0, "row_span": 1, "column_span": 2}
+
+
+def test_a_layout_is_saved_by_the_page_in_control_and_told_to_all(tmp_path):
+    file = tmp_path / "layout" / "alice.yaml"
+
+    async def steps(windows, station):
+        page = await windows.open("driver", "here")
+        assert (await told(page, "hello"))["layout"]["problem"] is None
+        watcher = await windows.open("w", "there")
+        monitor = await windows.open("m", "here", show="rear_center")
+        await watcher.send_json({"id": "1", "layout": {"rear_center": PLACE}})
+        await told(watcher, "reply", id="1", reason="this page does not hold control; take it first")
+        assert not file.exists()
+        await page.send_json({"id": "2", "layout": {"rear_center": PLACE}})
+        for window in (page, watcher, monitor):
+            layout = await told(window, "layout")
+            assert {name: place for name, place in layout["places"].items() if place} == {"rear_center": PLACE}
+            assert layout["own"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
+        await told(page, "reply", id="2", result="applied")
+        assert "    rear_center: {row: 0, column: 0, column_span: 2}\n" in file.read_text()
+        later = await told(await windows.open("late", "there"), "hello")
+        assert later["layout"]["places"]["rear_center"] == PLACE
+        await monitor.send_json({"id": "3", "layout": None})  # it has its page's control
+        await told(monitor, "reply", id="3", result="applied")
+        assert (await told(page, "layout"))["places"] == layout["own"]
+        assert file.read_text().endswith("vehicles: {}\n")
+
+    in_windows(steps, layouts=Layouts(tmp_path, "alice"))
+    assert [path.name for path in tmp_path.rglob("*")] == ["layout", "alice.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        ({"layout": {"../x": PLACE}}, "'../x': must be letters, digits, _ and - only"),
+        ({"layout": {"rear_centre": PLACE}}, "'rear_centre': unknown camera, did you mean rear_center?"),
+        ({"layout": {"rear_center": {**PLACE, "row": -1}}}, "rear_center.row: -1: must be at least 0"),
+        ({"layout": "../../x"}, "'../../x': must be a mapping"),
+        ({"layout": {}, "operator": "../bob"}, "operator: unknown key beside layout"),
+        ({"layout": {}, "id": 7}, "id: must be given, as text of at most 64 characters"),
+    ],
+)
+def test_a_layout_that_is_wrong_is_refused_and_nothing_is_written(tmp_path, document, reason):
+    async def steps(windows, station):
+        page = await windows.open("driver", "here")
+        await told(page, "control", holder="you")
+        await page.send_json({"id": "1", **document})
+        assert (await told(page, "reply"))["reason"] == reason
+        await page.send_json({"id": "2", "layout": {}})
+        await told(page, "reply", id="2", result="applied")  # one refusal does not lock the next out
+
+    in_windows(steps, layouts=Layouts(tmp_path / "conf", "alice"))
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["alice.yaml", "conf", "layout"]
+
+
+def test_why_a_layout_cannot_be_saved(tmp_path):
+    (tmp_path / "layout").touch()
+
+    def reason_of(layouts):
+        found = []
+
+        async def steps(windows, station):
+            page = await windows.open("driver", "here")
+            found.append((await told(page, "hello"))["layout"]["problem"])
+            await page.send_json({"id": "1", "layout": {"rear_center": PLACE}})
+            found.append((await told(page, "reply", id="1", result="refused"))["reason"])
+
+        in_windows(steps, layouts=layouts)
+        return found
+
+    assert reason_of(None) == [NOWHERE, NOWHERE]
+    early, late = reason_of(Layouts(tmp_path, "alice"))
+    assert early is None
+    assert late.startswith(f"{tmp_path}/layout/alice.yaml: cannot be written: ")
+
+
+def test_what_windows_state_together():
+    hidden, slow, watching, unfocused = Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UNFOCUSED
+    assert attention_of([]) is attention_of([None]) is None
+    assert attention_of([None, unfocused]) is unfocused
+    assert attention_of([unfocused, watching]) is watching
+    assert attention_of([watching, slow]) is slow
+    assert attention_of([slow, hidden, watching]) is hidden
+
+
+def window(token, browser="", monitor=False):
+    return SimpleNamespace(token=token, browser=browser, monitor=monitor)
+
+
+def test_which_page_a_window_belongs_to():
+    control, monitor = Control(), window("m", "a", monitor=True)
+    pages = [window("1", "a"), window("2", "a"), window("3", "b"), monitor]
+    assert [page_of(each, pages, control) for each in pages] == ["1", "2", "3", "2"], "the newest of its browser"
+    control.take("1")
+    assert page_of(monitor, pages, control) == "1"
+    control.take("3")
+    assert page_of(monitor, pages, control) == "2"
+    assert page_of(monitor, [monitor], control) == "m"
+    nameless = window("n", "", monitor=True)
+    assert page_of(nameless, [window("4"), nameless], control) == "n", (
+        "it shares nothing with pages that state no browser"
+    )
+    control.release("3")
+    assert control.seen_by(page_of(nameless, [nameless], control)) == "nobody"
+
+
+def test_a_monitor_gets_the_pictures_of_its_cameras_alone():
+    burst = []
+    viewer = PageViewer("me", [1, 3], lambda camera: burst.append(camera) or [unit(camera, key=True)], "here", True)
+    for camera in range(4):
+        viewer.show(camera, unit(9))
+        viewer.restart(camera)
+    assert [(camera, number) for camera, _, number in sent(viewer)] == [(1, 1), (3, 3)]
+    assert burst == [1, 3]
+    assert sent(PageViewer("me", [], lambda camera: [unit(0, key=True)], "here", True)) == []
+
+
 def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
-    viewer = PageViewer("me", 1, lambda camera: [unit(0, key=True), unit(7), unit(8)])
+    viewer = PageViewer("me", range(1), lambda camera: [unit(0, key=True), unit(7), unit(8)])
     viewer.show(0, unit(8))  # part of the burst already
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, CATCH_UP, 7), (0, 0, 8)]
     viewer.show(0, unit(9))
@@ -187,40 +429,40 @@ def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
 
 def test_a_viewer_waits_for_a_burst_and_a_burst_of_one_is_drawn():
     burst = []
-    viewer = PageViewer("me", 1, lambda camera: burst)
+    viewer = PageViewer("me", range(1), lambda camera: burst)
     assert sent(viewer) == []
     burst.append(unit(0, key=True))
     assert sent(viewer) == [(0, KEY | RESTART, 0)]
 
 
 def test_texts_go_first_and_cameras_take_turns():
-    viewer = PageViewer("me", 2, lambda camera: [unit(0, key=True), unit(1)])
+    viewer = PageViewer("me", range(2), lambda camera: [unit(0, key=True), unit(1)])
     viewer.tell("state", {})
     assert [m if isinstance(m, str) else m[0] for m in sent(viewer)] == ["state", 0, 1, 0, 1]
 
 
 def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
     newest = []
-    viewer = PageViewer("me", 1, lambda camera: [unit(0, key=True), *newest])
+    viewer = PageViewer("me", range(1), lambda camera: [unit(0, key=True), *newest])
     sent(viewer)
     for number in range(1, 201):
         newest[:] = [unit(number)]
         viewer.show(0, newest[0])
-        assert len(viewer._cameras[0].live) <= WAITING_UNITS
+        assert len(viewer._waiting[0].live) <= WAITING_UNITS
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, 0, 200)]
 
 
 def test_texts_are_bounded_too():
-    viewer = PageViewer("me", 0, lambda camera: [])
+    viewer = PageViewer("me", range(0), lambda camera: [])
     for _ in range(10_000):
         viewer.tell("sample", {})
     assert len(sent(viewer)) == 500
 
 
 def test_the_header_states_times_in_ms_and_an_unknown_capture_as_nan():
-    viewer = PageViewer("me", 1, lambda camera: [unit(5, key=True, captured=0.25)])
+    viewer = PageViewer("me", range(1), lambda camera: [unit(5, key=True, captured=0.25)])
     assert HEADER.unpack_from(viewer.pop()) == (0, KEY | RESTART, 0, 1, 250.0, 500.0)
-    viewer = PageViewer("me", 1, lambda camera: [unit(5, key=True)])
+    viewer = PageViewer("me", range(1), lambda camera: [unit(5, key=True)])
     assert math.isnan(HEADER.unpack_from(viewer.pop())[4])
 
 

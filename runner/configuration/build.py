@@ -43,6 +43,7 @@ from runner.core.model import (
     Value,
     Vehicle,
     exact,
+    overlapping,
     suggest,
 )
 from runner.core.rules import RuleCall
@@ -127,6 +128,7 @@ class Builder:
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         listening = {"page.port": page.port} if page.serve else {}
+        self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index, recording)
@@ -361,6 +363,13 @@ class Builder:
         """Path of a camera's graph or source: its own one, otherwise the common one."""
         data = self.composed.document["cameras"][camera]
         return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
+
+    def _check_places(self, cameras: Mapping[str, Camera]) -> None:
+        """No tile of the page covers another one."""
+        places = {name: camera.place for name, camera in cameras.items() if camera.place}
+        for name, rule in overlapping(places):
+            found = self.composed.document["cameras"][name]["place"]
+            self._report(("cameras", name), ModelError("place", found, rule))
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
         """No two listeners on one port. Cameras count up from the first port of their graph."""

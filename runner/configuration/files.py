@@ -10,6 +10,7 @@ from runner.configuration.yaml_file import load_file
 from runner.errors import ConfigError
 from runner.resources import directory
 
+LAYOUT = "layout"  # folder of the user's directory in which the operator's page keeps layouts; it is no group
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
 
 

@@ -63,13 +63,13 @@ def _origins(composed: Composed, value: Any, path: schema.Path) -> Iterator[str]
 def _flow(value: Any) -> str:
     """A value in one line of YAML, as OmegaConf reads it."""
     text = yaml.dump(
-        value, Dumper=_dumper(), default_flow_style=True, width=float("inf"), allow_unicode=True, sort_keys=False
+        value, Dumper=dumper(), default_flow_style=True, width=float("inf"), allow_unicode=True, sort_keys=False
     )
     return text.removesuffix("\n...\n").rstrip("\n")
 
 
 @cache
-def _dumper() -> Any:
+def dumper() -> Any:
     """OmegaConf's dumper, which quotes what OmegaConf would otherwise read as a number."""
     from omegaconf._utils import get_omega_conf_dumper
 

@@ -6,13 +6,13 @@ Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), siz
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from difflib import get_close_matches
 from enum import StrEnum
 from fractions import Fraction
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any, Protocol
 
 Kbps = Fraction
@@ -334,10 +334,26 @@ class Dimensions:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Tile on the operator's page, counted from the top left."""
+    """Tile on the operator's page, counted from the top left, and how many rows and columns it covers."""
 
     row: int
     column: int
+    row_span: int = 1
+    column_span: int = 1
+
+    def overlaps(self, other: Place) -> bool:
+        """Whether both cover the same row of the same column."""
+        rows = self.row < other.row + other.row_span and other.row < self.row + self.row_span
+        columns = self.column < other.column + other.column_span and other.column < self.column + self.column_span
+        return rows and columns
+
+
+def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
+    """Cameras whose tile covers part of an earlier camera's, each with the rule that it breaks."""
+    for count, (name, place) in enumerate(places.items()):
+        covered = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
+        if covered is not None:
+            yield name, f"overlaps the place of camera {covered}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ import ssl
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -20,19 +20,21 @@ from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web_protocol import RequestHandler
 
+from runner.configuration.layout import NOWHERE, Layouts, Places, own_places
 from runner.core.events import Attention
 from runner.core.model import Camera, Vehicle, plain
-from runner.errors import RunError
+from runner.errors import ConfigError, RunError, UserError
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, Recent
 from runner.mqtt.messages import read_message
 from runner.operator.station import Listener, Station
-from runner.page.control import Control
+from runner.page.control import Control, attention_of, page_of
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
 from runner.page.login import COOKIE, SESSION_S, PageLogin
 from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
+from runner.schema import shortened
 from runner.security.keyring import Keyring
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
@@ -76,6 +78,7 @@ class PageServer(Listener):
     on_counter  called, in the page's thread, with what a page read of the counter that a camera films; None: such
                 messages are refused
     keyring     of the operator, to serve other machines: by HTTPS, to those that have its token; None: loopback only
+    layouts     of the operator; None: none can be saved
     raises      RunError if the port is in use or plotly is not installed
     """
 
@@ -85,8 +88,10 @@ class PageServer(Listener):
         station: Station,
         on_counter: Callable[[CounterReading], None] | None = None,
         keyring: Keyring | None = None,
+        layouts: Layouts | None = None,
     ) -> None:
         self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
+        self._layouts, self._saving = layouts or Layouts(), False
         self._keyring = keyring
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
         self._names = keyring.holder.hosts if keyring else ("127.0.0.1", "localhost")
@@ -98,7 +103,7 @@ class PageServer(Listener):
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
-        self._viewers: set[PageViewer] = set()
+        self._viewers: list[PageViewer] = []  # the newest last
         self._control = Control()
         self._silent: set[RequestHandler] = set()  # new connections without a complete request
         self._loop = asyncio.new_event_loop()
@@ -115,6 +120,8 @@ class PageServer(Listener):
     def start(self) -> None:
         self._thread.start()
         asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(START_S)
+        for note in self._layouts.notes(self._vehicle):
+            self._station.note(note)
 
     def stop(self) -> None:
         with suppress(TimeoutError):  # a connection that does not close ends with the process
@@ -213,7 +220,7 @@ class PageServer(Listener):
             raise web.HTTPForbidden(text="only for pages of this server\n")
         if not self._may_see(request):
             if request.path == "/":
-                raise web.HTTPSeeOther("/login")
+                raise web.HTTPSeeOther(f"/login?{request.rel_url.raw_query_string}".rstrip("?"))
             if request.path not in UNPROTECTED:
                 raise web.HTTPUnauthorized(text="log in first, at /login\n")
         response: web.StreamResponse = await handler(request)
@@ -260,18 +267,23 @@ class PageServer(Listener):
             viewer.show(index, unit)
 
     async def _on_viewer(self, request: web.Request) -> web.WebSocketResponse:
-        token = request.query.get("viewer", "")
-        if not 0 < len(token) <= 64:
-            raise web.HTTPBadRequest(text="viewer: must be given, as text of at most 64 characters\n")
+        token, browser = (request.query.get(key, "") for key in ("viewer", "browser"))
+        if not 0 < len(token) <= 64 or len(browser) > 64:
+            rule = "viewer: must be given, as text of at most 64 characters; browser: at most as many"
+            raise web.HTTPBadRequest(text=f"{rule}\n")
+        monitor = "show" in request.query
+        shown = request.query.get("show", "").split(",")
+        cameras = [index for name, index in self._index.items() if name in shown or not monitor]
         line = request.transport.get_extra_info("socket") if request.transport else None
         if line is not None:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=CLOSED_ABOVE_BYTES, autoping=False)
         await ws.prepare(request)
-        viewer = PageViewer(token, len(self._recent), lambda camera: self._recent[camera].burst())
+        viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor)
+        self._viewers.append(viewer)
         self._greet(viewer)
-        self._viewers.add(viewer)
-        self._control.opened(token, time.monotonic())
+        if not monitor:
+            self._control.opened(token, time.monotonic())
         self._tell_control()
         tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(self._ping(ws, request))]
         try:
@@ -283,7 +295,7 @@ class PageServer(Listener):
             for task in tasks:
                 task.cancel()
             self._viewers.remove(viewer)
-            if token not in {other.token for other in self._viewers}:
+            if token not in {other.token for other in self._viewers if not other.monitor}:
                 self._control.closed(token, time.monotonic())
             self._tell_control()
         return ws
@@ -311,22 +323,41 @@ class PageServer(Listener):
         return self._login is None or self._login.accepts(request.cookies.get(COOKIE), time.monotonic())
 
     def _greet(self, viewer: PageViewer) -> None:
-        viewer.tell("hello", {**_introduction(self._vehicle), "answer_s": self._station.answer_s})
+        viewer.selected = next((other.selected for other in self._others(viewer) if other.selected), "")
+        introduction = _introduction(self._vehicle, viewer.cameras)
+        own = {"layout": self._layout(), "selected": viewer.selected or None, "answer_s": self._station.answer_s}
+        viewer.tell("hello", introduction | own)
         viewer.tell("state", state_to_json(self._station.state))
         viewer.tell("history", self._history.columns())
         for note in self._notes:
             viewer.tell("note", note)
 
+    def _layout(self) -> dict[str, Any]:
+        """Where the pictures of the Configure view are, and why another layout cannot be saved."""
+        own, places = own_places(self._vehicle), self._layouts.places(self._vehicle)
+        return {"places": _places(places), "own": _places(own), "problem": None if self._layouts.path else NOWHERE}
+
+    def _page_of(self, viewer: PageViewer) -> str:
+        return page_of(viewer, self._viewers, self._control)
+
+    def _others(self, viewer: PageViewer) -> list[PageViewer]:
+        """The other windows of a viewer's page."""
+        page = self._page_of(viewer)
+        return [other for other in self._viewers if other is not viewer and self._page_of(other) == page]
+
     def _tell_control(self) -> None:
+        """To each viewer who holds control, and whether keys reach another window of its page."""
         for viewer in self._viewers:
-            viewer.tell("control", {"holder": self._control.seen_by(viewer.token)})
+            elsewhere = any(other.attention is Attention.WATCHING for other in self._others(viewer))
+            holder = self._control.seen_by(self._page_of(viewer))
+            viewer.tell("control", {"holder": holder, "elsewhere": elsewhere})
         self._state_attention()
 
     def _state_attention(self) -> None:
-        """State whether the person who drives can see the pictures: by the page in control."""
-        driving = [viewer for viewer in self._viewers if self._control.seen_by(viewer.token) == "you"]
+        """State whether the person who drives can see the pictures: by the windows of the page in control."""
+        driving = [viewer for viewer in self._viewers if self._control.seen_by(self._page_of(viewer)) == "you"]
         if driving:
-            self._station.attention = driving[0].attention
+            self._station.attention = attention_of([viewer.attention for viewer in driving])
         else:
             self._station.attention = Attention.ABSENT if self._control.is_held else None
 
@@ -346,7 +377,12 @@ class PageServer(Listener):
                 self._on_counter(reading)
             case {"attention": str(word)} if word in STATED:
                 viewer.attention = Attention(word)
-                self._state_attention()
+                self._tell_control()
+            case {"select": str(name)} if name in self._index:
+                self._select(viewer, name)
+            case {"take_control": True} | {"release_control": True} if viewer.monitor:
+                reason = "a monitor takes and releases no control: the page that it belongs to does"
+                viewer.tell("reply", {"id": document.get("id"), "result": "refused", "reason": reason})
             case {"take_control": True}:
                 self._control.take(viewer.token)
                 self._tell_control()
@@ -356,30 +392,74 @@ class PageServer(Listener):
             case _:
                 self._on_request(viewer, document)
 
+    def _select(self, viewer: PageViewer, camera: str) -> None:
+        """A camera is selected in all windows of a page."""
+        viewer.selected = camera
+        for other in self._others(viewer):
+            other.selected = camera
+            other.tell("selection", {"camera": camera})
+
     def _on_request(self, viewer: PageViewer, document: dict[str, Any]) -> None:
         identity = document.pop("id", None)
 
         def answer(result: str, reason: str) -> None:
             viewer.tell("reply", {"id": identity, "result": result, "reason": reason})
 
+        if problem := self._not_allowed(viewer, identity):
+            answer("refused", problem)
+        elif "layout" in document:
+            self._save(document, answer)
+        else:
+            self._ask(document, answer)
+
+    def _not_allowed(self, viewer: PageViewer, identity: object) -> str | None:
+        """Why a request of a viewer is not carried out; None if it is."""
+        if not isinstance(identity, str) or not 0 < len(identity) <= 64:
+            return "id: must be given, as text of at most 64 characters"
+        if self._control.seen_by(self._page_of(viewer)) != "you":
+            return "this page does not hold control; take it first"
+        return None
+
+    def _ask(self, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
+        """Send a request to the vehicle."""
+
         def on_reply(outcome: Outcome) -> None:
             self._in_page(answer, outcome.result, outcome.reason)
 
-        problem = self._problem(viewer.token, identity, document.get("event"))
-        if problem:
-            answer("refused", problem)
-        else:
+        event = document.get("event")
+        if event in EVENTS:
             self._station.ask(document, on_reply)
+        else:
+            answer("refused", f"event: {event!r}: must be one of {', '.join(EVENTS)}")
 
-    def _problem(self, token: str, identity: object, event: object) -> str | None:
-        """Why a request is not sent to the vehicle; None if it is."""
-        if not isinstance(identity, str) or not 0 < len(identity) <= 64:
-            return "id: must be given, as text of at most 64 characters"
-        if event not in EVENTS:
-            return f"event: {event!r}: must be one of {', '.join(EVENTS)}"
-        if self._control.seen_by(token) != "you":
-            return "this page does not hold control; take it first"
-        return None
+    def _save(self, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
+        """Save a layout in a thread of its own: a disk that hangs must not stop the video."""
+        if unknown := sorted(document.keys() - {"layout"}):
+            answer("refused", f"{shortened(unknown[0])}: unknown key beside layout")
+        elif self._saving:
+            answer("refused", "another layout is being saved")
+        else:
+            self._saving = True
+            threading.Thread(target=self._write, args=(document["layout"], answer), name="layout", daemon=True).start()
+
+    def _write(self, layout: Any, answer: Callable[[str, str], None]) -> None:
+        """In its own thread."""
+        problem = "the layout could not be saved"
+        try:
+            self._layouts.save(self._vehicle, layout)
+            problem = ""
+        except ConfigError as error:
+            problem = "; ".join(map(str, error.problems))
+        except (UserError, RunError) as error:
+            problem = str(error)
+        finally:
+            self._in_page(self._saved, problem, answer)
+
+    def _saved(self, problem: str, answer: Callable[[str, str], None]) -> None:
+        self._saving = False
+        if not problem:
+            self._tell("layout", self._layout())
+        answer("refused" if problem else "applied", problem)
 
 
 def _recent(camera: Camera) -> Recent:
@@ -415,15 +495,18 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
         pass  # the reader of the socket ends it
 
 
-def _introduction(vehicle: Vehicle) -> dict[str, Any]:
-    """What a page must know about the vehicle first."""
+def _introduction(vehicle: Vehicle, shown: Sequence[int]) -> dict[str, Any]:
+    """What a page must know about the vehicle first.
+
+    shown  indexes of the cameras that it shows
+    """
     cameras = [
         {
             "name": camera.name,
+            "index": index,
             "width": camera.width,
             "height": camera.height,
             "fps": float(camera.fps),
-            "place": {"row": camera.place.row, "column": camera.place.column} if camera.place else None,
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,
             "lens": camera.lens,
@@ -436,12 +519,17 @@ def _introduction(vehicle: Vehicle) -> dict[str, Any]:
             "b_min_kbps": [plain(bound) for bound in camera.rate_quality.b_min],
             "b_full_kbps": plain(camera.rate_quality.b_full),
         }
-        for camera in vehicle.cameras.values()
+        for index, camera in enumerate(vehicle.cameras.values())
+        if index in shown
     ]
     dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
     limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
     inputs = asdict(vehicle.inputs)
     return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
+
+
+def _places(places: Places) -> dict[str, Any]:
+    return {name: place and asdict(place) for name, place in places.items()}
 
 
 def _native(camera: Camera) -> dict[str, int]:

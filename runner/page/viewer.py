@@ -7,7 +7,7 @@ import json
 import math
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,18 +27,25 @@ class PageViewer:
     """Queues of one viewer. Used from one thread.
 
     token      its identity: a random name that the browser keeps when the page is reloaded
-    attention  whether its user can see the pictures; None: it has not stated that yet
+    cameras    indexes of those that it shows
     burst      returns the units that bring a late decoder up to date; called only when the viewer is ready for them
+    browser    see `runner.page.control.Window`
+    monitor    see there
+    attention  whether its user can see the pictures; None: it has not stated that yet
+    selected   name of the selected camera; "": it has not stated that yet
     """
 
-    def __init__(self, token: str, cameras: int, burst: Burst) -> None:
-        self.token = token
+    def __init__(
+        self, token: str, cameras: Sequence[int], burst: Burst, browser: str = "", monitor: bool = False
+    ) -> None:
+        self.token, self.cameras, self.browser, self.monitor = token, cameras, browser, monitor
         self.attention: Attention | None = None
+        self.selected = ""
         self._burst = burst
         self._filled = asyncio.Event()
         self._texts: deque[str] = deque(maxlen=WAITING_TEXTS)
-        self._cameras = [_Waiting() for _ in range(cameras)]
-        self._turn = 0  # index of the camera whose turn it is
+        self._waiting = {camera: _Waiting() for camera in cameras}
+        self._turn = 0  # of the camera at this place among them
         self._sequence = 0
 
     def tell(self, kind: str, message: Mapping[str, Any]) -> None:
@@ -47,8 +54,10 @@ class PageViewer:
 
     def show(self, camera: int, unit: AccessUnit) -> None:
         """A newly received unit."""
+        waiting = self._waiting.get(camera)
+        if waiting is None:
+            return
         self._filled.set()
-        waiting = self._cameras[camera]
         if waiting.behind:
             return  # it will be part of the burst
         waiting.live.append(unit)
@@ -57,8 +66,9 @@ class PageViewer:
 
     def restart(self, camera: int) -> None:
         """Clear the queue; what is sent next for this camera is a burst."""
-        self._cameras[camera] = _Waiting()
-        self._filled.set()
+        if camera in self._waiting:
+            self._waiting[camera] = _Waiting()
+            self._filled.set()
 
     async def next(self) -> str | bytes:
         """The next message to send, as soon as there is one."""
@@ -71,9 +81,9 @@ class PageViewer:
         """The next message to send, texts first, then the cameras in turn; None if there is nothing."""
         if self._texts:
             return self._texts.popleft()
-        for _ in self._cameras:
-            camera, self._turn = self._turn, (self._turn + 1) % len(self._cameras)
-            waiting = self._cameras[camera]
+        for _ in self.cameras:
+            camera, self._turn = self.cameras[self._turn], (self._turn + 1) % len(self.cameras)
+            waiting = self._waiting[camera]
             if waiting.behind:
                 self._catch_up(camera, waiting)
             if waiting.burst:

@@ -19,8 +19,10 @@ import gc
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from runner.configuration.layout import WITHOUT_KEYS, Layouts
 from runner.operator.live import LiveOperator, live_operator
 from runner.security.exposure import page_keyring
 from runner.system.signals import stopping
@@ -44,7 +46,7 @@ def run(arguments: Arguments) -> int:
     ):
         station = operator.station
         station.listeners.append(table)
-        with _served(operator) as page:
+        with _served(operator, arguments.conf) as page:
             operator.start(page.show if page else None, duration)
             gc.freeze()  # objects loaded by now stay: collecting them again and again would delay frames
             with stopping(action=operator.end) as stop:
@@ -57,15 +59,19 @@ def run(arguments: Arguments) -> int:
 
 
 @contextmanager
-def _served(operator: LiveOperator) -> Iterator[PageServer | None]:
-    """The page, unless the configuration switches it off."""
+def _served(operator: LiveOperator, conf: Path | None) -> Iterator[PageServer | None]:
+    """The page, unless the configuration switches it off.
+
+    conf  the user's directory, with the operator's layouts
+    """
     vehicle, station = operator.vehicle, operator.station
     if not vehicle.page.serve:
         yield None
         return
     from runner.page.server import PageServer
 
-    page = PageServer(vehicle, station, keyring=page_keyring(vehicle))
+    layouts = Layouts(conf, station.identity if vehicle.keys else WITHOUT_KEYS)
+    page = PageServer(vehicle, station, keyring=page_keyring(vehicle), layouts=layouts)
     page.start()
     station.listeners.append(page)
     station.note(f"page: {page.url}")

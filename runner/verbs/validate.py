@@ -39,7 +39,7 @@ from runner.configuration.build import PlanCheck
 from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
-from runner.configuration.files import GROUPS, bases_of, built_on, conf_directories, find_file, options
+from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_directories, find_file, options
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.core.model import ModelError, suggest
@@ -47,6 +47,7 @@ from runner.errors import ConfigError, MissingBindings, Problem, UserError
 from runner.graph import Plan
 from runner.verbs import Arguments
 
+FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
 STANDING_ALONE = ("experiment", "link")  # packaged ones are never combined with choices of the command line
@@ -155,7 +156,7 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
 
 
 def _has_groups(directory: Path) -> bool:
-    return any((directory / group).is_dir() for group in GROUPS)
+    return any((directory / folder).is_dir() for folder in FOLDERS)
 
 
 def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> tuple[list[Problem], int]:
@@ -190,6 +191,11 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
         yield Problem(name, "", None, rule)
         return
     try:
+        if group == LAYOUT:
+            from runner.configuration.layout import layout_problems
+
+            yield from layout_problems(path)
+            return
         load_node(path)
         content = load_file(path)
     except ConfigError as error:
@@ -205,9 +211,11 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
 def _misplaced(group: str, relative: Path) -> str | None:
     """Why Hydra would not find a file; None if it would."""
     first = relative.parts[0]
-    if group and group not in GROUPS:
-        nested = f"files stand in {first}/ itself, not in folders below" if first in GROUPS else ""
+    if group and group not in FOLDERS:
+        nested = f"files stand in {first}/ itself, not in folders below" if first in FOLDERS else ""
         return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
+    if group == LAYOUT:
+        return _misplaced_layout(relative)
     if not group and relative.stem != "config":
         return f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
     if relative.suffix != ".yaml":
@@ -215,6 +223,15 @@ def _misplaced(group: str, relative: Path) -> str | None:
     if group and not choosable(relative.stem):
         return "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"
     return None
+
+
+def _misplaced_layout(relative: Path) -> str | None:
+    """Why the page of no operator would read a file; None if one would."""
+    from runner.mqtt.messages import OPERATOR
+
+    if relative.suffix != ".yaml":
+        return f"would be ignored: the page reads {relative.stem}.yaml"
+    return None if OPERATOR.fullmatch(relative.stem) else "would be ignored: no operator can have this name"
 
 
 # --- composed configurations ------------------------------------------------------------------------------------------

@@ -41,6 +41,19 @@ test("an absence counts from its own start, and a moment is not one", () => {
   assert.equal(attention.changed(HERE, 7600), "No key reached this page for 1 s");
 });
 
+test("keys that reach another window of the page are not missing here, and pictures that nobody saw are", () => {
+  const attention = new Attention();
+  attention.changed({ hidden: false, focused: false, elsewhere: true }, 0);
+  assert.equal(attention.state, "unfocused");
+  assert.equal(attention.warning, null);
+  assert.equal(attention.changed(HERE, 9000), null);
+  attention.changed({ hidden: false, focused: false, elsewhere: false }, 10_000);
+  assert.match(attention.warning ?? "", /OUT OF FOCUS/);
+  assert.equal(attention.changed({ hidden: false, focused: false, elsewhere: true }, 12_000), "No key reached this page for 2 s");
+  attention.changed({ hidden: true, focused: false, elsewhere: true }, 13_000);
+  assert.equal(attention.changed({ hidden: false, focused: false, elsewhere: true }, 16_000), "This page was hidden for 3 s: look at every picture");
+});
+
 const STATES = [
   [{ hidden: false, focused: true }, "watching", null],
   [{ hidden: false, focused: false }, "unfocused", /OUT OF FOCUS/],

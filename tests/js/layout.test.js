@@ -1,45 +1,57 @@
-/** Rows of tiles and the heights of their pictures. */
+/** Bands of tiles, and the heights and boxes of their pictures. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { heightsOf, rowsOf } from "../../runner/page/static/layout.js";
+import { bandsOf, boxesOf, heightsOf } from "../../runner/page/static/layout.js";
 
 const GAP = 8;
 const CHROME = 66;
-const camera = (name, place = null, width = 1920, height = 1080) => ({ name, place, width, height });
-const names = (rows) => rows.map((row) => row.map((each) => each.camera.name));
+const camera = (name, width = 1920, height = 1080) => ({ name, width, height });
+const cameras = (...names) => names.map((name) => camera(name));
+const at = (row, column, row_span = 1, column_span = 1) => ({ row, column, row_span, column_span });
+const names = (bands) => bands.map(({ tiles }) => tiles.map((tile) => tile.camera.name));
+const where = (bands) => bands.map(({ tiles }) => tiles.map(({ camera: { name }, row, column }) => [name, row, column]));
 
 test("places give rows and their order, whatever the order of the cameras", () => {
-  const cameras = [
-    camera("rear", { row: 2, column: 1 }), camera("right", { row: 1, column: 3 }),
-    camera("left", { row: 1, column: 1 }), camera("center", { row: 1, column: 2 }),
-  ];
-  assert.deepEqual(names(rowsOf(cameras)), [["left", "center", "right"], ["rear"]]);
+  const places = { rear: at(2, 1), right: at(1, 3), left: at(1, 1), center: at(1, 2) };
+  assert.deepEqual(names(bandsOf(cameras("rear", "right", "left", "center"), places)), [["left", "center", "right"], ["rear"]]);
 });
 
 test("cameras without a place fill a square", () => {
-  assert.deepEqual(names(rowsOf(["a", "b", "c", "d", "e"].map((name) => camera(name)))), [["a", "b", "c"], ["d", "e"]]);
+  assert.deepEqual(names(bandsOf(cameras("a", "b", "c", "d", "e"), {})), [["a", "b", "c"], ["d", "e"]]);
 });
 
 test("cameras without a place follow in rows as long as the longest that has places", () => {
-  const placed = [camera("a", { row: 1, column: 1 }), camera("b", { row: 1, column: 2 }), camera("c", { row: 1, column: 3 })];
-  const rows = rowsOf([camera("x"), camera("y"), camera("z"), camera("u"), ...placed]);
-  assert.deepEqual(names(rows), [["a", "b", "c"], ["x", "y", "z"], ["u"]]);
+  const bands = bandsOf(cameras("x", "y", "z", "u", "a", "b", "c"), { a: at(1, 1), b: at(1, 2), c: at(1, 3) });
+  assert.deepEqual(names(bands), [["a", "b", "c"], ["x", "y", "z"], ["u"]]);
 });
 
-test("no cameras, no rows", () => {
-  assert.deepEqual(rowsOf([]), []);
+test("no cameras, no bands", () => {
+  assert.deepEqual(bandsOf([], {}), []);
   assert.deepEqual(heightsOf([], 1000, 500, CHROME), []);
+});
+
+test("rows that a picture joins are one band, and rows and columns that nothing covers take no room", () => {
+  const places = { a: at(1, 2, 2, 2), b: at(1, 5), c: at(2, 5), d: at(7, 0), e: at(7, 9) };
+  const bands = bandsOf(cameras("a", "b", "c", "d", "e"), places);
+  assert.deepEqual(where(bands), [[["a", 0, 0], ["b", 0, 2], ["c", 1, 2]], [["d", 0, 0], ["e", 0, 1]]]);
+  assert.deepEqual(bands.map(({ rows, columns, grid }) => [rows, columns, grid]), [[2, 3, true], [1, 2, false]]);
+});
+
+test("bands that overlap in a chain are one", () => {
+  const bands = bandsOf(cameras("a", "b", "c"), { a: at(0, 0, 2), b: at(1, 1, 2), c: at(2, 0, 2) });
+  assert.deepEqual(bands.map(({ rows }) => rows), [4]);
 });
 
 /** Rows of some lengths of 16:9 pictures in an area: neither too wide nor too high. */
 function checked(lengths, width, height) {
-  const rows = lengths.map((count, row) => Array.from({ length: count }, (_, i) => ({ camera: camera(`${row}-${i}`) })));
-  const heights = heightsOf(rows, width, height, CHROME);
+  const all = lengths.flatMap((count, row) => Array.from({ length: count }, (_, i) => ({ name: `${row}-${i}`, place: at(row, i) })));
+  const bands = bandsOf(all.map(({ name }) => camera(name)), Object.fromEntries(all.map(({ name, place }) => [name, place])));
+  const heights = heightsOf(bands, width, height, CHROME);
   for (const [i, count] of lengths.entries()) assert.ok(heights[i] * count * (16 / 9) + (count - 1) * GAP <= width + 1e-6);
-  const all = heights.reduce((sum, each) => sum + each + CHROME, (lengths.length - 1) * GAP);
-  assert.ok(all <= height, `${all} of ${height}`);
+  const total = heights.reduce((sum, each) => sum + each + CHROME, (lengths.length - 1) * GAP);
+  assert.ok(total <= height, `${total} of ${height}`);
   return heights;
 }
 
@@ -56,5 +68,40 @@ test("where the area is high enough every row is as wide as it may be", () => {
 test("a single wide picture fills the width", () => assert.deepEqual(checked([1], 1600, 2000), [900]));
 
 test("pictures never vanish, however small the area is", () => {
-  assert.deepEqual(heightsOf([[{ camera: camera("a") }], [{ camera: camera("b") }]], 800, 100, CHROME), [24, 24]);
+  const bands = bandsOf(cameras("a", "b"), { a: at(0, 0), b: at(1, 0) });
+  assert.deepEqual(heightsOf(bands, 800, 100, CHROME), [24, 24]);
+});
+
+const AREAS = [[1600, 1000], [1600, 500], [700, 1200], [500, 420]];
+const LAYOUTS = {
+  "a large picture beside two": { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2) },
+  "with a row below": { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2), d: at(2, 0), e: at(2, 1) },
+  "a wide one above": { a: at(0, 0, 1, 3), b: at(1, 0), c: at(1, 1), d: at(1, 2) },
+  "a pinwheel": { a: at(0, 0, 1, 2), b: at(0, 2, 2, 1), c: at(2, 1, 1, 2), d: at(1, 0, 2, 1), e: at(1, 1) },
+};
+for (const [words, places] of Object.entries(LAYOUTS))
+  for (const [width, height] of AREAS)
+    test(`${words} in ${width}x${height}: everything is inside, and every span is as long as what it spans`, () => {
+      const bands = bandsOf(Object.keys(places).map((name, i) => camera(name, 1920, i % 2 ? 1080 : 1200)), places);
+      const heights = heightsOf(bands, width, height, CHROME);
+      const used = bands.reduce((sum, { rows }, i) => sum + rows * (heights[i] + CHROME) + (rows - 1) * GAP, (bands.length - 1) * GAP);
+      assert.ok(used <= height, `${used} of ${height}`);
+      for (const [i, band] of bands.entries()) {
+        const { column, boxes } = boxesOf(band, heights[i], width, CHROME);
+        assert.equal(column > 0, band.grid);
+        for (const [j, tile] of band.tiles.entries()) {
+          assert.equal(boxes[j].height + CHROME, tile.row_span * (heights[i] + CHROME) + (tile.row_span - 1) * GAP);
+          if (band.grid) assert.equal(boxes[j].width, tile.column_span * column + (tile.column_span - 1) * GAP);
+        }
+        if (band.grid) assert.ok(band.columns * column + (band.columns - 1) * GAP <= width);
+      }
+    });
+
+test("a picture that spans two rows and columns is twice as large, and fills the width where there is room", () => {
+  const [band] = bandsOf(cameras("a", "b", "c"), { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2) });
+  const [height] = heightsOf([band], 1816, 2000, 0);
+  const { column, boxes } = boxesOf(band, height, 1816, 0);
+  assert.equal(column, 600);
+  assert.deepEqual(boxes[0], { width: 1208, height: 2 * height + GAP });
+  assert.ok(Math.abs(boxes[1].width / boxes[1].height - 16 / 9) < 0.02);
 });

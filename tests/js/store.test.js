@@ -35,6 +35,31 @@ test("the state is what the vehicle says, as long as it is online", () => {
   assert.equal(mode(), null);
 });
 
+test("a selection is told to the other windows of the page, and one that comes from there is not", () => {
+  const chosen = [];
+  listen("chosen", (name) => chosen.push(name));
+  select("rear");
+  take({ kind: "selection", camera: "front" });
+  assert.equal(store.selected, "front");
+  take({ kind: "selection", camera: "elsewhere" }); // of a camera that a monitor does not show
+  assert.equal(store.selected, "elsewhere");
+  assert.deepEqual(chosen, ["rear"]);
+});
+
+test("what another window has selected counts when this one opens", () => {
+  take({ ...HELLO, selected: "rear" });
+  assert.equal(store.selected, "rear");
+  take({ ...HELLO, selected: null });
+  assert.equal(store.selected, "rear");
+});
+
+test("a monitor selects nothing by itself", () => {
+  Object.assign(store, { selected: null, view: "monitor" });
+  take({ ...HELLO, selected: null });
+  assert.equal(store.selected, null);
+  store.view = "configure";
+});
+
 test("every message reaches those who listen for its kind", () => {
   take(STATE);
   take({ kind: "control", holder: "you" });

@@ -10,6 +10,8 @@ import { rolesOf } from "./arrange.js";
 import { toggleGuides } from "./drive.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
+import { listMonitors } from "./monitors.js";
+import { isEdited } from "./edit.js";
 
 /**
  * @typedef {object} Action
@@ -32,11 +34,12 @@ export const ACTIONS = {
   total_lower: { words: "mode Collective: lower the total by a tenth", run: () => changeTotal(0.9) },
   total_raise: { words: "mode Collective: raise the total by a tenth", run: () => changeTotal(1.1) },
   view: { words: "Drive or Configure view", run: toggleView },
-  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view === "drive" && toggleGuides() },
+  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
   drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { words: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
   sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
   full_screen: { words: "full screen", run: toggleFullScreen },
+  monitors: { words: "pictures in further windows, for other monitors", run: listMonitors },
   switch: { words: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
   full_image: { words: "full image of the selected camera (mode S)", run: sendFull },
   control: { words: "take or release control", run: toggleControl },
@@ -60,7 +63,7 @@ function reverse() {
 }
 
 function enlargeSelected() {
-  if (store.selected) enlarge(store.enlarged === store.selected ? null : store.selected);
+  if (store.selected && !isEdited()) enlarge(store.enlarged === store.selected ? null : store.selected);
 }
 
 export function selectCamera(name) {

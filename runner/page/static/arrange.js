@@ -169,7 +169,7 @@ const sum = (values) => values.reduce((a, b) => a + b, 0);
  * @param {Camera} camera  @param {"fit"|"fill"} usual unless the camera states it  @param {number} align of what is cropped
  * @returns {View}
  */
-function viewOf(camera, usual = "fit", align = 0.5) {
+export function viewOf(camera, usual = "fit", align = 0.5) {
   const fills = (camera.framing ?? usual) === "fill";
   return { fit: fills ? "cover" : "contain", align: fills ? align : 0.5, mirrored: looksBack(camera) };
 }

@@ -6,20 +6,21 @@ const NOTICED_MS = 500; // a shorter absence, as of a dialog of the browser, is 
 export class Attention {
   hidden = false;
   focused = true;
+  elsewhere = false; // whether keys reach another window of this page
   /** @type {number|null} since when the page is hidden or out of focus */
   since = null;
   saw = true; // whether the page was visible all that time
   slow = false; // whether too few pictures are drawn
 
   /**
-   * The page is hidden or not, in focus or not, and draws too few pictures or not.
-   * @param {{hidden: boolean, focused: boolean, slow?: boolean}} page
+   * The page is hidden or not, in focus or not, as one of its other windows is or not, and draws too few pictures or not.
+   * @param {{hidden: boolean, focused: boolean, elsewhere?: boolean, slow?: boolean}} page
    * @param {number} now
    * @returns {string|null} what to tell an operator who has just returned
    */
-  changed({ hidden, focused, slow = false }, now) {
-    Object.assign(this, { hidden, focused, slow });
-    if (hidden || !focused) {
+  changed({ hidden, focused, elsewhere = false, slow = false }, now) {
+    Object.assign(this, { hidden, focused, elsewhere, slow });
+    if (hidden || !(focused || elsewhere)) {
       if (this.since === null) Object.assign(this, { since: now, saw: true });
       this.saw &&= !hidden;
       return null;
@@ -44,6 +45,6 @@ export class Attention {
   /** What to tell an operator who may still see the page; null: all is well. */
   get warning() {
     if (this.state === "slow") return "SLOW: this page draws fewer than 10 pictures a second";
-    return this.state === "unfocused" ? "OUT OF FOCUS: keys do not reach this page; click it" : null;
+    return this.state === "unfocused" && !this.elsewhere ? "OUT OF FOCUS: keys do not reach this page; click it" : null;
   }
 }

@@ -95,7 +95,7 @@ export function toggleGuides() {
 
 function refreshGuides() {
   const cameras = placedCameras();
-  const guided = store.view === "drive" ? cameras.filter((camera) => isGuided(camera, chosen())).map(({ name }) => name) : [];
+  const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, chosen())).map(({ name }) => name) : [];
   for (const canvas of document.querySelectorAll("canvas.guides")) canvas.toggleAttribute("hidden", !guided.includes(canvas.getAttribute("data-guides") ?? ""));
   showGuides(guided);
   by("guides").hidden = !cameras.length;
@@ -108,12 +108,12 @@ function refreshGuides() {
 function look() {
   if (document.hidden) shown = performance.now();
   const slow = store.slow && performance.now() - shown > SETTLED_MS;
-  const words = attention.changed({ hidden: document.hidden, focused, slow }, performance.now());
+  const words = attention.changed({ hidden: document.hidden, focused, elsewhere: store.elsewhere, slow }, performance.now());
   const warning = inControl() ? attention.warning : null;
   by("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
   write(by("attention"), warning ?? "");
   tellAttention();
-  if (words && inControl() && store.view === "drive") publish("toast", { text: words, level: "problem" });
+  if (words && inControl() && store.view !== "configure") publish("toast", { text: words, level: "problem" });
 }
 
 /** Tell the station, which tells the vehicle while this page is in control. */
@@ -140,5 +140,6 @@ export function startDrive() {
   listen("socket", () => (told = ""));
   listen("control socket view ages", look);
   listen("hello view", refreshGuides);
+  addEventListener("storage", refreshGuides); // chosen in another window
   refresh();
 }

@@ -1,9 +1,9 @@
 /** The header: vehicle, mode, totals, who is in control; and the banner when vehicle or station is offline. */
 
 import { inControl, listen, mode, publish, store } from "./store.js";
-import { pending, request, whyNoControl } from "./requests.js";
+import { complain, pending, request, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
-import { by, mark, whole, write } from "./format.js";
+import { by, mark, spoken, whole, write } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
 const MOVING = ["live", "damaged", "late"];
@@ -23,6 +23,7 @@ export function selectMode(selected) {
 
 export function toggleControl() {
   if (!store.connected) return;
+  if (store.view === "monitor") return complain("the page takes and releases control, not its monitors");
   if (store.holder === "you") return send({ release_control: true });
   if (store.holder === "nobody") return send({ take_control: true });
   write(by("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
@@ -31,7 +32,7 @@ export function toggleControl() {
 
 function refresh() {
   write(by("vehicle"), store.hello?.vehicle ?? "…");
-  document.title = `${store.hello?.vehicle ?? "tod-runner"} · tod-runner`;
+  document.title = [...(globalThis.boot.shown ?? []).map(spoken), store.hello?.vehicle, "tod-runner"].filter(Boolean).join(" · ");
   refreshModes();
   refreshControl();
   refreshBanner();

@@ -42,7 +42,7 @@ function pressed(event) {
 }
 
 function fixed(key) {
-  if (/^[1-9]$/.test(key)) return selectCamera(store.hello?.cameras[+key - 1]?.name);
+  if (/^[1-9]$/.test(key)) return selectCamera(store.hello?.cameras.find(({ index }) => index === +key - 1)?.name);
   if (key !== "m") return;
   chord = performance.now();
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });

@@ -1,42 +1,123 @@
-/** Layout of the tiles: rows as placed in the vehicle file, pictures in the aspect ratio of the full image. */
+/**
+ * Layout of the tiles: bands of rows, pictures in the aspect ratio of the full image. Pure; lengths in px.
+ *
+ * A row without a spanning picture is a band of its own: its pictures are equally high and stand side by side. Rows that
+ * spanning pictures join are a band with a grid, whose columns are equally wide and whose rows are equally high.
+ */
 
-const GAP = 8;
+export const GAP = 8;
 const EVEN = 1.25; // a row is at most this much higher than the highest row limited by the width
+const LEAST = 24; // of a picture's height
+
+/** @typedef {{row: number, column: number, row_span: number, column_span: number}} Place */
+/** @typedef {Record<string, Place|null>} Places by camera; null: none */
+/** @typedef {{name: string, width: number, height: number}} Camera */
+/** @typedef {{camera: Camera} & Place} Tile its place is counted within the band, without rows and columns that no tile covers */
+/** @typedef {{rows: number, columns: number, grid: boolean, tiles: Tile[]}} Band */
 
 /**
- * Rows of tiles. Cameras without a place follow in separate rows, as long as the longest row with places.
- * @returns {{camera: object, column: number}[][]}
+ * The bands of a layout. Cameras without a place follow in rows of their own, as long as the longest row with places.
+ * @param {Camera[]} cameras  @param {Places} places
+ * @returns {Band[]}
  */
-export function rowsOf(cameras) {
-  const placed = new Map();
-  for (const camera of cameras.filter(({ place }) => place)) {
-    const { row, column } = camera.place;
-    placed.set(row, [...(placed.get(row) ?? []), { camera, column }]);
-  }
-  const rows = [...placed.entries()].sort(([a], [b]) => a - b).map(([, row]) => row.sort((a, b) => a.column - b.column));
-  const others = cameras.filter(({ place }) => !place);
-  const longest = Math.max(...rows.map((row) => row.length), others.length ? Math.ceil(Math.sqrt(others.length)) : 1);
+export function bandsOf(cameras, places) {
+  const placed = cameras.flatMap((camera) => (places[camera.name] ? [{ camera, .../** @type {Place} */ (places[camera.name]) }] : []));
+  const bands = joined(placed).map(bandOf);
+  const others = cameras.filter(({ name }) => !places[name]);
+  const longest = Math.max(...bands.map(({ columns }) => columns), others.length ? Math.ceil(Math.sqrt(others.length)) : 1);
   for (let i = 0; i < others.length; i += longest)
-    rows.push(others.slice(i, i + longest).map((camera, column) => ({ camera, column })));
-  return rows;
+    bands.push(bandOf(others.slice(i, i + longest).map((camera, column) => ({ camera, row: 0, column, row_span: 1, column_span: 1 }))));
+  return bands;
+}
+
+/** Tiles by band, from the top: those in the same row, or in rows that a tile joins. */
+function joined(tiles) {
+  /** @type {Tile[][]} */
+  const bands = [];
+  let end = 0; // first row below the band
+  for (const tile of [...tiles].sort((a, b) => a.row - b.row || a.column - b.column)) {
+    if (!bands.length || tile.row >= end) bands.push([]);
+    bands[bands.length - 1].push(tile);
+    end = Math.max(end, tile.row + tile.row_span);
+  }
+  return bands;
+}
+
+/** @param {Tile[]} tiles  @returns {Band} */
+function bandOf(tiles) {
+  const grid = tiles.some(({ row_span, column_span }) => row_span > 1 || column_span > 1);
+  const rows = covered(tiles, "row");
+  const columns = covered(tiles, "column");
+  const own = tiles.map((tile) => ({ ...tile, row: rows.indexOf(tile.row), column: columns.indexOf(tile.column) }));
+  return { rows: rows.length, columns: columns.length, grid, tiles: own.sort((a, b) => a.row - b.row || a.column - b.column) };
 }
 
 /**
- * Height of the pictures in each row: rows share the height, none is wider than the area.
- * @param {{camera: {width, height}}[][]} rows  @param {number} width  @param {number} height of the area
- * @param {number} chrome height of a tile without its picture
+ * One grid with all tiles as they are placed, and a free row and column.
+ * @param {Camera[]} cameras  @param {Record<string, Place>} places
+ * @returns {Band}
  */
-export function heightsOf(rows, width, height, chrome) {
-  const available = height - rows.length * chrome - (rows.length - 1) * GAP;
-  const highest = rows.map((row) => {
-    const aspects = row.reduce((sum, { camera }) => sum + camera.width / camera.height, 0);
-    return (width - (row.length - 1) * GAP) / aspects;
-  });
-  const level = waterLevel(highest, available);
+export function gridOf(cameras, places) {
+  const tiles = cameras.map((camera) => ({ camera, ...places[camera.name] }));
+  const free = (side) => 1 + Math.max(0, ...tiles.map((tile) => tile[side] + tile[`${side}_span`]));
+  return { rows: free("row"), columns: free("column"), grid: true, tiles };
+}
+
+/** The rows or columns that any tile covers, rising. */
+export function covered(tiles, side) {
+  const numbers = tiles.flatMap((tile) => Array.from({ length: tile[`${side}_span`] }, (_, i) => tile[side] + i));
+  return [...new Set(numbers)].sort((a, b) => a - b);
+}
+
+/**
+ * Height of the pictures in one row of each band: rows share the height, no band is wider than the area.
+ * @param {Band[]} bands  @param {number} width  @param {number} height of the area
+ * @param {number} chrome height of a tile without its picture
+ * @returns {number[]}
+ */
+export function heightsOf(bands, width, height, chrome) {
+  const count = bands.reduce((sum, { rows }) => sum + rows, 0);
+  const available = height - count * chrome - (count - 1) * GAP;
+  const highest = bands.map((band) => highestOf(band, width, chrome));
+  const level = waterLevel(bands.flatMap(({ rows }, i) => Array(rows).fill(highest[i])), available);
   const limited = highest.filter((each) => each <= level);
   const cap = limited.length ? Math.max(...limited) * EVEN : Infinity;
-  return highest.map((each) => Math.max(24, Math.floor(Math.min(each, level, cap))));
+  return highest.map((each) => Math.max(LEAST, Math.floor(Math.min(each, level, cap))));
 }
+
+/** Height of the pictures in a row at which a band is as wide as the area. */
+function highestOf(band, width, chrome) {
+  if (!band.grid) return (width - (band.tiles.length - 1) * GAP) / band.tiles.reduce((sum, { camera }) => sum + aspectOf(camera), 0);
+  const column = (width - (band.columns - 1) * GAP) / band.columns;
+  return Math.max(...band.tiles.map((tile) => rowFor(tile, column, chrome)));
+}
+
+/** Height of the pictures in a row at which a tile's picture fills its columns. */
+const rowFor = ({ camera, row_span, column_span }, column, chrome) =>
+  ((column * column_span + GAP * (column_span - 1)) / aspectOf(camera) - (row_span - 1) * (chrome + GAP)) / row_span;
+
+/**
+ * The boxes of a band's pictures, in the order of its tiles, and the width of a grid's columns (0: it has none). A box of
+ * a grid may have another shape than its picture, which is then whole within it.
+ * @param {Band} band  @param {number} height of the pictures in one of its rows  @param {number} width of the area  @param {number} chrome
+ * @returns {{column: number, boxes: {width: number, height: number}[]}}
+ */
+export function boxesOf(band, height, width, chrome) {
+  if (!band.grid) return { column: 0, boxes: band.tiles.map(({ camera }) => ({ width: Math.floor(height * aspectOf(camera)), height })) };
+  const widest = (width - (band.columns - 1) * GAP) / band.columns;
+  const wished = Math.max(...band.tiles.map((tile) => columnFor(tile, height, chrome)));
+  const column = Math.floor(Math.min(widest, wished));
+  const boxes = band.tiles.map((tile) => ({ width: column * tile.column_span + GAP * (tile.column_span - 1), height: heightOf(tile, height, chrome) }));
+  return { column, boxes };
+}
+
+/** Width of the columns at which a tile's picture fills its height. */
+const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * aspectOf(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
+
+/** Height of a tile's picture, with the gaps and the rest of the tiles that it spans. */
+const heightOf = ({ row_span }, height, chrome) => height * row_span + (chrome + GAP) * (row_span - 1);
+
+const aspectOf = ({ width, height }) => width / height;
 
 /** The level L with sum(min(limit, L)) = total. */
 function waterLevel(limits, total) {

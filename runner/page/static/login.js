@@ -22,7 +22,7 @@ async function logIn() {
   const { challenge } = await asked.json();
   const answer = await answerTo(field.value.trim(), challenge);
   const done = await fetch("/login", { method: "POST", body: JSON.stringify({ challenge, answer }) });
-  if (done.ok) location.assign("/");
+  if (done.ok) location.assign(`/${location.search}`);
   else problem.textContent = done.status === 403 ? "This is not the token of this page." : `Not opened: ${await done.text()}`;
 }
 

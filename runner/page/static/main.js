@@ -14,6 +14,8 @@ import { startPanel } from "./panel.js";
 import { startTabs } from "./tabs.js";
 import { startNews } from "./news.js";
 import { startCharts } from "./charts.js";
+import { startMonitors } from "./monitors.js";
+import { startEdit } from "./edit.js";
 import { startKeys } from "./keys.js";
 import { startGamepads } from "./gamepads.js";
 
@@ -22,14 +24,12 @@ startViews();
 startHeader();
 startTiles();
 startDrive();
-startSound();
-startTotal();
-startPanel();
-startTabs();
 startNews();
-startCharts();
+startMonitors();
+startEdit();
 startKeys();
 startGamepads();
+if (store.view !== "monitor") for (const part of [startSound, startTotal, startPanel, startTabs, startCharts]) part();
 start();
 
 /** For tests and benchmarks. With #measure in the address the first picture of each camera is kept as well. */
@@ -64,6 +64,9 @@ globalThis.tod = {
   },
   get control() {
     return store.holder;
+  },
+  get selected() {
+    return store.selected;
   },
   get requests() {
     return { pending: [...requests.pending.values()].map(({ timer, ...kept }) => kept), answered: requests.answered };

@@ -22,14 +22,16 @@ let count = 0;
  * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it replaces an older one
  * @param {object} event without id
  * @param {string} words what is requested, for the news if it fails
+ * @returns {string|undefined} its id; undefined: this page may not ask
  */
 export function request(control, event, words) {
-  if (!inControl()) return complain(whyNoControl());
+  if (!inControl()) return void complain(whyNoControl());
   const id = `${PREFIX}-${++count}`;
   const timer = setTimeout(() => answer({ id, result: "timed out", reason: "no answer from the station" }), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
   requests.pending.set(id, { id, control, event, words, timer, sent: Date.now() });
   send({ id, ...event });
   publish("requests");
+  return id;
 }
 
 /** The newest request that waits for an answer and sets this control. */
@@ -40,7 +42,7 @@ export function pending(control) {
 export function whyNoControl() {
   if (!store.connected) return "no connection to the station";
   if (store.holder === "another") return "another page holds control";
-  return "take control first (t)";
+  return store.view === "monitor" ? "the page of this monitor does not hold control" : "take control first (t)";
 }
 
 /** Report a problem in a toast. */

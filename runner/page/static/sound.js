@@ -72,5 +72,6 @@ export function startSound() {
     refresh();
   });
   listen("status", heard);
+  addEventListener("storage", refresh); // muted in another window
   refresh();
 }

@@ -8,10 +8,10 @@ const listeners = new Map();
  * @typedef {{x: number, y: number, width: number, height: number}} Region in px of the full image
  * @typedef {object} Camera of hello
  * @property {string} name
+ * @property {number} index among the vehicle's cameras, of which a monitor shows some
  * @property {number} width px
  * @property {number} height px
  * @property {number} fps
- * @property {{row: number, column: number}|null} place on the page
  * @property {import("./projection.js").Pose|null} pose
  * @property {number} fov_deg
  * @property {"pinhole"|"fisheye"} lens
@@ -22,9 +22,12 @@ const listeners = new Map();
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello answer_s: by then the station has
+ * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello selected: in another window of this page; answer_s: by then the station has
  *   answered a request; late_ms: an older picture is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|null>}} Inputs by action
+ * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: in force, the vehicle's own, and
+ *   why another one cannot be saved
+ * @typedef {import("./layout.js").Places} Places
  * @typedef {object} Applied what was read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
@@ -68,6 +71,7 @@ const listeners = new Map();
  * @property {State|null} state
  * @property {Sample|null} sample
  * @property {string} holder
+ * @property {boolean} elsewhere
  * @property {boolean} connected
  * @property {Note[]} notes
  * @property {ReturnType<typeof emptySeries>} series
@@ -78,7 +82,7 @@ const listeners = new Map();
  * @property {boolean} slow
  * @property {string|null} selected
  * @property {string|null} enlarged
- * @property {"configure"|"drive"} view
+ * @property {"configure"|"drive"|"monitor"} view
  */
 
 /** @type {Store} */
@@ -87,6 +91,7 @@ export const store = {
   state: null,
   sample: null,
   holder: "nobody",
+  elsewhere: false, // whether keys reach another window of this page
   connected: false,
   notes: [],
   series: emptySeries([]),
@@ -114,7 +119,9 @@ export function take(message) {
   const { kind } = message;
   if (kind === "hello") hello(message);
   else if (kind === "state" || kind === "sample") store[kind] = message;
-  else if (kind === "control") store.holder = message.holder;
+  else if (kind === "control") Object.assign(store, { holder: message.holder, elsewhere: message.elsewhere });
+  else if (kind === "layout" && store.hello) store.hello.layout = message;
+  else if (kind === "selection") return follow(message.camera);
   else if (kind === "history") history(message);
   else if (kind === "note") return note(message);
   if (kind === "sample") extend(message);
@@ -126,7 +133,8 @@ function hello(message) {
   store.notes = [];
   const names = message.cameras.map(({ name }) => name);
   store.series = emptySeries(names);
-  if (!names.includes(store.selected)) store.selected = names[0] ?? null;
+  const own = store.view === "monitor" || names.includes(store.selected) ? store.selected : (names[0] ?? null);
+  store.selected = message.selected ?? own;
   if (!names.includes(store.enlarged)) store.enlarged = null;
 }
 
@@ -149,9 +157,15 @@ export const decided = (name) => (store.state?.online && name ? store.state.came
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
-/** @param {string} name */
+/** Select a camera in this window, and thereby in the others of this page. */
 export function select(name) {
   if (!camera(name) || store.selected === name) return;
+  follow(name);
+  publish("chosen", name);
+}
+
+/** A camera was selected, which a monitor need not show. */
+function follow(name) {
   store.selected = name;
   publish("selected", name);
 }

@@ -1,11 +1,11 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
-import { decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { camera, decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
 import { drawFirst, giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
-import { heightsOf, rowsOf } from "./layout.js";
-import { arrange, rolesOf } from "./arrange.js";
+import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
+import { arrange, rolesOf, viewOf } from "./arrange.js";
 import { shownWords, WHOLE } from "./framing.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
@@ -24,8 +24,12 @@ const { canShowVideo } = globalThis.boot;
 const area = by("tiles");
 const scene = by("scene");
 const tiles = new Map();
-let rows = [];
-let described = "";
+/** @type {import("./layout.js").Band[]} */
+let bands = [];
+let described = ""; // the cameras for which there are tiles
+let grouped = ""; // the bands that they are in
+/** @type {Record<string, import("./layout.js").Place>|null} */
+let draft = null; // the layout that is being edited
 let hinted = false; // whether the way back from an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
@@ -36,18 +40,39 @@ const sizes = new ResizeObserver((entries) => {
 
 function build({ cameras }) {
   const text = JSON.stringify(cameras);
-  if (text === described) return;
-  described = text;
-  sizes.disconnect();
-  tiles.clear();
-  rows = rowsOf(cameras);
-  area.replaceChildren(...rows.map((row) => make("div", { class: "row" }, ...row.map(({ camera }) => tile(camera)))));
-  lay();
+  if (text !== described) {
+    described = text;
+    grouped = "";
+    draft = null;
+    sizes.disconnect();
+    tiles.clear();
+    cameras.forEach(tile);
+  }
+  group();
   refreshAll();
+}
+
+/** Show a layout that is being edited; null: the one in force. */
+export function showDraft(places) {
+  draft = places;
+  group();
+}
+
+/** Put the tiles into bands. */
+function group() {
+  const cameras = store.hello?.cameras ?? [];
+  bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
+  const text = JSON.stringify(bands);
+  if (text === grouped) return lay();
+  grouped = text; // moving a tile takes the focus away
+  const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map((its) => tiles.get(its.camera.name).element));
+  area.replaceChildren(...bands.map(row));
+  lay();
 }
 
 /** Height of a tile without its picture, as in the style sheet. */
 function chrome() {
+  if (store.view === "monitor") return 0;
   const style = getComputedStyle(document.documentElement);
   const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
   return (HEAD + below) * scale;
@@ -94,7 +119,6 @@ function tile({ name, pose }) {
   }
   dragRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
-  return element;
 }
 
 /** Ask to switch a camera on or off: the opposite of the state that the vehicle reports. */
@@ -109,22 +133,27 @@ function lay() {
   drawFirst(store.enlarged ?? rolesOf(store.hello?.cameras ?? []).front?.name ?? null);
   if (store.view === "drive") return layDrive();
   for (const [name, { element }] of tiles) {
+    const its = camera(name);
     Object.assign(element.style, { left: "", top: "" });
-    frame(name, WHOLE);
+    frame(name, its && store.view === "monitor" ? viewOf(its) : WHOLE);
   }
-  layRows();
+  layBands();
   layEnlarged();
 }
 
-/** Rows as the vehicle's mounts place them. */
-function layRows() {
-  const heights = heightsOf(rows, area.clientWidth, area.clientHeight, chrome());
-  for (const [i, row] of rows.entries()) {
-    for (const { camera: { name, width, height } } of row) {
-      const { box, element } = tiles.get(name);
-      const wide = Math.floor((heights[i] * width) / height);
-      element.style.width = `${wide}px`;
-      box.style.height = `${heights[i]}px`;
+/** Bands as the layout places them. */
+function layBands() {
+  const rest = chrome();
+  const heights = heightsOf(bands, area.clientWidth, area.clientHeight, rest);
+  for (const [i, band] of bands.entries()) {
+    const { column, boxes } = boxesOf(band, heights[i], area.clientWidth, rest);
+    const tracks = band.grid ? { gridTemplateColumns: `repeat(${band.columns}, ${column}px)`, gridTemplateRows: `repeat(${band.rows}, ${heights[i] + rest}px)` } : {};
+    Object.assign(/** @type {HTMLElement} */ (area.children[i]).style, tracks);
+    for (const [j, its] of band.tiles.entries()) {
+      const { box, element } = tiles.get(its.camera.name);
+      const gridArea = `${its.row + 1} / ${its.column + 1} / span ${its.row_span} / span ${its.column_span}`;
+      Object.assign(element.style, { width: `${boxes[j].width}px`, gridArea: band.grid ? gridArea : "" });
+      box.style.height = `${boxes[j].height}px`;
     }
   }
 }
@@ -161,7 +190,7 @@ function tellFrame(name) {
 
 /** State what is cropped. */
 function refreshShown(name, { box, shown, view }) {
-  const picture = seenRegion(name) ?? store.hello?.cameras.find((camera) => camera.name === name);
+  const picture = seenRegion(name) ?? camera(name);
   const laid = picture && box.clientWidth && box.clientHeight;
   write(shown, laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "");
 }
@@ -180,7 +209,7 @@ function layEnlarged() {
 // --- what is shown ----------------------------------------------------------------------------------------------------
 
 function refreshAll() {
-  for (const [i, { name }] of (store.hello?.cameras ?? []).entries()) refresh(name, i);
+  for (const { name, index } of store.hello?.cameras ?? []) refresh(name, index);
 }
 
 function refresh(name, index) {
@@ -271,6 +300,7 @@ function announce({ camera: name, status }) {
 
 export function startTiles() {
   listen("hello", build);
+  listen("layout", () => draft || group());
   listen("state sample requests control socket theme selected", refreshAll);
   listen("status", announce);
   listen("view", lay);

@@ -48,7 +48,7 @@ let settings = null; // of the page: {url, origin, video}
 let socket = null; // null between two attempts
 let moved = 0; // when it last received anything
 let attempts = 0; // to reconnect
-let streams = []; // in the order of hello, by which the binary messages are indexed
+let streams = []; // in the order of hello
 let described = "";
 /** @type {string[]} */
 let guided = []; // cameras whose guides are shown
@@ -152,7 +152,8 @@ function guide() {
 
 function unit(buffer) {
   const view = new DataView(buffer);
-  streams[view.getUint8(0)]?.receive({
+  const index = view.getUint8(0);
+  streams.find(({ camera }) => camera.index === index)?.receive({
     flags: view.getUint8(1),
     sequence: view.getUint32(4, true),
     captured: view.getFloat64(8, true),

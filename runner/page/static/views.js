@@ -1,6 +1,6 @@
 /**
  * The two views of the page, Drive and Configure. Only the operator changes the view: it outlasts a reload, and Drive is
- * offered once, when this tab first gets control.
+ * offered once, when this tab first gets control. A monitor, a window with some pictures, has a view of its own.
  */
 
 import { inControl, listen, publish, store } from "./store.js";
@@ -27,7 +27,9 @@ function show() {
   if (!drive) setDrawer(false);
 }
 
-export const toggleView = () => choose(store.view === "drive" ? "configure" : "drive");
+export function toggleView() {
+  if (store.view !== "monitor") choose(store.view === "drive" ? "configure" : "drive");
+}
 
 // --- the drawer: all that is not a picture ----------------------------------------------------------------------------
 
@@ -65,7 +67,7 @@ const showFullScreen = () => by("full-screen").setAttribute("aria-pressed", Stri
 
 /** The offer is for who is in control; it waits for an answer, also while the connection is lost. */
 function refreshOffer() {
-  if (inControl() && store.view !== "drive" && !sessionStorage.getItem(OFFERED)) {
+  if (inControl() && store.view === "configure" && !sessionStorage.getItem(OFFERED)) {
     sessionStorage.setItem(OFFERED, "yes");
     offered = true;
   }
@@ -78,7 +80,7 @@ function answer() {
 }
 
 export function startViews() {
-  store.view = sessionStorage.getItem(VIEW) === "drive" ? "drive" : "configure";
+  store.view = globalThis.boot.shown ? "monitor" : sessionStorage.getItem(VIEW) === "drive" ? "drive" : "configure";
   for (const id of ["to-drive", "to-configure"]) by(id).addEventListener("click", toggleView);
   by("drawer").addEventListener("click", toggleDrawer);
   by("full-screen").addEventListener("click", toggleFullScreen);

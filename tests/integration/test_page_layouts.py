@@ -1,0 +1,386 @@
+"""The page's layouts, monitors and colours in a real browser, with one picture in place of a vehicle's video."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import subprocess
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from browser import all_live, boxes, measure, opened, shot, take_control, until
+from rig import SMALL_ROBOT, answers, free_port, process
+from runner.configuration.config import configuration
+from runner.configuration.layout import HEADER, NOWHERE, Layouts
+from runner.core.events import parse
+from runner.core.model import plain
+from runner.core.step import start, step
+from runner.h264.access_unit import read_unit
+from runner.page.server import PageServer
+from runner.records import CameraState, Outcome, VehicleState, applied_to_json
+
+pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+aiohttp = pytest.importorskip("aiohttp")
+
+WORDS = (*SMALL_ROBOT, "source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures come more often
+CAMERAS = ("front", "rear", "mast")
+EVERY_S = 0.3
+
+
+class Station(SimpleNamespace):
+    """What the page needs of the operator's side: a vehicle in mode A that applies every request at once."""
+
+    def __init__(self, vehicle):
+        run = step(vehicle, start(vehicle), parse({"t": 0, "event": "bitrate_predicted", "kbps": 3000}))
+        cameras = {
+            name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
+            for name, setting in run.decision.settings.items()
+        }
+        state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
+        super().__init__(state=state, note=print, answer_s=1.0, attention=None, asked=[])
+
+    def captured_here(self, camera, captured):
+        return captured
+
+    def ask(self, document, on_reply):
+        self.asked.append(document)
+        on_reply(Outcome(0.0, "applied", ""))
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """A key frame of H.264."""
+    size = "video/x-raw,width=320,height=180,pixel-aspect-ratio=1/1"
+    stream = "video/x-h264,stream-format=byte-stream,alignment=au,profile=constrained-baseline"
+    line = f"videotestsrc num-buffers=1 pattern=white ! {size} ! x264enc tune=zerolatency ! {stream} ! fdsink fd=1"
+    return subprocess.run(["gst-launch-1.0", "-q", *line.split()], capture_output=True, check=True, timeout=60).stdout
+
+
+@contextmanager
+def served(picture, layouts):
+    """The page of a robot, with pictures: its server and the station."""
+    vehicle = configuration([*WORDS, f"page.port={free_port()}"]).vehicle()
+    station = Station(vehicle)
+    page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
+
+    def send():
+        while not ended.wait(EVERY_S):
+            for name in CAMERAS:
+                page.show(name, read_unit(picture, time.time(), time.time()))
+
+    page.start()
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        yield page, station
+    finally:
+        ended.set()
+        sending.join()
+        page.stop()
+
+
+def controlling(page):
+    until(lambda: page.evaluate("tod.control") == "you")
+
+
+def pulled(page, selector, right, down):
+    """Drag something by so many px."""
+    box = page.locator(selector).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + right / 2, y + down / 2)
+    page.mouse.move(x + right, y + down, steps=2)
+    assert page.locator(".target").is_visible()
+    page.mouse.up()
+    assert page.locator(".target").is_hidden()
+
+
+def where(page, camera):
+    return page.get_attribute(f"[data-mover={camera}]", "aria-label").partition(": ")[2]
+
+
+def edges(page, selector="article"):
+    """By camera, the box of its tile, or of what lies on that."""
+    return {name: page.locator(f"{selector}[data-camera={name}]").bounding_box() for name in CAMERAS}
+
+
+def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tmp_path):
+    file = tmp_path / "layout" / "alice.yaml"
+    with served(picture, Layouts(tmp_path, "alice")) as (server, station), opened(chromium, server.url) as page:
+        controlling(page)
+        page.click("#offer-no")
+        before = edges(page)
+        page.click("#edit-layout")
+        assert page.evaluate("document.activeElement.dataset.mover") == "front"
+        assert where(page, "mast") == "row 1, column 2, 1 high, 1 wide"
+        cell = edges(page)
+        down = cell["rear"]["y"] - cell["front"]["y"]
+        pulled(page, "[data-mover=mast]", cell["rear"]["x"] - cell["mast"]["x"], down)
+        assert [where(page, name) for name in ("mast", "rear")] == [
+            "row 2, column 1, 1 high, 1 wide",
+            "row 1, column 2, 1 high, 1 wide",
+        ], "they change places"
+        page.focus("[data-mover=front]")
+        page.keyboard.press("Shift+ArrowRight")
+        assert where(page, "front") == "row 1, column 1, 1 high, 2 wide"
+        assert where(page, "rear") == "row 2, column 2, 1 high, 1 wide", "it makes room"
+        assert page.evaluate("document.activeElement.dataset.mover") == "front", "the next key moves the same picture"
+        assert page.inner_text("#announcer") == "front: row 1, column 1, 1 high, 2 wide"
+        pulled(page, "[data-mover=front] .grip", 0, edges(page)["mast"]["y"] - edges(page)["front"]["y"])
+        assert where(page, "front") == "row 1, column 1, 2 high, 2 wide"
+        shot(page, "edit-layout")
+        page.click("#layout-save")
+        page.wait_for_selector("#layout-bar", state="hidden")
+        saved = "    front: {row: 0, column: 0, row_span: 2, column_span: 2}\n    rear: {row: 2, column: 1}\n"
+        expected = f"{HEADER}vehicles:\n  delivery_robot:\n{saved}    mast: {{row: 2, column: 0}}\n"
+        assert file.read_text() == expected
+        large = edges(page)
+        assert large["front"]["height"] == pytest.approx(2 * large["mast"]["height"] + 8, abs=1)
+        assert large["mast"]["x"] < large["rear"]["x"]
+        pictures, wrong = boxes(page)
+        assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}
+        assert set(pictures) == set(CAMERAS)
+        shot(page, "layout")
+        page.reload()
+        until(lambda: page.evaluate("window.tod?.control") == "you")
+        until(lambda: edges(page) == large)
+        page.click("#edit-layout")
+        page.keyboard.press("ArrowDown")
+        page.keyboard.press("Escape")
+        assert page.locator("#layout-bar").is_hidden()
+        assert edges(page) == large, "cancelled"
+        page.click("#edit-layout")
+        page.click("#layout-reset")
+        page.click("#layout-save")
+        page.wait_for_selector("#layout-bar", state="hidden")
+        assert file.read_text() == f"{HEADER}vehicles: {{}}\n"
+        assert edges(page) == before
+        assert station.asked == [], "no region was dragged, no camera switched"
+
+
+@pytest.mark.soak  # the station's answers are those of tests/test_page_parts.py
+def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        controlling(page)
+        page.click("#edit-layout")
+        assert NOWHERE in page.inner_text("#toasts")
+        assert page.locator("#layout-bar").is_hidden()
+    (tmp_path / "layout").touch()
+    with served(picture, Layouts(tmp_path, "alice")) as (server, _), opened(chromium, server.url) as page:
+        controlling(page)
+        page.click("#edit-layout")
+        page.keyboard.press("ArrowDown")
+        page.click("#layout-save")
+        until(lambda: "alice.yaml: cannot be written: " in page.inner_text("#toasts"))
+        assert where(page, "front") == "row 2, column 1, 1 high, 1 wide", "what was edited is still there"
+
+
+def test_monitors_are_windows_of_their_page(chromium, picture):
+    with served(picture, None) as (server, station), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        page.keyboard.press("w")
+        addresses = page.locator("#monitors a").evaluate_all("each => each.map((a) => a.getAttribute('href'))")
+        assert addresses == ["/?show=front,mast", "/?show=front", "/?show=rear", "/?show=mast"]
+        shot(page, "monitors")
+        with page.context.expect_page() as opening:
+            page.locator("#monitors a").first.click()
+        page.keyboard.press("Escape")
+        monitor = opening.value
+        until(lambda: monitor.evaluate("window.tod !== undefined"))
+        all_live(monitor)
+        assert set(measure(monitor)) == {"front", "mast"}
+        controlling(monitor)
+        assert page.evaluate("tod.control") == "you"
+        assert monitor.locator("#header").is_hidden() and monitor.locator("#side").is_hidden()
+        pictures, wrong = boxes(monitor)
+        assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}
+        assert sum(box["width"] for box in pictures.values()) > 0.9 * monitor.evaluate("innerWidth")
+        shot(monitor, "monitor")
+
+        monitor.click("[data-camera=mast] .picture")
+        until(lambda: page.evaluate("tod.selected") == "mast")
+        page.keyboard.press("2")
+        until(lambda: monitor.evaluate("tod.selected") == "rear")
+        monitor.keyboard.press("o")
+        assert until(lambda: station.asked) == [{"event": "camera_switched", "camera": "rear", "on": False}]
+        monitor.keyboard.press("t")
+        until(lambda: "not its monitors" in monitor.inner_text("#toasts"))
+        assert page.evaluate("tod.control") == "you"
+
+        until(lambda: station.attention in ("watching", "unfocused"))
+        monitor.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
+        monitor.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+        until(lambda: station.attention == "hidden")
+        with opened(chromium, server.url) as other:
+            take_control(other)
+            until(lambda: monitor.evaluate("tod.control") == "another")
+            until(lambda: page.evaluate("tod.control") == "another")
+            until(lambda: station.attention in ("watching", "unfocused"))
+        take_control(page)
+        until(lambda: station.attention == "hidden")
+        monitor.close()
+        until(lambda: station.attention in ("watching", "unfocused"))
+        wrong = page.context.new_page()
+        wrong.goto(f"{server.url}?show=front,raer")
+        wrong.wait_for_selector("#no-such-camera")
+        assert wrong.inner_text("#no-such-camera") == "delivery_robot has no camera raer; cameras are front, rear, mast"
+
+
+def test_a_layout_outlasts_the_operators_process(broker, tmp_path):
+    port, layout = free_port(), {"rear": {"row": 0, "column": 0, "row_span": 1, "column_span": 2}}
+
+    async def exchange(messages):
+        url = f"http://127.0.0.1:{port}"
+        async with aiohttp.ClientSession() as session, session.ws_connect(f"{url}/live?viewer=me", origin=url) as ws:
+            places = (await ws.receive_json(timeout=20))["layout"]["places"]
+            for message in messages:
+                await ws.send_json({"id": "1", **message})
+                while (reply := await ws.receive_json(timeout=20))["kind"] != "reply":
+                    pass
+                assert reply["result"] == "applied", reply
+            return places
+
+    words = (*WORDS, f"control.port={broker.port}", f"media.port={free_port()}", f"page.port={port}")
+    for messages in ([{"layout": layout}], []):
+        with process("operator", *words, f"conf={tmp_path}", stdout=subprocess.DEVNULL):
+            until(lambda: answers(port))
+            with ThreadPoolExecutor(1) as pool:  # this thread is the browser's
+                places = pool.submit(asyncio.run, exchange(messages)).result(timeout=60)
+    assert (tmp_path / "layout" / "operator.yaml").is_file()
+    assert places == {"front": None, "rear": layout["rear"], "mast": None}
+
+
+# WCAG 2.2, 1.4.3: text has 4.5 : 1 with what is below it, large text 3 : 1. Over a picture anything may be below it.
+CONTRAST = """([root, theme, states]) => {
+  document.documentElement.dataset.theme = theme;
+  const parsed = (text) => {
+    const [r, g, b, a = 1] = text.match(/[\\d.]+/g).map(Number);
+    return { r, g, b, a };
+  };
+  const over = (top, below) => {
+    const mixed = (key) => top.a * top[key] + (1 - top.a) * below[key];
+    return { r: mixed("r"), g: mixed("g"), b: mixed("b"), a: 1 };
+  };
+  const linear = (value) => (value / 255 <= 0.04045 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
+  const luminance = ({ r, g, b }) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const ratio = (a, b) => {
+    const [low, high] = [luminance(a), luminance(b)].sort((x, y) => x - y);
+    return (high + 0.05) / (low + 0.05);
+  };
+  const pictures = document.body.dataset.view === "configure" ? ".picture" : ".picture, .tile";
+  const grey = (value) => ({ r: value, g: value, b: value, a: 1 });
+  const grounds = (element) => {
+    const layers = [];
+    let below = [grey(255)];
+    for (let it = element; it; it = it.parentElement) {
+      if (it.matches(pictures)) {
+        below = [grey(0), grey(128), grey(255)];
+        break;
+      }
+      const colour = parsed(getComputedStyle(it).backgroundColor);
+      layers.push(colour);
+      if (colour.a === 1) break;
+    }
+    return below.map((one) => layers.reduceRight((ground, layer) => over(layer, ground), one));
+  };
+  const seen = (element) => {
+    const { width, height } = element.getBoundingClientRect();
+    const isShown = element.checkVisibility({ opacityProperty: true, visibilityProperty: true });
+    return isShown && width > 1 && height > 1 && !element.closest(":disabled, [aria-disabled=true], .unseen, svg");
+  };
+  const bad = [];
+  let measured = 0;
+  const look = (element) => {
+    if (!seen(element)) return;
+    measured++;
+    const { color, fontSize, fontWeight } = getComputedStyle(element);
+    const [size, bold] = [parseFloat(fontSize), +fontWeight >= 700];
+    const needed = size >= 24 || (bold && size >= 18.66) ? 3 : 4.5;
+    const found = Math.min(...grounds(element).map((ground) => ratio(over(parsed(color), ground), ground)));
+    const name = element.id || element.className || element.tagName;
+    if (found < needed) bad.push(`${theme} ${name} "${element.textContent.trim().slice(0, 30)}": ${found.toFixed(2)}`);
+  };
+  const lookBelow = (top) => {
+    const walker = document.createTreeWalker(top, NodeFilter.SHOW_TEXT);
+    const parents = new Set();
+    while (walker.nextNode()) if (walker.currentNode.data.trim()) parents.add(walker.currentNode.parentElement);
+    parents.forEach(look);
+    top.querySelectorAll("input:not([type=range])").forEach(look);
+  };
+  lookBelow(document.querySelector(root));
+  for (const [selector, attribute, values] of states) {
+    for (const element of document.querySelectorAll(selector)) {
+      const { hidden } = element;
+      const before = element.getAttribute(attribute);
+      const text = element.childElementCount || element.textContent.trim() ? null : element.textContent;
+      if (text !== null) element.textContent = "words";
+      element.hidden = false;
+      for (const value of values) {
+        element.setAttribute(attribute, value);
+        lookBelow(element);
+      }
+      if (before === null) element.removeAttribute(attribute);
+      else element.setAttribute(attribute, before);
+      if (text !== null) element.textContent = text;
+      element.hidden = hidden;
+    }
+  }
+  return [measured, bad];
+}"""
+LEVELS = ["fine", "near", "late", "unknown", "none"]
+STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "unsupported"]
+# By selector and attribute, what a page shows only at times.
+STATES = [
+    *([f"#{name}", "data-test", ["shown"]] for name in ("banner", "warning", "offer", "attention", "no-such-camera")),
+    ["#latency", "data-level", LEVELS],
+    ["#speed-now", "data-level", LEVELS],
+    ["#alarms", "data-level", ["near", "late"]],
+    ["#sound", "data-level", ["near", "fine"]],
+    ["#full-screen", "aria-pressed", ["true", "false"]],
+    ["#holder", "data-holder", ["you", "another", "nobody"]],
+    ["#connection", "data-state", ["fine", "bad"]],
+    [".tile", "data-status", STATUSES],
+    [".caption span", "data-differs", [""]],
+    [".refused", "data-test", ["shown"]],
+]
+
+
+def test_every_text_can_be_read_by_day_and_by_night(chromium, picture, tmp_path):
+    with served(picture, Layouts(tmp_path)) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        found = []
+
+        def look(view, root="body", on=page):
+            for theme in ("day", "night"):
+                measured, bad = on.evaluate(CONTRAST, [root, theme, STATES if root == "body" else []])
+                assert measured > 3, view
+                found.extend(f"{view}: {each}" for each in bad)
+
+        look("configure")
+        page.click("#offer-no")
+        page.click("#edit-layout")
+        look("edit")
+        shot(page, "edit-layout-night")
+        page.keyboard.press("Escape")
+        for key, dialog in (("w", "#monitors"), ("?", "#help")):
+            page.keyboard.press(key)
+            look(dialog, dialog)
+            page.keyboard.press("Escape")
+        page.keyboard.press("v")
+        look("drive")
+        page.keyboard.press("d")
+        look("drawer")
+        monitor = page.context.new_page()
+        monitor.goto(f"{server.url}?show=front,rear")
+        until(lambda: monitor.evaluate("window.tod !== undefined"))
+        all_live(monitor)
+        look("monitor", on=monitor)
+        assert sorted(set(found)) == []
