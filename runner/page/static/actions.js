@@ -6,7 +6,9 @@ import { focusTile, switchCamera } from "./tiles.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
 import { rolesOf } from "./arrange.js";
+import { changeBirdseye } from "./birdseye.js";
 import { toggleGuides } from "./drive.js";
+import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleView } from "./views.js";
 
@@ -29,6 +31,8 @@ export const ACTIONS = {
   mode_collective: { words: "mode Collective", run: () => selectMode("collective") },
   view: { words: "Drive or Configure view", run: toggleView },
   guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view === "drive" && toggleGuides() },
+  birdseye: { words: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none", run: changeBirdseye },
+  straighten: { words: "straighten the picture of the selected fisheye, or show it as it comes", run: () => toggleStraight() },
   drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
   sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
   full_screen: { words: "full screen", run: toggleFullScreen },

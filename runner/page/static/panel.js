@@ -5,6 +5,8 @@ import { pending, request, whyNoControl, complain } from "./requests.js";
 import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js";
 import { makeSlider } from "./slider.js";
 import { SHAPES, STILL, switchCamera, unapplied } from "./tiles.js";
+import { canStraighten } from "./straight.js";
+import { isStraight, toggleStraight } from "./straighten.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, region, size, tenth, whole, write } from "./format.js";
 
@@ -26,6 +28,7 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
+const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show it as it comes (r)", onclick: () => toggleStraight() }, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
@@ -134,6 +137,8 @@ function refresh() {
   if (!about) return;
   const now = decided(name());
   refreshHead(now);
+  straight.hidden = !canStraighten(about);
+  mark(straight, "aria-pressed", isStraight(name()));
   refreshSettings(about, now);
   refreshComparison(now);
   refreshDiagram(about);
@@ -263,8 +268,8 @@ export function startPanel() {
       make("div", {}, field("", apply, full), field("Weight", weight, weightNote)),
       diagram.box),
   );
-  const head = make("div", { class: "head" }, swatch, title, status, on);
+  const head = make("div", { class: "head" }, swatch, title, status, straight, on);
   by("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
-  listen("hello state sample control requests socket status theme", refresh);
+  listen("hello state sample control requests socket status theme straight", refresh);
   listen("selected", forget);
 }

@@ -3,6 +3,7 @@
 import { camera, decided, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { toBox, toPicture, visible } from "./framing.js";
+import { isStraight } from "./straighten.js";
 import { make, sameRegion } from "./format.js";
 
 const START_PX = 6; // the pointer moves less than this in a click
@@ -51,8 +52,10 @@ export function fullRegion(name) {
   return { x: 0, y: 0, width: full.width, height: full.height };
 }
 
-export function whyNoRegion() {
+/** Why a region cannot be dragged on a camera's picture. */
+function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
+  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; straighten it no longer (r), or type its numbers";
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
@@ -88,7 +91,7 @@ export function dragRegion(name, box, view) {
   const refresh = () => {
     if (dragging) return;
     const wish = waiting(name);
-    if (wish && seenRegion(name)) place(wish);
+    if (wish && seenRegion(name) && !isStraight(name)) place(wish);
     else rectangle.hidden = true;
   };
 
@@ -101,8 +104,8 @@ export function dragRegion(name, box, view) {
     if (!(event.buttons & 1) || !seenRegion(name)) return end(); // released elsewhere, or the vehicle is offline
     const here = point(event);
     if (!dragging && Math.hypot(here.x - from.x, here.y - from.y) < START_PX) return;
-    if (!dragging && whyNoRegion()) {
-      publish("toast", { text: `${name}: ${whyNoRegion()}`, level: "hint" });
+    if (!dragging && whyNoRegion(name)) {
+      publish("toast", { text: `${name}: ${whyNoRegion(name)}`, level: "hint" });
       return end();
     }
     dragging = true;
@@ -118,12 +121,15 @@ export function dragRegion(name, box, view) {
   views.set(name, refresh);
 }
 
-listen("requests state", () => views.forEach((refresh) => refresh()));
+listen("requests state straight", () => views.forEach((refresh) => refresh()));
 
-/** The region that was requested or decided, and is not yet the one on the picture. */
+/**
+ * The region that was requested or decided, and is not yet the one on the picture.
+ * @returns {import("./framing.js").Rectangle|null}
+ */
 export function waiting(name) {
   const asked = pending(`roi:${name}`)?.event;
-  if (asked) return asked;
+  if (asked) return { x: asked.x, y: asked.y, width: asked.width, height: asked.height };
   const now = decided(name);
   return now?.applied.roi && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
 }

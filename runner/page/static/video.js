@@ -4,7 +4,9 @@
  */
 
 import { ageOf, skewOf } from "./ages.js";
+import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
+import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
@@ -12,12 +14,16 @@ import { Stream } from "./stream.js";
 import "./codec.js";
 import "./counter.js";
 import "./framing.js";
+import "./ground.js";
 import "./guide_layer.js";
 import "./guides.js";
 import "./pace.js";
 import "./projection.js";
 import "./overlay.js";
 import "./status.js";
+import "./straight.js";
+import "./straight_view.js";
+import "./warp.js";
 import "./yuv.js";
 
 const WATCH_MS = 15;
@@ -39,6 +45,7 @@ const station = {
   counted: null, // name of the camera that films the counter, if the page is to read it
   count: (counter) => send({ counter }),
   resync: (name) => send({ resync: name }),
+  crooked,
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
@@ -49,6 +56,9 @@ let streams = []; // in the order of hello, by which the binary messages are ind
 let described = "";
 /** @type {string[]} */
 let guided = []; // cameras whose guides are shown
+/** @type {string[]} */
+let straight = []; // cameras whose pictures are straightened
+const ground = new GroundView(station.steering);
 let asleep = true;
 let watched = now();
 let stalled = false; // at the last tick
@@ -129,6 +139,8 @@ function hello(message) {
     streams = message.cameras.map((camera) => new Stream(camera, station));
     described = text;
     guide();
+    straighten();
+    ground.know(streams.filter(({ camera }) => isTopView(camera)), message.dimensions);
   }
   streams.forEach((stream) => stream.started());
   connection(true);
@@ -143,6 +155,22 @@ function decided(message) {
 
 function guide() {
   for (const stream of streams) stream.guide(guided.includes(stream.name));
+}
+
+function straighten() {
+  for (const stream of streams) {
+    try {
+      stream.straighten(straight.includes(stream.name));
+    } catch (error) {
+      crooked(stream, error);
+    }
+  }
+}
+
+/** A picture cannot be straightened: show it as it comes, and say why. */
+function crooked(stream, error) {
+  stream.straighten(false);
+  tell({ kind: "crooked", camera: stream.name, why: error instanceof Error ? error.message : String(error) });
 }
 
 function unit(buffer) {
@@ -164,6 +192,7 @@ function wake() {
   requestAnimationFrame(() => {
     asleep = true;
     for (const stream of streams) stream.draw();
+    ground.draw();
   });
 }
 
@@ -184,6 +213,7 @@ function judgeAll() {
     if (log.length > 200) log.shift();
     tell({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
   }
+  if (asleep) ground.draw(); // the state of a picture
 }
 
 /** Report the ages that the page shows, and how far apart in time the pictures of the cameras are. */
@@ -214,13 +244,19 @@ const orders = {
     guided = names;
     guide();
   },
+  straight({ names }) {
+    straight = names;
+    straighten();
+  },
+  ground: ({ picture, lines }) => ground.attach(picture, lines),
+  above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
   size({ name, ...display }) {
     const stream = find(name);
     if (stream) Object.assign(stream, { display, painted: null });
   },
   send: ({ message }) => tell({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, guides: () => find(name)?.guides?.lines, stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = { measure, guides: () => find(name)?.guides?.lines, ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
     tell({ kind: "answer", id, value: await questions[what]() });
   },
 };
