@@ -114,6 +114,36 @@ def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "")
 
 
+def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_may_be_locked(page, station):
+    def asked():
+        roi = until(lambda: getattr(station, "asked", None))
+        station.asked = None
+        until(lambda: page.evaluate("tod.requests.pending") == [])  # the station carries out nothing
+        assert (roi.pop("event"), roi.pop("camera")) == ("roi_set", name)
+        return roi
+
+    def at(x, y):
+        box = page.locator(f"[data-camera={name}] .picture").bounding_box()
+        return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+    station.asked = None
+    name = "scaled"
+    page.mouse.move(*at(0.25, 0.5))
+    page.mouse.wheel(0, -500 * math.log(2))
+    assert asked() == pytest.approx({"x": 160, "y": 180, "width": 640, "height": 360}, abs=4)
+    page.locator("body").press("d")
+    page.locator("[data-control=roi-aspect]").click()
+    page.locator("body").press("d")
+    drag(page, at(0.2, 0.2), at(0.6, 0.9))
+    roi = asked()
+    assert roi == pytest.approx({"x": 256, "y": 144, "width": 512, "height": 288}, abs=4)
+    name = "mirrored"
+    drag(page, at(0.5, 0.5), at(0.6, 0.5), button="middle")
+    until(lambda: (getattr(station, "asked", None) or {}).get("x") == pytest.approx(288, abs=4))  # and none on the way
+    roi = asked()
+    assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
+
+
 def drag(page, begin, end, button="left"):
     page.mouse.move(*begin)
     page.mouse.down(button=button)

@@ -2,7 +2,8 @@
 
 import { camera, decided, inControl, listen, mode, store } from "./store.js";
 import { pending, request, whyNoControl, complain } from "./requests.js";
-import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js";
+import { fullRegion, isLocked, seenRegion, sendRegion, toggleLocked, waiting } from "./roi.js";
+import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
 import { SHAPES, STILL, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
@@ -45,6 +46,7 @@ const weightNote = make("span", { class: "muted" });
 const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
 const full = make("button", { "data-control": "roi-full", onclick: () => sendFull(), title: "full image (f)" }, "Full image");
+const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "a region that is dragged has the aspect ratio of the full image" }, "Lock aspect");
 const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), is: make("i", { class: "is" }), wish: make("i", { class: "wish" }) };
 const differing = make("p", { class: "differing" });
 const rows = new Map();
@@ -168,6 +170,7 @@ function refreshSettings(about, now) {
   refreshFactors(about, now, why);
   fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
   for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
+  mark(locked, "aria-pressed", isLocked());
   apply.disabled = full.disabled = Boolean(why);
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? about.weight, whyNot(), pending(`weight:${name()}`));
@@ -265,11 +268,11 @@ export function startPanel() {
     field("Factor", choices, free),
     field("ROI", make("div", { class: "sides" }, ...numbers)),
     make("div", { class: "beside" },
-      make("div", {}, field("", apply, full), field("Weight", weight, weightNote)),
+      make("div", {}, field("", apply, full, locked), field("Weight", weight, weightNote)),
       diagram.box),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
   by("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
-  listen("hello state sample control requests socket status theme straight", refresh);
+  listen("hello state sample control requests socket status theme straight aspect", refresh);
   listen("selected", forget);
 }

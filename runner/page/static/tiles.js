@@ -4,6 +4,7 @@ import { decided, enlarge, inControl, listen, publish, select, store } from "./s
 import { giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
+import { zoomRegion } from "./zoom.js";
 import { heightsOf, rowsOf } from "./layout.js";
 import { arrange, BIRDSEYE } from "./arrange.js";
 import { birdseyeSize, placeBirdseye } from "./birdseye.js";
@@ -96,6 +97,7 @@ function tile({ name, pose }) {
     giveGuides(name, guides);
   }
   dragRegion(name, parts.box, () => tiles.get(name).view);
+  zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
   return element;
 }
