@@ -130,13 +130,25 @@ def share(pixels, colour):
 
 def test_the_vehicle_is_as_large_as_it_is(page):
     shown_large(page)
-    pixels, view = on_screen(image, page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
+    until(lambda: is_as_large_as_stated(page))  # on a busy machine words may lie over it for a moment
     shot(page, "birdseye")
-    rows, columns = np.nonzero(np.abs(pixels - BODY).max(axis=-1) < 3)
-    found = [columns.min(), columns.max() + 1, rows.min(), rows.max() + 1]
+
+
+def is_as_large_as_stated(page):
+    pixels, view = on_screen(image, page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
     px, half = view["px_per_m"], CAR.width_m / 2
+    row, column = round(view["y"]), round(view["x"] + 0.8 * px * half)  # beside the wedge that points ahead
+    found = [*run(pixels[row], column), *run(pixels[:, column], row)]
     expected = [view["x"] - px * half, view["x"] + px * half, view["y"] - px * CAR.front_m, view["y"] + px * CAR.rear_m]
-    assert found == pytest.approx(expected, abs=2)
+    print(found, expected)
+    return found == pytest.approx(expected, abs=2)
+
+
+def run(line, at):
+    """Where the vehicle's colour begins and ends along a line of pixels, around one of them."""
+    others = np.flatnonzero(np.abs(line - BODY).max(axis=-1) >= 3)
+    after = np.searchsorted(others, at)
+    return others[after - 1] + 1, others[after]
 
 
 def test_a_picture_that_stands_still_is_not_shown(page, station):
