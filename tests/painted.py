@@ -1,13 +1,13 @@
 """Marks painted into the ground of the synthetic drive, and found in pictures by image processing.
 
-A mark is a corner where two white and two black fields meet; there is one at each end of the lines that the page draws
-across the ground, 5, 10 and 15 m from both ends of the vehicle.
+A mark is a corner where two white and two black fields meet. For lines on the ground there is one at each end of those
+that the page draws across it, 5, 10 and 15 m from both ends of the vehicle; for the bird's-eye view they are around it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from itertools import product
@@ -27,7 +27,18 @@ CAR = Dimensions(wheelbase_m=2.9, track_m=1.65, width_m=1.92, front_m=3.65, rear
 DISTANCES_M = (5, 10, 15)
 WITHIN_PX = 2  # of the full image
 AROUND_PX = 40  # how far from the end of its line a mark is looked for, at most
+FINER = 4  # rays each way through a pixel of the bird's-eye view's cameras, as the light that a sensor collects
 End = tuple[int, int, int]  # 1 ahead or -1 behind, distance in m, side: 0 left or -1 right
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where a mark is, in the vehicle's axes, and how far its fields reach from there each way, m."""
+
+    x: float
+    y: float
+    along: float = 2.0
+    aside: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -69,8 +80,42 @@ CAMERAS = {
 }
 
 
-def paint(world: Path) -> None:
-    """Build the street with its marks around where the drive begins."""
+def _line_end(sign: int, far: int, side: int) -> Mark:
+    ahead = CAR.front_m + far if sign > 0 else -CAR.rear_m - far
+    return Mark(ahead, CAR.width_m / 2 * (1 + 2 * side))
+
+
+LINE_ENDS = tuple(_line_end(*end) for end in (*AHEAD, *BEHIND))
+
+# As tum_q7's, with pictures as they are delivered: scaled, cut from a larger native one, a region of it.
+TOP_SIZE = (1280, 800)
+TOP_CAMERAS = {
+    "top_front": Mounted(Pose(3.7, 0.0, 0.8, 0, 35), (), 180, "fisheye", TOP_SIZE, factor=0.5),
+    "top_left": Mounted(Pose(1.8, 1.0, 1.1, 90, 35), (), 180, "fisheye", TOP_SIZE, roi=(40, 80, 1200, 720)),
+    "top_right": Mounted(Pose(1.8, -1.0, 1.1, -90, 35), (), 180, "fisheye", TOP_SIZE),
+    "top_rear": Mounted(Pose(-1.0, 0.0, 0.9, 180, 35), (), 180, "fisheye", (1280, 960), top=120),
+}
+AWAY_M = ((2, 0.6, 0.6), (4, 0.9, 0.7), (6, 1.4, 0.7), (8, 1.6, 0.7))  # from the vehicle, and half of a mark's sides
+
+
+def _all_around() -> Iterator[Mark]:
+    """In front, behind, to the left and right, and off the corners."""
+    for (far, long, wide), lane in zip(AWAY_M, (-2.5, -0.8, 0.9, 2.6), strict=True):
+        yield Mark(CAR.front_m + far, lane, long, wide)
+        yield Mark(-CAR.rear_m - far, lane, long, wide)
+        for side in (1, -1):
+            yield Mark(CAR.front_m / 2 + lane, side * (CAR.width_m / 2 + far), wide, long)
+    for far in (3.0, 5.6):
+        for side in (1, -1):
+            yield Mark(CAR.front_m + far, side * (CAR.width_m / 2 + far), 0.8, 0.8)
+            yield Mark(-CAR.rear_m - far, side * (CAR.width_m / 2 + far), 0.8, 0.8)
+
+
+ALL_AROUND = tuple(_all_around())
+
+
+def paint(world: Path, marks: Sequence[Mark] = LINE_ENDS) -> None:
+    """Build the street with marks around where the drive begins."""
     from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, plan_course, shrink
 
     build_world(SECONDS, world)
@@ -79,11 +124,11 @@ def paint(world: Path) -> None:
     luma, per_m = level_of(atlas, GROUND, 0)[0], float(atlas.per_m[GROUND])
     at_x, at_y, heading = course.at(0)
     cos, sin = math.cos(heading), math.sin(heading)
-    along, aside = np.meshgrid(np.arange(-2, 2, 0.004), np.arange(-0.5, 0.5, 0.004))  # m, of a mark
-    white = np.where((along < 0) == (aside < 0), 230, 25)
-    for sign, far, side in (*AHEAD, *BEHIND):
-        ahead = (CAR.front_m + far if sign > 0 else -CAR.rear_m - far) + along
-        left = CAR.width_m / 2 * (1 + 2 * side) + aside
+    for mark in marks:
+        sides = (np.arange(-half, half, 0.004) for half in (mark.along, mark.aside))
+        along, aside = np.meshgrid(*sides)  # m
+        white = np.where((along < 0) == (aside < 0), 230, 25)
+        ahead, left = mark.x + along, mark.y + aside
         x, y = at_x + cos * ahead - sin * left, at_y + sin * ahead + cos * left
         rows, columns = (np.floor(per_m * each).astype(int) for each in (y, x))
         texels = rows % luma.shape[0] * luma.shape[1] + columns % luma.shape[1]
@@ -93,18 +138,36 @@ def paint(world: Path) -> None:
     shrink(atlas, GROUND)
 
 
-def native_pictures(world: Path) -> Iterator[tuple[str, bytes]]:
-    """The first picture of each camera, I420 of the native size; nothing stands on the ground, which is sharp."""
+def native_pictures(
+    world: Path, cameras: Mapping[str, Mounted] = CAMERAS, finer: int = 1
+) -> Iterator[tuple[str, bytes]]:
+    """The first picture of each camera, I420 of the native size; nothing stands on the ground, which is sharp.
+
+    finer  rays each way through a pixel, which shows their mean
+    """
     from runner.synthetic import picture
 
     def flat(course: Any) -> Any:
         faces = stand_faces(course)
-        return replace(faces, height_m=np.zeros_like(faces.height_m))
+        return replace(faces, height_m=np.zeros_like(faces.height_m), box=np.full_like(faces.box, -1))
 
     stand_faces = picture.stand_faces
     with patch.object(picture, "stand_faces", flat), patch.object(picture, "SOFT", 0.0):
-        for name, camera in CAMERAS.items():
-            yield name, next(picture.pictures(camera.view, SECONDS, world))
+        for name, camera in cameras.items():
+            view = camera.view
+            large = replace(view, width=finer * view.width, height=finer * view.height)
+            yield name, _smaller(next(picture.pictures(large, SECONDS, world)), view.width, view.height, finer)
+
+
+def _smaller(i420: bytes, width: int, height: int, times: int) -> bytes:
+    """A picture of which each pixel is the mean of so many each way."""
+    planes, samples, begin = [], np.frombuffer(i420, np.uint8), 0
+    for wide, high in ((width, height), (width // 2, height // 2), (width // 2, height // 2)):
+        end = begin + wide * high * times**2
+        blocks = samples[begin:end].reshape(high, times, wide, times)
+        planes.append(np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8).tobytes())
+        begin = end
+    return b"".join(planes)
 
 
 def ends_of(lines: Sequence[Any], ends: Sequence[End]) -> dict[End, tuple[float, float]]:
@@ -132,3 +195,34 @@ def found(picture: Any, near: tuple[float, float], others: Sequence[tuple[float,
     rows, columns = np.mgrid[top + row - 2 : top + row + 3, left + column - 2 : left + column + 3]
     weights = saddle[rows, columns]
     return float((columns * weights).sum() / weights.sum() + 0.5), float((rows * weights).sum() / weights.sum() + 0.5)
+
+
+def corner(picture: Any, near: tuple[float, float], half: tuple[float, float], around: float) -> tuple[float, float]:
+    """Where a picture is most like a mark around a point, px.
+
+    half    how far the part of a mark that is compared reaches to the right and up, px
+    around  how far from the point the mark is looked for, px
+
+    Fields of equal shade lie opposite each other: the sum of one pair minus that of the other is largest in its middle,
+    from where it falls as a straight line to each side.
+    """
+    import cv2
+
+    wide, high = (max(2, round(each)) for each in half)
+    sign = np.sign(np.arange(-high, high) + 0.5)[:, None] * np.sign(np.arange(-wide, wide) + 0.5)[None, :]
+    left, top = (max(0, math.floor(each - around) - margin) for each, margin in zip(near, (wide, high), strict=True))
+    right, bottom = (math.ceil(each + around) + margin for each, margin in zip(near, (wide, high), strict=True))
+    part = picture[top:bottom, left:right].astype(np.float32)
+    alike = np.abs(cv2.matchTemplate(part, sign.astype(np.float32), cv2.TM_CCORR))
+    row, column = np.unravel_index(alike.argmax(), alike.shape)
+    return left + wide + column + _apex(alike[row], column, wide), top + high + row + _apex(alike[:, column], row, high)
+
+
+def _apex(values: Any, at: int, half: int) -> float:
+    """Where the straight lines through the values at both sides of the largest one meet, counted from there."""
+    reach = min(half // 2, at, len(values) - 1 - at)
+    if reach < 2:
+        return 0.0
+    steps = np.arange(1, reach + 1)
+    (rise, left), (fall, right) = (np.polyfit(sign * steps, values[at + sign * steps], 1) for sign in (-1, 1))
+    return float((right - left) / (rise - fall))

@@ -1,31 +1,20 @@
-"""The page in a real browser, with still pictures in place of a drive: lines on the ground, gamepads, attention."""
+"""The page in a real browser, with still pictures in place of a drive: lines on the ground, lens, pads, attention."""
 
 from __future__ import annotations
 
-import io
-import json
 import math
 import shutil
-import subprocess
 import threading
 import time
 from contextlib import contextmanager
-from dataclasses import asdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from painted import CAMERAS, CAR, SIZE, WITHIN_PX, ends_of, found, native_pictures, paint
+from painted import CAMERAS, SIZE, WITHIN_PX, ends_of, found, native_pictures, paint
+from stills import Station, on_screen, serving
 
 from browser import PADS, all_live, opened, shot, until
-from rig import free_port
-from runner.configuration.config import configuration
-from runner.core.events import parse
-from runner.core.model import plain
-from runner.core.step import start, step
-from runner.h264.access_unit import read_unit
-from runner.page.server import PageServer
-from runner.records import CameraState, Sample, VehicleState, applied_to_json
+from runner.records import Sample
 
 pytestmark = [
     pytest.mark.gst,
@@ -36,115 +25,19 @@ image = pytest.importorskip("PIL.Image")
 pytest.importorskip("cv2")
 pytest.importorskip("numba")
 
-FPS = 1  # as the page knows it; pictures come more often, so that none is late on a busy machine
-EVERY_S = 0.4
-
-
-class Station(SimpleNamespace):
-    """What the page needs of the operator's side: a vehicle in mode S, of which each camera sends one picture."""
-
-    def __init__(self, vehicle, pictures):
-        self.vehicle, self.run = vehicle, start(vehicle)
-        for name, camera in CAMERAS.items():
-            self.step(event="camera_configured", camera=name, kbps=4000, scaling=camera.factor)
-            if camera.roi:
-                roi = dict(zip(("x", "y", "width", "height"), camera.roi, strict=True))
-                self.step(event="roi_set", camera=name, **roi)
-        self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
-        super().__init__(state=self.published(), note=print, answer_s=1.0, attention=None)
-
-    def step(self, **event):
-        self.run = step(self.vehicle, self.run, parse({"t": 0, **event}))
-        assert not self.run.refused
-
-    def published(self):
-        run = self.run
-        cameras = {
-            name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
-            for name, setting in run.decision.settings.items()
-        }
-        return VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-
-    def encoded(self, name, picture):
-        """A key frame of what the vehicle would send of a native picture: cropped, scaled, as H.264."""
-        (width, height), setting = CAMERAS[name].native, self.run.decision.settings[name]
-        roi, top = setting.roi, CAMERAS[name].top
-        edges = (f"left={roi.x}", f"right={width - roi.x - roi.width}")
-        edges += (f"top={top + roi.y}", f"bottom={height - top - roi.y - roi.height}")
-        size = f"video/x-raw,width={setting.width},height={setting.height},pixel-aspect-ratio=1/1"
-        stream = "video/x-h264,stream-format=byte-stream,alignment=au,profile=constrained-baseline"
-        line = ["gst-launch-1.0", "-q", "fdsrc", "fd=0", "!", "rawvideoparse", "format=i420", f"width={width}"]
-        line += [
-            f"height={height}",
-            f"framerate={FPS}/1",
-            "!",
-            "videocrop",
-            *edges,
-            "!",
-            "videoscale",
-            "add-borders=false",
-        ]
-        line += ["!", size, "!", "x264enc", "tune=zerolatency", "bitrate=8000", "!", stream, "!", "fdsink", "fd=1"]
-        done = subprocess.run(line, input=picture, capture_output=True, check=True, timeout=60)
-        return done.stdout
-
-    def captured_here(self, camera, captured):
-        return captured
-
-    def ask(self, document, on_reply):
-        self.asked = document
-
 
 @pytest.fixture(scope="module")
 def station(tmp_path_factory):
     place = tmp_path_factory.mktemp("stills")
     paint(place / "world")
-    conf = place / "conf"
-    (conf / "vehicle").mkdir(parents=True)
-    (conf / "vehicle" / "marks.yaml").write_text(f"# @package _global_\n{json.dumps(vehicle_file())}\n")
-    words = ["vehicle=marks", "source=test", "mode=single", f"page.port={free_port()}"]
-    words += ["inputs.keys.view=x", "inputs.buttons.view=7"]
-    return Station(configuration(words, conf).vehicle(), dict(native_pictures(place / "world")))
-
-
-def vehicle_file():
-    cameras = {
-        name: {
-            "width_px": SIZE[0],
-            "height_px": SIZE[1],
-            "fps": FPS,
-            "native": {"width_px": camera.native[0], "height_px": camera.native[1], "top_px": camera.top},
-            "lens": camera.lens,
-            "fov_deg": camera.fov_deg,
-            "calibrated": name != "fisheye",
-            "rate_quality": {"scaling": [0.5, 1.0], "b_min_kbps": [0, 100], "b_full_kbps": 8000},
-            "pose": asdict(camera.pose),
-        }
-        for name, camera in CAMERAS.items()
-    }
-    return {"name": "marks", "dimensions": asdict(CAR), "cameras": cameras}
+    pictures = dict(native_pictures(place / "world"))
+    return Station(place, CAMERAS, pictures, SIZE, ["fisheye"], ["inputs.keys.view=x", "inputs.buttons.view=7"])
 
 
 @pytest.fixture
 def served(station):
-    """The page's server, which sends the pictures."""
-    page, ended = PageServer(station.vehicle, station), threading.Event()
-    page.behind_s = 0.0  # how long ago pictures were captured
-
-    def send():
-        while not ended.wait(EVERY_S):
-            for name, data in station.units.items():
-                page.show(name, read_unit(data, time.time() - page.behind_s, time.time()))
-
-    page.start()
-    sending = threading.Thread(target=send)
-    sending.start()
-    try:
+    with serving(station) as page:
         yield page
-    finally:
-        ended.set()
-        sending.join()
-        page.stop()
 
 
 @pytest.fixture
@@ -189,19 +82,83 @@ def test_lines_end_where_marks_on_the_ground_are(page):
     assert {key: value for key, value in apart.items() if value > WITHIN_PX} == {}
 
 
+def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(page, station):
+    number = list(CAMERAS).index("fisheye") + 1
+    for key in (str(number), "Enter", "g", "r"):
+        page.locator("body").press(key)
+    until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "straight, 100° of 130°")
+    until(lambda: scale_of(page, "fisheye", CAMERAS["fisheye"]) > 1)
+    until(lambda: page.evaluate("tod.measure()")["cameras"]["fisheye"]["straight"])
+    page.add_style_tag(content=".tile .head, .drawn-off canvas.guides { visibility: hidden; }")
+    on, lines = seen(page, "fisheye")
+    shot(page, "straight")
+    page.evaluate("document.body.classList.add('drawn-off')")
+    off, _ = seen(page, "fisheye")
+    scale, ends = scale_of(page, "fisheye", CAMERAS["fisheye"]), ends_of(lines, CAMERAS["fisheye"].ends)
+    marks = {key: found(off, end, [other for other in ends.values() if other is not end]) for key, end in ends.items()}
+    apart = {key: round(math.dist(mark, ends[key]) / scale, 2) for key, mark in marks.items()}
+    print(apart)
+    assert {key: value for key, value in apart.items() if value > WITHIN_PX} == {}
+    for side in (0, -1):
+        near, middle, far = (np.array(marks[1, metres, side]) for metres in (5, 10, 15))
+        across = (far - near)[::-1] * (1, -1) / math.dist(far, near)
+        assert abs(across @ (middle - near)) / scale < WITHIN_PX, "three places in a line"
+    for line in lines:
+        for piece in line["pieces"]:
+            assert is_drawn(on - off, piece) is not False, (line["kind"], line["metres"])
+    station.asked = None
+    box = page.locator("[data-camera=fisheye] .picture").bounding_box()
+    drag(page, (box["x"] + 300, box["y"] + 200), (box["x"] + 500, box["y"] + 400))
+    until(lambda: "no ROI can be chosen on a straightened picture" in page.inner_text("#toasts"))
+    assert station.asked is None
+    page.locator("body").press("r")
+    until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "")
+
+
+def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_may_be_locked(page, station):
+    def asked():
+        roi = until(lambda: getattr(station, "asked", None))
+        station.asked = None
+        until(lambda: page.evaluate("tod.requests.pending") == [])  # the station carries out nothing
+        assert (roi.pop("event"), roi.pop("camera")) == ("roi_set", name)
+        return roi
+
+    def at(x, y):
+        box = page.locator(f"[data-camera={name}] .picture").bounding_box()
+        return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+    station.asked = None
+    name = "scaled"
+    page.mouse.move(*at(0.25, 0.5))
+    page.mouse.wheel(0, -500 * math.log(2))
+    assert asked() == pytest.approx({"x": 160, "y": 180, "width": 640, "height": 360}, abs=4)
+    page.locator("body").press("d")
+    page.locator("[data-control=roi-aspect]").click()
+    page.locator("body").press("d")
+    drag(page, at(0.2, 0.2), at(0.6, 0.9))
+    roi = asked()
+    assert roi == pytest.approx({"x": 256, "y": 144, "width": 512, "height": 288}, abs=4)
+    name = "mirrored"
+    drag(page, at(0.5, 0.5), at(0.6, 0.5), button="middle")
+    until(lambda: (getattr(station, "asked", None) or {}).get("x") == pytest.approx(288, abs=4))  # and none on the way
+    roi = asked()
+    assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
+
+
+def drag(page, begin, end, button="left"):
+    page.mouse.move(*begin)
+    page.mouse.down(button=button)
+    page.mouse.move(*end, steps=4)
+    page.mouse.up(button=button)
+
+
 def seen(page, name):
     """Luma of a camera's box on the screen while its picture is live, and its guides."""
 
     def live():
         return page.evaluate("tod.measure()")["cameras"][name]["status"] == "live" and guides(page, name)
 
-    def pictured():
-        before = live()
-        png = page.locator(f"[data-camera={name}] .picture").screenshot()
-        return png, before, live()
-
-    png, lines, _ = until(lambda: (taken := pictured())[1] and taken[1] == taken[2] and taken)
-    return np.asarray(image.open(io.BytesIO(png)).convert("L"), float), lines
+    return on_screen(image, page.locator(f"[data-camera={name}] .picture"), live)
 
 
 def scale_of(page, name, camera):

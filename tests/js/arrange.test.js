@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { test } from "node:test";
 
-import { arrange, rolesOf } from "../../runner/page/static/arrange.js";
+import { arrange, BIRDSEYE, isTopView, rolesOf } from "../../runner/page/static/arrange.js";
 
 const camera = (name, yaw_deg = null, pitch_deg = 0, width = 1920, height = 1080) =>
   ({ name, width, height, framing: null, pose: yaw_deg === null ? null : { yaw_deg, pitch_deg } });
@@ -127,6 +127,33 @@ test("a camera may change places with the front camera; both are whole then", ()
   assert.equal(after.get("rear_center").view.mirrored, true);
   assert.equal(after.get("front_center").view.mirrored, false);
   assert.equal(arrange(VEHICLES.tum_q7, 1920, 1080, "front_left").pictures.get("front_left").view.fit, "contain");
+});
+
+const ABOVE = { width: 18, height: 21 };
+
+for (const vehicle of ["tum_q7", "delivery_robot", "six top views"])
+  for (const [width, height] of SIZES)
+    test(`${vehicle} at ${width}x${height}: a bird's-eye view is in place of the top views, and overlaps nothing`, () => {
+      const cameras = VEHICLES[vehicle];
+      const { pictures } = arrange(cameras, width, height, null, ABOVE);
+      assert.deepEqual([...pictures.keys()].sort(), [...cameras.filter((each) => !isTopView(each)).map(({ name }) => name), BIRDSEYE].sort());
+      const boxes = [...pictures.entries()];
+      for (const [i, [name, box]] of boxes.entries()) {
+        assert.ok(box.x >= 0 && box.y >= 0 && box.x + box.width <= width && box.y + box.height <= height, `${name}: ${JSON.stringify(box)}`);
+        for (const [other, its] of boxes.slice(i + 1)) assert.ok(!overlap(box, its), `${name} and ${other}`);
+      }
+      const [front, above] = [pictures.get(rolesOf(cameras).front.name), pictures.get(BIRDSEYE)];
+      assert.ok(front.width * front.height >= 0.4 * width * height);
+      assert.ok(Math.abs(above.width / above.height - 18 / 21) < 0.02, JSON.stringify(above));
+    });
+
+test("the bird's-eye view may change places with the front camera, and a top view may beside it", () => {
+  const large = arrange(VEHICLES.tum_q7, 1920, 1080, BIRDSEYE, ABOVE).pictures;
+  const usual = arrange(VEHICLES.tum_q7, 1920, 1080, null, ABOVE).pictures;
+  assert.deepEqual([large.get(BIRDSEYE).width, large.get("front_center").width], [usual.get("front_center").width, usual.get(BIRDSEYE).width]);
+  const beside = arrange(VEHICLES.tum_q7, 1920, 1080, "top_left", ABOVE).pictures;
+  assert.ok(beside.has(BIRDSEYE) && !beside.has("top_right"));
+  assert.ok(beside.get("top_left").width > beside.get("front_center").width);
 });
 
 test("no cameras, no pictures", () => assert.equal(arrange([], 1920, 1080).pictures.size, 0));

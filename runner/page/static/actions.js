@@ -7,7 +7,9 @@ import { changeTotal } from "./total.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
 import { rolesOf } from "./arrange.js";
+import { changeBirdseye } from "./birdseye.js";
 import { toggleGuides } from "./drive.js";
+import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
@@ -35,6 +37,8 @@ export const ACTIONS = {
   total_raise: { words: "mode Collective: raise the total by a tenth", run: () => changeTotal(1.1) },
   view: { words: "Drive or Configure view", run: toggleView },
   guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
+  birdseye: { words: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none", run: changeBirdseye },
+  straighten: { words: "straighten the picture of the selected fisheye, or show it as it comes", run: () => toggleStraight() },
   drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { words: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
   sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },

@@ -1,7 +1,8 @@
 /** The age of the pictures on show, from the times at which each passed: ms on the station's clock. Pure. */
 
+import { MOVING } from "./status.js";
+
 const LAST = 15; // pictures whose median counts
-const MOVING = ["live", "late", "damaged"];
 const NEAR = 0.75; // of the limit
 
 /** @typedef {[captured: number, arrived: number, received: number, decoded: number, drawn: number]} Times */

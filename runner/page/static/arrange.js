@@ -27,10 +27,12 @@ const MIRROR = 0.3; // most of the width
  */
 /** @typedef {{front: Camera|null, left: Camera|null, right: Camera|null, rear: Camera|null, others: Camera[]}} Roles */
 
+export const BIRDSEYE = "bird's eye"; // in place of a camera's name; no camera has a blank in its name
+
 /** To the left, from -180 to 180. */
 const yawOf = ({ pose }) => pose && 180 - (((180 - pose.yaw_deg) % 360) + 360) % 360;
-const looksDown = ({ pose }) => pose !== null && pose.pitch_deg >= DOWN_DEG;
-const looksBack = (camera) => camera.pose !== null && !looksDown(camera) && Math.abs(yawOf(camera)) >= BEHIND_DEG;
+export const isTopView = ({ pose }) => pose !== null && pose.pitch_deg >= DOWN_DEG;
+const looksBack = (camera) => camera.pose !== null && !isTopView(camera) && Math.abs(yawOf(camera)) >= BEHIND_DEG;
 
 /**
  * The cameras by what a driver uses them for. The front camera is the one nearest to straight ahead, else the first that
@@ -39,7 +41,7 @@ const looksBack = (camera) => camera.pose !== null && !looksDown(camera) && Math
  * @returns {Roles}
  */
 export function rolesOf(cameras) {
-  const level = cameras.filter((camera) => camera.pose && !looksDown(camera));
+  const level = cameras.filter((camera) => camera.pose && !isTopView(camera));
   const front = nearest(level, 0, AHEAD_DEG) ?? level.find((camera) => Math.abs(yawOf(camera)) < 90) ?? cameras[0] ?? null;
   const rear = nearest(level.filter((camera) => camera !== front && looksBack(camera)), 180, 180);
   const ahead = front?.pose ? yawOf(front) : 0;
@@ -60,19 +62,23 @@ function nearest(cameras, yaw, within) {
 
 /**
  * The box of each picture, of the band above them, and of the mirror in its middle (of no width without one). No two boxes
- * of pictures overlap.
+ * of pictures overlap. A bird's-eye view takes the place of the top views, except of the main one.
  * @param {Camera[]} cameras  @param {number} width  @param {number} height of the area
  * @param {string|null} main camera that has changed places with the front camera
- * @returns {{band: Box, mirror: Box, pictures: Map<string, Framed>}}
+ * @param {{width: number, height: number}|null} birdseye its size, in any unit; null: none
+ * @returns {{band: Box, mirror: Box, pictures: Map<string, Framed>}} pictures of cameras, and BIRDSEYE
  */
-export function arrange(cameras, width, height, main = null) {
-  const roles = rolesOf(cameras);
+export function arrange(cameras, width, height, main = null, birdseye = null) {
+  const roles = rolesOf(birdseye ? [...cameras.filter((each) => !isTopView(each) || each.name === main), asCamera(birdseye)] : cameras);
   const area = (found) => (roles.front ? found.pictures.get(roles.front.name).width : 0);
   const found = [withStrip(roles, width, height), ...(roles.left || roles.right || !roles.others.length ? [] : [withColumn(roles, width, height)])];
   const best = found.sort((a, b) => area(b) - area(a))[0];
   exchange(best.pictures, roles.front?.name, main);
   return best;
 }
+
+/** @returns {Camera} */
+const asCamera = (birdseye) => ({ ...birdseye, name: BIRDSEYE, pose: null, framing: null });
 
 /** Let two cameras change places; both are whole there. */
 function exchange(pictures, front, main) {

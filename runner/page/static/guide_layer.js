@@ -7,10 +7,10 @@ import { imageToBox, placed } from "./framing.js";
 import { imageOf, pathGuides, straightGuides } from "./guides.js";
 import { projection } from "./projection.js";
 
-const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
+export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
 const THICK = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
 const USUAL_PX = 960;
-const RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
+export const RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{width: number, height: number, ratio: number, view: import("./framing.js").View}} Display a box on the screen, CSS px */
 /**
@@ -38,7 +38,18 @@ export class GuideLayer {
     this.dimensions = dimensions;
     this.label = camera.calibrated ? "" : "ESTIMATED";
     this.toImage = projection(camera);
-    this.straight = straightGuides(dimensions).map((guide) => this.imaged(guide));
+    this.straight = this.straightLines();
+  }
+
+  /** The picture is that of other optics: straightened, or as it comes. @param {import("./projection.js").Optics} optics */
+  look(optics) {
+    this.toImage = projection(optics);
+    this.straight = this.straightLines();
+    this.drawn = "nothing yet";
+  }
+
+  straightLines() {
+    return straightGuides(this.dimensions).map((guide) => this.imaged(guide));
   }
 
   attach(canvas) {
@@ -126,9 +137,11 @@ function nameDistances(context, lines, visible) {
   }
 }
 
-function namePicture(context, words, { left, top, bottom }) {
+/** Words in the lower left corner of what is visible. */
+export function namePicture(context, words, { left, top, bottom }) {
   const size = fontSize({ top, bottom }, 0.035);
   context.font = `700 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+  context.textAlign = "start";
   context.textBaseline = "middle";
   const wide = context.measureText(words).width + size;
   context.fillStyle = "#ffb000";

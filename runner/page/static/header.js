@@ -3,10 +3,10 @@
 import { inControl, listen, mode, publish, store } from "./store.js";
 import { complain, pending, request, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
+import { MOVING } from "./status.js";
 import { by, mark, spoken, whole, write } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
-const MOVING = ["live", "damaged", "late"];
 const COMPARE_MS = 2000;
 const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer from the vehicle's clock; LATE is not shown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };

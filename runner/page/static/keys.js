@@ -14,6 +14,7 @@ const FIXED = [
   ["1 … 9", "", "select a camera"],
   ["m, then s, a or c", "", "mode Single, Automatic, Collective"],
   ["drag on a picture", "", "choose the ROI (mode S)"],
+  ["wheel or pinch on a picture", "", "zoom the ROI (mode S); drag with the middle button or two fingers to move it"],
   ["Tab", "", "from control to control; arrows within modes, tabs and sliders"],
 ];
 

@@ -33,6 +33,7 @@ const heard = {
     store.slow = slow;
     publish("ages", ages);
   },
+  crooked: (message) => publish("crooked", message),
   sent: ({ id, sent }) => sent || publish("unsent", id),
   answer({ id, value }) {
     questions.get(id)?.(value);
@@ -86,6 +87,19 @@ export const showGuides = (names) => worker.postMessage({ order: "guided", names
 
 /** @param {string|null} name of the camera whose picture is drawn first */
 export const drawFirst = (name) => worker.postMessage({ order: "first", name });
+/** Give the worker the canvases of the bird's-eye view: of its picture, and of the lines above it. */
+export function giveGround(...elements) {
+  if (!canShowVideo) return;
+  const [picture, lines] = elements.map((element) => element.transferControlToOffscreen());
+  worker.postMessage({ order: "ground", picture, lines }, [picture, lines]);
+}
+
+/** Show the bird's-eye view in a box on the screen, or not. */
+export const showGround = (shown, { clientWidth: width, clientHeight: height }) =>
+  worker.postMessage({ order: "above", shown, width, height, ratio: devicePixelRatio });
+
+/** @param {string[]} names of the cameras whose pictures are straightened */
+export const showStraight = (names) => worker.postMessage({ order: "straight", names });
 
 /** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
 export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>

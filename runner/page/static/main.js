@@ -8,6 +8,8 @@ import { startViews } from "./views.js";
 import { startHeader } from "./header.js";
 import { startTiles } from "./tiles.js";
 import { startDrive } from "./drive.js";
+import { startBirdseye } from "./birdseye.js";
+import { startStraight } from "./straighten.js";
 import { startSound } from "./sound.js";
 import { startTotal } from "./total.js";
 import { startPanel } from "./panel.js";
@@ -24,6 +26,8 @@ startViews();
 startHeader();
 startTiles();
 startDrive();
+startBirdseye();
+startStraight();
 startNews();
 startMonitors();
 startEdit();
@@ -44,6 +48,7 @@ globalThis.tod = {
   picture: (name) => ask("picture", name),
   first: (name) => ask("first", name),
   guides: (name) => ask("guides", name),
+  birdseye: () => ask("ground"),
   request: (event) =>
     new Promise((resolve) => {
       const id = crypto.randomUUID();

@@ -3,8 +3,8 @@
  * Colour, word and shape agree: LOST a cross, FROZEN a hatch, DAMAGED and LATE a dashed frame: the picture below it moves.
  */
 
-const RED = "#e01b24";
-const AMBER = "#ffb000";
+export const RED = "#e01b24";
+export const AMBER = "#ffb000";
 
 /**
  * Draw the alarm or notice of a status over what the canvas shows.
@@ -71,7 +71,7 @@ function cross(context, width, height, side) {
   });
 }
 
-function frame(context, width, height, thick, colour, dashes) {
+export function frame(context, width, height, thick, colour, dashes) {
   context.setLineDash(dashes);
   stroke(context, thick, colour, () => context.rect(thick / 2, thick / 2, width - thick, height - thick));
   context.setLineDash([]);

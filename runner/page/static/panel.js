@@ -2,9 +2,12 @@
 
 import { camera, decided, inControl, listen, mode, store } from "./store.js";
 import { pending, request, whyNoControl, complain } from "./requests.js";
-import { fullRegion, seenRegion, sendRegion, SMALLEST, waiting } from "./roi.js";
+import { fullRegion, isLocked, seenRegion, sendRegion, toggleLocked, waiting } from "./roi.js";
+import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
 import { SHAPES, STILL, switchCamera, unapplied } from "./tiles.js";
+import { canStraighten } from "./straight.js";
+import { isStraight, toggleStraight } from "./straighten.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, region, size, tenth, whole, write } from "./format.js";
 
@@ -26,6 +29,7 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
+const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show it as it comes (r)", onclick: () => toggleStraight() }, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
@@ -42,6 +46,7 @@ const weightNote = make("span", { class: "muted" });
 const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
 const full = make("button", { "data-control": "roi-full", onclick: () => sendFull(), title: "full image (f)" }, "Full image");
+const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "a region that is dragged has the aspect ratio of the full image" }, "Lock aspect");
 const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), is: make("i", { class: "is" }), wish: make("i", { class: "wish" }) };
 const differing = make("p", { class: "differing" });
 const rows = new Map();
@@ -134,6 +139,8 @@ function refresh() {
   if (!about) return;
   const now = decided(name());
   refreshHead(now);
+  straight.hidden = !canStraighten(about);
+  mark(straight, "aria-pressed", isStraight(name()));
   refreshSettings(about, now);
   refreshComparison(now);
   refreshDiagram(about);
@@ -163,6 +170,7 @@ function refreshSettings(about, now) {
   refreshFactors(about, now, why);
   fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
   for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
+  mark(locked, "aria-pressed", isLocked());
   apply.disabled = full.disabled = Boolean(why);
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? about.weight, whyNot(), pending(`weight:${name()}`));
@@ -260,11 +268,11 @@ export function startPanel() {
     field("Factor", choices, free),
     field("ROI", make("div", { class: "sides" }, ...numbers)),
     make("div", { class: "beside" },
-      make("div", {}, field("", apply, full), field("Weight", weight, weightNote)),
+      make("div", {}, field("", apply, full, locked), field("Weight", weight, weightNote)),
       diagram.box),
   );
-  const head = make("div", { class: "head" }, swatch, title, status, on);
+  const head = make("div", { class: "head" }, swatch, title, status, straight, on);
   by("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
-  listen("hello state sample control requests socket status theme", refresh);
+  listen("hello state sample control requests socket status theme straight aspect", refresh);
   listen("selected", forget);
 }

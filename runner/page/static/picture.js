@@ -30,6 +30,11 @@ class FramePicture {
     context.drawImage(this.frame, 0, 0, width, height);
   }
 
+  /** Into the texture that is bound. @param {WebGL2RenderingContext} gl */
+  upload(gl) {
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, this.frame);
+  }
+
   /** Planes of the frame, as they were decoded: {width, height, format, bytes, planes}. */
   async decoded() {
     const bytes = new Uint8Array(this.frame.allocationSize());
@@ -42,7 +47,7 @@ class FramePicture {
   }
 }
 
-/** The planes of a frame; converted to pixels when first painted, since not every decoded picture is. */
+/** The planes of a frame; converted to pixels when first drawn, since not every decoded picture is. */
 class PlanePicture {
   converted = false;
 
@@ -61,14 +66,25 @@ class PlanePicture {
     this.painted = { width: memory.image.width, height: memory.image.height };
   }
 
-  paint(context, width, height) {
+  pixels() {
     const { bytes, image } = this.memory;
     if (!this.converted) toRgba(bytes, this.planes, this.format, this.colorSpace, image, this.width);
     this.converted = true;
+    return image;
+  }
+
+  paint(context, width, height) {
+    const image = this.pixels();
     if (width === image.width && height === image.height) return context.putImageData(image, 0, 0);
     const still = new OffscreenCanvas(image.width, image.height);
     still.getContext("2d", { alpha: false, willReadFrequently: true })?.putImageData(image, 0, 0);
     context.drawImage(still, 0, 0, width, height);
+  }
+
+  /** Into the texture that is bound. @param {WebGL2RenderingContext} gl */
+  upload(gl) {
+    const { width, height, data } = this.pixels();
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, data);
   }
 
   async decoded() {

@@ -37,6 +37,22 @@ export function projection({ pose, fov_deg, lens, native }) {
   };
 }
 
+/**
+ * The inverse, of a pinhole: a function from a point of the full image to a place that is seen there, 1 m deep.
+ * @param {Optics} optics
+ * @returns {(point: Point) => Place}
+ */
+export function sightline({ pose, fov_deg, native }) {
+  const { forward, right, down } = axesOf(pose);
+  const focal = native.width / 2 / Math.tan(radians(fov_deg / 2));
+  return ({ x, y }) => {
+    const across = (x + native.left - native.width / 2) / focal;
+    const below = (y + native.top - native.height / 2) / focal;
+    const [ahead, left, up] = forward.map((each, i) => each + across * right[i] + below * down[i]);
+    return { x: pose.x_m + ahead, y: pose.y_m + left, z: pose.z_m + up };
+  };
+}
+
 /** Directions of the camera in the vehicle's axes: along its view, and to the right and down in its picture. */
 function axesOf({ yaw_deg, pitch_deg, roll_deg }) {
   const [sy, sp, sr] = [yaw_deg, pitch_deg, roll_deg].map((angle) => Math.sin(radians(angle)));

@@ -3,10 +3,12 @@
 import { camera, decided, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { toBox, toPicture, visible } from "./framing.js";
+import { isStraight } from "./straighten.js";
+import { inside, SMALLEST, withAspect } from "./region.js";
 import { make, sameRegion } from "./format.js";
 
 const START_PX = 6; // the pointer moves less than this in a click
-export const SMALLEST = 16;
+const ASPECT = "tod-roi-aspect";
 const views = new Map(); // by camera: shows the region that is pending
 
 /** The region on the picture: the one read back, otherwise the one decided. */
@@ -14,6 +16,14 @@ export const seenRegion = (name) => {
   const now = decided(name);
   return now?.applied.roi ?? now?.roi ?? null;
 };
+
+/** Whether a region that is dragged has the full image's aspect ratio. */
+export const isLocked = () => localStorage.getItem(ASPECT) === "locked";
+
+export function toggleLocked() {
+  localStorage.setItem(ASPECT, isLocked() ? "free" : "locked");
+  publish("aspect");
+}
 
 const sizeOf = ({ clientWidth: width, clientHeight: height }) => ({ width, height });
 
@@ -27,7 +37,9 @@ function regionOf(box, view, roi, full, a, b) {
   };
   const [x, width] = along("x", seen.x, seen.width, full.width);
   const [y, height] = along("y", seen.y, seen.height, full.height);
-  return { x, y, width, height };
+  if (!isLocked()) return { x, y, width, height };
+  const towards = { right: corners[1].x >= corners[0].x, down: corners[1].y >= corners[0].y };
+  return inside(withAspect({ x, y, width, height }, full.width / full.height, towards), full);
 }
 
 /** Whole numbers within the visible bounds; never smaller than the smallest, never outside the image. */
@@ -51,8 +63,10 @@ export function fullRegion(name) {
   return { x: 0, y: 0, width: full.width, height: full.height };
 }
 
-export function whyNoRegion() {
+/** Why a region cannot be chosen on a camera's picture; null: it can. */
+export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
+  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; straighten it no longer (r), or type its numbers";
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
@@ -88,21 +102,22 @@ export function dragRegion(name, box, view) {
   const refresh = () => {
     if (dragging) return;
     const wish = waiting(name);
-    if (wish && seenRegion(name)) place(wish);
+    if (wish && seenRegion(name) && !isStraight(name)) place(wish);
     else rectangle.hidden = true;
   };
 
   box.addEventListener("pointerdown", (event) => {
     dragging = false;
+    if (!event.isPrimary) return end(); // a second finger: zoom.js
     from = event.button === 0 && seenRegion(name) ? point(event) : null;
   });
   box.addEventListener("pointermove", (event) => {
-    if (!from) return;
+    if (!from || !event.isPrimary) return;
     if (!(event.buttons & 1) || !seenRegion(name)) return end(); // released elsewhere, or the vehicle is offline
     const here = point(event);
     if (!dragging && Math.hypot(here.x - from.x, here.y - from.y) < START_PX) return;
-    if (!dragging && whyNoRegion()) {
-      publish("toast", { text: `${name}: ${whyNoRegion()}`, level: "hint" });
+    if (!dragging && whyNoRegion(name)) {
+      publish("toast", { text: `${name}: ${whyNoRegion(name)}`, level: "hint" });
       return end();
     }
     dragging = true;
@@ -118,12 +133,15 @@ export function dragRegion(name, box, view) {
   views.set(name, refresh);
 }
 
-listen("requests state", () => views.forEach((refresh) => refresh()));
+listen("requests state straight", () => views.forEach((refresh) => refresh()));
 
-/** The region that was requested or decided, and is not yet the one on the picture. */
+/**
+ * The region that was requested or decided, and is not yet the one on the picture.
+ * @returns {import("./framing.js").Rectangle|null}
+ */
 export function waiting(name) {
   const asked = pending(`roi:${name}`)?.event;
-  if (asked) return asked;
+  if (asked) return { x: asked.x, y: asked.y, width: asked.width, height: asked.height };
   const now = decided(name);
   return now?.applied.roi && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
 }

@@ -1,5 +1,8 @@
 /** The status of a tile's stream: judged from times alone, so that it can be tested without video. */
 
+export const MOVING = ["live", "late", "damaged"];
+export const STANDING = ["frozen", "lost"]; // though pictures should come
+
 const LOST_MS = 1000;
 const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 

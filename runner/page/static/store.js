@@ -1,5 +1,7 @@
 /** The page's state, as received from the station; views listen for the kinds of message that they show. */
 
+import { BIRDSEYE } from "./arrange.js";
+
 const SHOWN_S = 300;
 const listeners = new Map();
 
@@ -81,7 +83,7 @@ const listeners = new Map();
  * @property {number|null} skew_ms
  * @property {boolean} slow
  * @property {string|null} selected
- * @property {string|null} enlarged
+ * @property {string|null} enlarged camera, or BIRDSEYE
  * @property {"configure"|"drive"|"monitor"} view
  */
 
@@ -135,7 +137,7 @@ function hello(message) {
   store.series = emptySeries(names);
   const own = store.view === "monitor" || names.includes(store.selected) ? store.selected : (names[0] ?? null);
   store.selected = message.selected ?? own;
-  if (!names.includes(store.enlarged)) store.enlarged = null;
+  if (store.enlarged !== BIRDSEYE && !names.includes(store.enlarged)) store.enlarged = null;
 }
 
 /**

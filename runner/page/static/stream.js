@@ -7,8 +7,11 @@ import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
 import { pictureOf } from "./picture.js";
 import { GuideLayer } from "./guide_layer.js";
-import { judge, words } from "./status.js";
+import { judge, MOVING, STANDING, words } from "./status.js";
 import { drawOverlay } from "./overlay.js";
+import { straightOptics } from "./straight.js";
+import { StraightView } from "./straight_view.js";
+import { FILLS } from "./warp.js";
 
 export const KEY = 1;
 export const CATCH_UP = 2;
@@ -23,8 +26,8 @@ const SETTLE_MS = 2000; // after a restart the decoder may take this long for th
 const REFUSED_MS = 5000; // between two questions whether the browser decodes a stream now
 const LATE_HOLD_MS = 500; // how long one late picture is indicated
 const STAGES = 1200;
+const NEW_REGION = "NEW REGION"; // which part of the image a picture shows is not known for a moment
 const UNTIMED_MS = 1000; // a picture without a capture time has been on its way for less
-const MOVING = ["live", "late", "damaged"];
 // Not every encoder states what the vehicle pins (ITU-R BT.709); browsers would take BT.601 for small pictures.
 /** @type {VideoColorSpaceInit} */
 const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRange: false };
@@ -41,7 +44,8 @@ export class Stream {
 
   /**
    * @param {object} camera as in hello
-   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), marked(name, mark), wake() requests a redraw
+   * @param {object} station what all streams share: clock, limits, connected, online, resync(name), marked(name, mark), wake() requests a redraw,
+   *   crooked(stream, error): its picture cannot be straightened
    */
   constructor(camera, station) {
     this.camera = camera;
@@ -82,9 +86,16 @@ export class Stream {
     this.last_drawn = 0; // page time
     this.late_age = NaN; // of the last late picture
     this.guides = camera.pose && station.dimensions ? new GuideLayer(camera, station.dimensions) : null;
-    /** @type {{x: number, y: number, width: number, height: number, size: {width: number, height: number}}|null} */
-    this.region = null; // of the full image that pictures show, and their size; null: unknown, or about to change
+    this.full = { x: 0, y: 0, width: camera.width, height: camera.height };
+    /** @type {import("./framing.js").Rectangle|null} */
+    this.region = null; // of the full image that pictures show; null: unknown, or about to change
+    /** @type {import("./framing.js").Size|null} */
+    this.expected = null; // size of these pictures; null likewise
     this.region_since = Infinity; // capture times from then on are those of pictures that show it
+    this.size_since = Infinity;
+    /** @type {StraightView|null} */
+    this.straight = null; // shows the picture straightened
+    this.above = false; // whether the bird's-eye view shows the picture, too
     this.started();
   }
 
@@ -107,13 +118,26 @@ export class Stream {
 
   /** Which part of the full image pictures show, once that was read back. */
   regard({ roi, width, height, applied }) {
-    const seen = applied.roi ?? roi;
+    const { x, y, width: wide, height: high } = applied.roi ?? roi;
     const size = applied.size ?? { width, height };
-    const same = ["x", "y", "width", "height"].every((key) => seen[key] === roi[key]) && size.width === width && size.height === height;
-    const region = same ? { ...seen, size } : null;
-    if (JSON.stringify(region) === JSON.stringify(this.region)) return;
-    this.region = region;
-    this.region_since = this.station.clock.server(now());
+    const isCut = x === roi.x && y === roi.y && wide === roi.width && high === roi.height;
+    const region = isCut ? { x, y, width: wide, height: high } : null;
+    const expected = isCut && size.width === width && size.height === height ? size : null;
+    const since = this.station.clock.server(now());
+    if (JSON.stringify(region) !== JSON.stringify(this.region)) Object.assign(this, { region, region_since: since });
+    if (JSON.stringify(expected) !== JSON.stringify(this.expected)) Object.assign(this, { expected, size_since: since });
+  }
+
+  /** The region that the picture on show is known to show. */
+  seenRegion() {
+    const { shown, region } = this;
+    return shown && region && this.taken() >= this.region_since && isOfShape(shown.picture, region) ? region : null;
+  }
+
+  /** When the picture on show was captured, or at least on its way. */
+  taken() {
+    const { captured = NaN, arrived = NaN } = this.shown?.meta ?? {};
+    return Number.isFinite(captured) ? captured : arrived - UNTIMED_MS;
   }
 
   attach(canvas) {
@@ -251,7 +275,8 @@ export class Stream {
   }
 
   async wait(frame, meta, decoder) {
-    const picture = await pictureOf(frame, this.widthOnScreen({ width: frame.displayWidth, height: frame.displayHeight })).catch(() => null);
+    const size = { width: frame.displayWidth, height: frame.displayHeight };
+    const picture = await pictureOf(frame, this.above || this.straight ? Infinity : this.widthOnScreen(size)).catch(() => null);
     if (!picture) return void this.counts.errors++;
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
@@ -292,14 +317,42 @@ export class Stream {
 
   /** The guides of the picture on show; none over one that stands still, since nobody may steer by it. */
   drawGuides() {
-    const { guides, shown, region } = this;
+    const { guides, shown } = this;
     if (!guides) return;
-    const { captured = NaN, arrived = NaN } = shown?.meta ?? {};
-    const taken = Number.isFinite(captured) ? captured : arrived - UNTIMED_MS;
-    const picture = shown && { width: shown.picture.width, height: shown.picture.height };
-    const fits = picture && region && picture.width === region.size.width && picture.height === region.size.height;
-    const seen = fits && MOVING.includes(this.status) && taken >= this.region_since ? { picture, region, rad: this.station.steering.when(captured) } : null;
-    guides.draw(this.display, seen);
+    const drawn = MOVING.includes(this.status) ? this.drawnRegion() : null;
+    guides.draw(this.display, shown && drawn && { ...drawn, rad: this.station.steering.when(shown.meta.captured) });
+  }
+
+  /** Which region of the image that the guides are made for is in the canvas, and how large; null: unknown. */
+  drawnRegion() {
+    const { shown, expected, canvas } = this;
+    const region = this.seenRegion();
+    if (!shown || !region) return null;
+    if (this.straight) return canvas && { picture: { width: canvas.width, height: canvas.height }, region: this.full };
+    const { width, height } = shown.picture;
+    const fits = expected && width === expected.width && height === expected.height && this.taken() >= this.size_since;
+    return fits ? { picture: { width, height }, region } : null;
+  }
+
+  /**
+   * Show the picture straightened, or as it comes.
+   * @throws {Error} for people to read: there is no straight view
+   */
+  straighten(on) {
+    if (on === Boolean(this.straight)) return;
+    this.straight = on ? new StraightView(this.camera) : null;
+    this.guides?.look(on ? straightOptics(this.camera) : this.camera);
+    this.painted = null; // it is painted again at the next tick
+  }
+
+  /** What the bird's-eye view shows of this camera. */
+  fromAbove() {
+    const region = this.seenRegion();
+    const moves = MOVING.includes(this.status);
+    const picture = moves && region ? (this.shown?.picture ?? null) : null;
+    const fill = picture ? FILLS.picture : STANDING.includes(this.status) ? FILLS.alarm : FILLS.none;
+    const { timestamp = null, captured = NaN } = (picture && this.shown?.meta) ?? {};
+    return { picture, fill, timestamp, captured, region: this.region ?? this.full, status: this.status, words: this.overlay(now()) || (region ? "" : NEW_REGION) };
   }
 
   age({ captured }, time) {
@@ -358,7 +411,7 @@ export class Stream {
   }
 
   overlay(time) {
-    if (this.status === "live") return "";
+    if (this.status === "live") return this.straight && !this.seenRegion() ? NEW_REGION : "";
     const late = this.isLateToo(time) ? `, ${words("late", 0, this.late_age)}` : "";
     return words(this.status, time - Math.min(this.arrived, this.failed_at ?? Infinity), this.late_age) + late;
   }
@@ -370,12 +423,11 @@ export class Stream {
 
   paint(time) {
     const { canvas, context } = this;
-    if (!canvas || !context) return;
+    if (!canvas || !context || (this.above && !this.display.width)) return; // the bird's-eye view is in its place
     const text = this.overlay(time);
-    this.size(canvas, this.status === "frozen" || this.status === "lost");
-    const { width, height } = canvas;
-    if (this.shown && this.status !== "off" && this.status !== "unsupported") this.shown.picture.paint(context, width, height);
-    else blank(context, width, height);
+    this.size(canvas, STANDING.includes(this.status));
+    if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown.picture);
+    else blank(context);
     if (text) drawOverlay(context, this.area(canvas), this.display.view.mirrored, this.status, text);
     this.painted = text;
     this.tellMark(this.isLateToo(time) ? "damaged late" : this.status);
@@ -388,6 +440,18 @@ export class Stream {
     this.station.marked(this.name, mark);
   }
 
+  paintPicture(context, picture) {
+    const region = this.seenRegion();
+    if (!this.straight) return picture.paint(context, context.canvas.width, context.canvas.height);
+    if (!region) return blank(context);
+    try {
+      this.straight.paint(context, picture, region);
+    } catch (error) {
+      this.station.crooked(this, error);
+      picture.paint(context, context.canvas.width, context.canvas.height);
+    }
+  }
+
   /**
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
    * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
@@ -395,11 +459,18 @@ export class Stream {
   size(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
-    const own = this.shown?.picture.painted ?? box;
+    const own = this.straight ? this.straightSize() : (this.shown?.picture.painted ?? box);
     const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const width = own.width * times;
     const height = own.height * times;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  }
+
+  /** A straight image is as sharp as the screen, and no larger than the camera's. */
+  straightSize() {
+    const { width, height } = this.camera;
+    const wide = Math.round(Math.min(width, this.widthOnScreen(this.camera) || width));
+    return { width: wide, height: Math.round((wide * height) / width) };
   }
 
   /** Width of a picture on the screen, with what is cropped, in px of the screen; 0: not known yet. */
@@ -422,6 +493,7 @@ export class Stream {
       status: this.status,
       ...this.counts,
       error: this.error,
+      straight: this.straight !== null && this.painted !== null,
       width: picture?.width ?? 0,
       height: picture?.height ?? 0,
       drawn_size: { width: this.canvas?.width ?? 0, height: this.canvas?.height ?? 0 },
@@ -441,12 +513,17 @@ export class Stream {
   }
 }
 
+/** Whether a picture has a region's aspect ratio, as far as whole even numbers of px allow. */
+function isOfShape(picture, { width, height }) {
+  return Math.abs(picture.width * height - picture.height * width) <= width + height;
+}
+
 /** JSON has no other numbers. */
 const finite = (ms) => (Number.isFinite(ms) ? ms : null);
 
-function blank(context, width, height) {
+function blank(context) {
   context.fillStyle = "#0b0e11";
-  context.fillRect(0, 0, width, height);
+  context.fillRect(0, 0, context.canvas.width, context.canvas.height);
 }
 
 function described({ width, height, bytes, planes }, { sequence, captured }) {

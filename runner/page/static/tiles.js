@@ -4,9 +4,13 @@ import { camera, decided, enlarge, inControl, listen, publish, select, store } f
 import { drawFirst, giveCanvas, giveGuides, tellSize } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, seenRegion } from "./roi.js";
+import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
-import { arrange, rolesOf, viewOf } from "./arrange.js";
+import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
+import { birdseyeSize, placeBirdseye } from "./birdseye.js";
 import { shownWords, WHOLE } from "./framing.js";
+import { isStraight } from "./straighten.js";
+import { straightOptics } from "./straight.js";
 import { colourOf } from "./colours.js";
 import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
 
@@ -118,6 +122,7 @@ function tile({ name, pose }) {
     giveGuides(name, guides);
   }
   dragRegion(name, parts.box, () => tiles.get(name).view);
+  zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
 }
 
@@ -132,8 +137,10 @@ export function switchCamera(name) {
 function lay() {
   drawFirst(store.enlarged ?? rolesOf(store.hello?.cameras ?? []).front?.name ?? null);
   if (store.view === "drive") return layDrive();
+  placeBirdseye(undefined);
   for (const [name, { element }] of tiles) {
     const its = camera(name);
+    element.hidden = false;
     Object.assign(element.style, { left: "", top: "" });
     frame(name, its && store.view === "monitor" ? viewOf(its) : WHOLE);
   }
@@ -160,10 +167,13 @@ function layBands() {
 
 /** A place for each camera by where it looks; the enlarged one has changed places with the front camera. */
 function layDrive() {
-  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged);
+  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged, birdseyeSize());
   by("drive").style.height = `${band.height}px`;
   by("drive").style.setProperty("--mirror", `${mirror.width}px`);
+  placeBirdseye(pictures.get(BIRDSEYE));
+  for (const [name, { element }] of tiles) element.hidden = !pictures.has(name);
   for (const [name, { x, y, width, height, view }] of pictures) {
+    if (!tiles.has(name)) continue;
     const { box, element } = tiles.get(name);
     Object.assign(element.style, { left: `${x}px`, top: `${y}px`, width: `${width}px` });
     element.classList.remove("enlarged");
@@ -190,9 +200,12 @@ function tellFrame(name) {
 
 /** State what is cropped. */
 function refreshShown(name, { box, shown, view }) {
-  const picture = seenRegion(name) ?? camera(name);
-  const laid = picture && box.clientWidth && box.clientHeight;
-  write(shown, laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "");
+  const about = camera(name);
+  const picture = (isStraight(name) ? null : seenRegion(name)) ?? about;
+  const laid = about && picture && box.clientWidth && box.clientHeight;
+  const words = laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
+  const straight = about && isStraight(name) ? `straight, ${straightOptics(about).fov_deg}° of ${about.fov_deg}°` : "";
+  write(shown, [words, straight].filter(Boolean).join(", "));
 }
 
 function layEnlarged() {
@@ -203,7 +216,7 @@ function layEnlarged() {
     element.style.width = "";
     box.style.height = `${scene.clientHeight - chrome()}px`;
   }
-  area.classList.toggle("has-enlarged", store.enlarged !== null);
+  area.classList.toggle("has-enlarged", tiles.has(store.enlarged));
 }
 
 // --- what is shown ----------------------------------------------------------------------------------------------------
@@ -218,6 +231,7 @@ function refresh(name, index) {
   part.swatch.style.background = colourOf(index);
   part.element.classList.toggle("selected", store.selected === name);
   mark(part.element, "aria-current", store.selected === name ? "true" : null);
+  mark(part.element, "data-straight", isStraight(name) ? "" : null);
   refreshStatus(name, part);
   refreshSwitch(name, part);
   refreshCaption(name, part);
@@ -301,9 +315,9 @@ function announce({ camera: name, status }) {
 export function startTiles() {
   listen("hello", build);
   listen("layout", () => draft || group());
-  listen("state sample requests control socket theme selected", refreshAll);
+  listen("state sample requests control socket theme selected straight", refreshAll);
   listen("status", announce);
-  listen("view", lay);
+  listen("view birdseye", lay);
   listen("enlarged", (name) => {
     lay();
     if (name && !hinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });

@@ -4,7 +4,9 @@
  */
 
 import { ageOf, skewOf } from "./ages.js";
+import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
+import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
@@ -13,12 +15,16 @@ import { drawInTurn } from "./turns.js";
 import "./codec.js";
 import "./counter.js";
 import "./framing.js";
+import "./ground.js";
 import "./guide_layer.js";
 import "./guides.js";
 import "./pace.js";
 import "./projection.js";
 import "./overlay.js";
 import "./status.js";
+import "./straight.js";
+import "./straight_view.js";
+import "./warp.js";
 import "./yuv.js";
 
 const WATCH_MS = 15;
@@ -42,6 +48,7 @@ const station = {
   count: (counter) => send({ counter }),
   resync: (name) => send({ resync: name }),
   marked: (name, mark) => log.push([now(), name, mark]) > LOGGED && log.shift(),
+  crooked,
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
@@ -54,6 +61,9 @@ let described = "";
 let guided = []; // cameras whose guides are shown
 /** @type {string|null} */
 let first = null; // camera whose picture is drawn first
+/** @type {string[]} */
+let straight = []; // cameras whose pictures are straightened
+const ground = new GroundView(station.steering);
 let asleep = true;
 let watched = now();
 let stalled = false; // at the last tick
@@ -134,6 +144,8 @@ function hello(message) {
     streams = message.cameras.map((camera) => new Stream(camera, station));
     described = text;
     guide();
+    straighten();
+    ground.know(streams.filter(({ camera }) => isTopView(camera)), message.dimensions);
   }
   streams.forEach((stream) => stream.started());
   connection(true);
@@ -148,6 +160,22 @@ function decided(message) {
 
 function guide() {
   for (const stream of streams) stream.guide(guided.includes(stream.name));
+}
+
+function straighten() {
+  for (const stream of streams) {
+    try {
+      stream.straighten(straight.includes(stream.name));
+    } catch (error) {
+      crooked(stream, error);
+    }
+  }
+}
+
+/** A picture cannot be straightened: show it as it comes, and say why. */
+function crooked(stream, error) {
+  stream.straighten(false);
+  tell({ kind: "crooked", camera: stream.name, why: error instanceof Error ? error.message : String(error) });
 }
 
 function unit(buffer) {
@@ -170,6 +198,7 @@ function wake() {
   requestAnimationFrame(() => {
     asleep = true;
     if (drawInTurn(streams, first, now)) wake();
+    ground.draw();
   });
 }
 
@@ -188,6 +217,7 @@ function judgeAll() {
     if (!stream.watch()) continue;
     tell({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
   }
+  if (asleep) ground.draw(); // the state of a picture
 }
 
 /** Report the ages that the page shows, and how far apart in time the pictures of the cameras are. */
@@ -219,13 +249,19 @@ const orders = {
     guide();
   },
   first: ({ name }) => (first = name),
+  straight({ names }) {
+    straight = names;
+    straighten();
+  },
+  ground: ({ picture, lines }) => ground.attach(picture, lines),
+  above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
   size({ name, ...display }) {
     const stream = find(name);
     if (stream) Object.assign(stream, { display, painted: null });
   },
   send: ({ message }) => tell({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, guides: () => find(name)?.guides?.lines, stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = { measure, guides: () => find(name)?.guides?.lines, ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
     tell({ kind: "answer", id, value: await questions[what]() });
   },
 };

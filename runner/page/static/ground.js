@@ -1,0 +1,139 @@
+/** The ground around the vehicle as seen from above: what each camera shows of it, and whose picture counts where. Pure; m and px. */
+
+import { projection } from "./projection.js";
+
+export const REACH_M = 9; // beyond the vehicle, on every side
+const CELL_M = 0.3; // of the lattice; between its vertices the image is taken for linear, off by 1 cm near a camera 1 m high
+const FEATHER = 0.12; // of the shorter side of a region: within it a picture fades out
+const NEARER = 10; // power of the distance by which a camera counts less: the seam between two is about 1 m wide
+
+/** @typedef {import("./projection.js").Place} Place */
+/** @typedef {import("./projection.js").Point} Point */
+/** @typedef {import("./projection.js").Optics} Optics */
+/** @typedef {import("./guides.js").Dimensions} Dimensions */
+/** @typedef {import("./framing.js").Rectangle} Rectangle */
+/** @typedef {{rear: number, front: number, right: number, left: number}} Extent along x from rear to front, along y from right to left */
+/** @typedef {{places: Place[], columns: number, rows: number}} Lattice rows from the rear to the front, each from right to left */
+/** @typedef {{points: (Point|null)[], near: number[]}} Sight of a camera, for each vertex: its point in the full image, and how much it counts there */
+
+/**
+ * The vehicle's outline on the ground, with a margin.
+ * @param {Dimensions} dimensions
+ * @param {number} margin
+ * @returns {Extent}
+ */
+export function outline({ width_m, front_m, rear_m }, margin = 0) {
+  const half = width_m / 2 + margin;
+  return { rear: -rear_m - margin, front: front_m + margin, right: -half, left: half };
+}
+
+/**
+ * The ground that the bird's-eye view shows, and how large it is.
+ * @param {Dimensions} dimensions
+ */
+export function groundOf(dimensions) {
+  const extent = outline(dimensions, REACH_M);
+  return { extent, width: extent.left - extent.right, height: extent.front - extent.rear };
+}
+
+/**
+ * Places on the ground, in cells of equal size.
+ * @param {Extent} extent
+ * @returns {Lattice}
+ */
+export function latticeOf({ rear, front, right, left }) {
+  const steps = (low, high) => {
+    const count = Math.ceil((high - low) / CELL_M);
+    return Array.from({ length: count + 1 }, (_, i) => low + ((high - low) * i) / count);
+  };
+  const [along, across] = [steps(rear, front), steps(right, left)];
+  return { places: along.flatMap((x) => across.map((y) => ({ x, y, z: 0 }))), columns: across.length, rows: along.length };
+}
+
+/**
+ * What a camera sees of the ground. The vehicle hides from a camera at its outside what lies behind it, and is taken to
+ * be as high as the camera; one above it sees everything.
+ * @param {Optics} optics  @param {Dimensions} dimensions  @param {Place[]} places
+ * @returns {Sight}
+ */
+export function sightOf(optics, dimensions, places) {
+  const toImage = projection(optics);
+  const { x_m, y_m, z_m } = optics.pose;
+  const [body, eye] = [outline(dimensions), { x: x_m, y: y_m }];
+  const outside = !crosses(eye, eye, body);
+  const near = places.map((place) => (outside && crosses(eye, place, body) ? 0 : Math.hypot(place.x - x_m, place.y - y_m, z_m) ** -NEARER));
+  return { points: places.map(toImage), near };
+}
+
+/** Whether a line from a to b leads through the inside of an extent. */
+export function crosses(a, b, { rear, front, right, left }) {
+  let [enter, leave] = [0, 1];
+  for (const [from, to, low, high] of [[a.x, b.x, rear, front], [a.y, b.y, right, left]]) {
+    if (from === to) {
+      if (from <= low || from >= high) return false;
+      continue;
+    }
+    const [first, second] = [(low - from) / (to - from), (high - from) / (to - from)];
+    enter = Math.max(enter, Math.min(first, second));
+    leave = Math.min(leave, Math.max(first, second));
+  }
+  return enter < leave;
+}
+
+/**
+ * Each camera's share of the picture at each vertex; they add up to 1 where any camera sees the ground, and fade out
+ * towards the edge of what a picture shows.
+ * @param {Sight[]} sights
+ * @param {Rectangle[]} regions of the full images that the pictures show
+ * @returns {Float32Array[]}
+ */
+export function sharesOf(sights, regions) {
+  const wished = sights.map(({ points, near }, i) => {
+    const fade = fading(regions[i]);
+    return Float64Array.from(points, (point, vertex) => (point ? near[vertex] * fade(point) : 0));
+  });
+  const shares = wished.map(({ length }) => new Float32Array(length));
+  for (let vertex = 0; vertex < (wished[0]?.length ?? 0); vertex++) {
+    const total = wished.reduce((sum, each) => sum + each[vertex], 0);
+    if (total > 0) for (const [i, each] of wished.entries()) shares[i][vertex] = each[vertex] / total;
+  }
+  return shares;
+}
+
+/** 1 inside a rectangle, 0 outside, and between them near its edges. */
+function fading({ x, y, width, height }) {
+  const wide = FEATHER * Math.min(width, height);
+  return (point) => {
+    const inside = Math.min(point.x - x, x + width - point.x, point.y - y, y + height - point.y);
+    return Math.min(1, Math.max(0, inside / wide));
+  };
+}
+
+/**
+ * Two triangles for each cell of a lattice, as indices of vertices; none with a vertex that has no image, or without a share.
+ * @param {number} columns  @param {number} rows of vertices
+ * @param {(Point|null)[]} points  @param {Float32Array} shares
+ */
+export function trianglesOf(columns, rows, points, shares) {
+  /** @type {number[]} */
+  const found = [];
+  const isDrawn = (corners) => corners.every((corner) => points[corner]) && corners.some((corner) => shares[corner] > 0);
+  const add = (...corners) => isDrawn(corners) && found.push(...corners);
+  for (let row = 0; row + 1 < rows; row++)
+    for (let column = 0; column + 1 < columns; column++) {
+      const at = row * columns + column;
+      add(at, at + 1, at + columns);
+      add(at + 1, at + columns + 1, at + columns);
+    }
+  return Uint32Array.from(found);
+}
+
+/**
+ * How the ground lies in a box on the screen: px for each metre, and where the ground below the rear axle is, the front up.
+ * @param {{width: number, height: number}} box  @param {Dimensions} dimensions
+ */
+export function laidOut(box, dimensions) {
+  const { extent, width, height } = groundOf(dimensions);
+  const px_per_m = Math.min(box.width / width, box.height / height);
+  return { px_per_m, x: box.width / 2 + ((extent.left + extent.right) / 2) * px_per_m, y: box.height / 2 + ((extent.front + extent.rear) / 2) * px_per_m };
+}

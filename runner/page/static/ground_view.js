@@ -1,0 +1,300 @@
+/**
+ * The bird's-eye view, drawn by the worker from the pictures of the cameras that look down, and above it, in a canvas of its
+ * own, what does not change with every picture: the vehicle, distances, and which picture is not as it should be.
+ */
+
+import { groundOf, laidOut, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
+import { now } from "./clock.js";
+import { COLOURS, namePicture, RAD } from "./guide_layer.js";
+import { pathGuides } from "./guides.js";
+import { AMBER, frame, RED } from "./overlay.js";
+import { hasGpu } from "./picture.js";
+import { MOVING, STANDING } from "./status.js";
+import { Warp } from "./warp.js";
+
+const DISTANCES_M = [1, 2, 5]; // from the vehicle
+const AWAY_M = 4; // from its camera the state of a picture is written
+// Without a GPU a processor draws: a picture of a million px would take it for a fifth of a second.
+const SOFTWARE = { every_ms: 200, most_px: 200_000 };
+const FONT = 'system-ui, "DejaVu Sans", sans-serif';
+
+/** @typedef {import("./stream.js").Stream} Stream */
+/** @typedef {import("./guides.js").Dimensions} Dimensions */
+
+export class GroundView {
+  shown = false;
+  display = { width: 0, height: 0, ratio: 1 }; // the box on the screen, CSS px
+  /** @type {{picture: string, frames: string, lines: string, states: string[]}} */
+  drawn = { picture: "", frames: "", lines: "", states: [] }; // what the canvases show
+  count = 0; // of the pictures drawn
+  /** @type {string[]} */
+  finished = []; // what was said of the cameras when the picture on show was drawn
+  at = -Infinity; // when the last one was
+  why = ""; // there is none, for people to read
+  /** @type {Warp|null} */
+  warp = null;
+  /** @type {Stream[]} */
+  streams = [];
+  /** @type {import("./warp.js").Layer[]} */
+  layers = [];
+  /** @type {import("./ground.js").Sight[]} */
+  sights = [];
+  /** @type {import("./ground.js").Lattice|null} */
+  lattice = null;
+  shared = ""; // regions for which the shares hold
+  /** @type {OffscreenCanvas|null} */
+  canvas = null;
+  /** @type {OffscreenCanvasRenderingContext2D|null} */
+  context = null;
+  /** @type {Dimensions|null} */
+  dimensions = null;
+
+  /** @param {import("./steering.js").Steering} steering */
+  constructor(steering) {
+    this.steering = steering;
+  }
+
+  /** @param {OffscreenCanvas} picture  @param {OffscreenCanvas} lines */
+  attach(picture, lines) {
+    this.canvas = picture;
+    this.context = lines.getContext("2d", { desynchronized: true });
+  }
+
+  /**
+   * The vehicle has these cameras that look down.
+   * @param {Stream[]} streams  @param {Dimensions|null} dimensions
+   */
+  know(streams, dimensions) {
+    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared: "", drawn: { picture: "", frames: "", lines: "", states: [] } });
+    this.use();
+  }
+
+  /** Show it in a box on the screen, or not. @param {{shown: boolean, width: number, height: number, ratio: number}} display */
+  show({ shown, ...display }) {
+    Object.assign(this, { shown, display, drawn: { picture: "", frames: "", lines: "", states: [] } });
+    this.use();
+    if (this.isOn()) this.draw();
+    else this.clear();
+  }
+
+  /** What was on show would be old when it is shown again. */
+  clear() {
+    this.warp?.draw(this.warp.canvas, { x: 0, y: 0, width: 1, height: 1 }, []);
+    this.context?.reset();
+  }
+
+  /** Tell the streams whether their whole pictures are needed. */
+  use() {
+    for (const stream of this.streams) stream.above = this.isOn();
+  }
+
+  isOn() {
+    return this.shown && this.streams.length > 0 && this.display.width > 0 && this.display.height > 0;
+  }
+
+  /** Draw what has changed: a new picture, or the state of one. */
+  draw() {
+    if (!this.isOn() || !this.canvas || !this.context) return;
+    const seen = this.streams.map((stream) => stream.fromAbove());
+    if (!this.why) this.tryPictures(seen);
+    this.drawLines(seen);
+  }
+
+  tryPictures(seen) {
+    try {
+      this.prepare();
+      this.drawPictures(seen);
+      if (this.warp?.lost) throw new Error("the browser has taken its graphics away; load the page again");
+    } catch (error) {
+      this.why = error instanceof Error ? error.message : String(error);
+    }
+  }
+
+  /** What takes a while is done when it is first needed. */
+  prepare() {
+    this.warp ??= new Warp(/** @type {OffscreenCanvas} */ (this.canvas));
+    if (this.layers.length || !this.dimensions) return;
+    const { warp, dimensions, streams } = this;
+    const lattice = (this.lattice = latticeOf(groundOf(dimensions).extent));
+    const fromAbove = lattice.places.map(({ x, y }) => ({ x: -y, y: x }));
+    this.sights = streams.map(({ camera }) => sightOf(camera, dimensions, lattice.places));
+    this.layers = this.sights.map(({ points }) => warp.layer(fromAbove, points));
+  }
+
+  drawPictures(seen) {
+    const { warp, layers, dimensions, drawn } = this;
+    if (!warp || !dimensions) return;
+    const size = this.size();
+    const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
+    const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
+    const isDue = hasGpu || now() - this.at >= SOFTWARE.every_ms;
+    const isBusy = warp.isBusy();
+    if (!isBusy) this.finished = drawn.states;
+    if (isBusy || (picture === drawn.picture && (frames === drawn.frames || !isDue))) return;
+    Object.assign(drawn, { picture, frames, states: seen.map(({ words }) => words) });
+    this.at = now();
+    this.share(seen.map(({ region }) => region));
+    const { px_per_m } = laidOut(size, dimensions);
+    const { extent } = groundOf(dimensions);
+    const middle = { x: -(extent.left + extent.right) / 2, y: (extent.front + extent.rear) / 2 };
+    warp.draw(size, { ...middle, width: size.width / px_per_m, height: size.height / px_per_m }, seen.map((each, i) => ({ ...each, layer: layers[i] })));
+    this.count++;
+  }
+
+  /** Of the picture, px. */
+  size() {
+    const { width, height, ratio } = this.display;
+    const scale = hasGpu ? ratio : Math.min(ratio, Math.sqrt(SOFTWARE.most_px / (width * height)));
+    return { width: Math.round(width * scale), height: Math.round(height * scale) };
+  }
+
+  /** Decide which camera shows what. @param {import("./framing.js").Rectangle[]} regions that the pictures show */
+  share(regions) {
+    const { lattice, sights, layers } = this;
+    if (!lattice || JSON.stringify(regions) === this.shared) return;
+    this.shared = JSON.stringify(regions);
+    for (const [i, shares] of sharesOf(sights, regions).entries()) layers[i].share(shares, trianglesOf(lattice.columns, lattice.rows, sights[i].points, shares));
+  }
+
+  // --- what does not change with every picture ------------------------------------------------------------------------
+
+  drawLines(seen) {
+    const { context, display, dimensions, why } = this;
+    if (!context || !dimensions) return;
+    const states = seen.map(({ words, status }) => [words, status]);
+    const rad = this.steering.when(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
+    const described = JSON.stringify([display, states, rad && Math.round(rad / RAD), why]);
+    if (described === this.drawn.lines) return;
+    this.drawn.lines = described;
+    const { canvas } = context;
+    Object.assign(canvas, { width: Math.round(display.width * display.ratio), height: Math.round(display.height * display.ratio) }); // clears it, too
+    context.scale(display.ratio, display.ratio);
+    const size = Math.round(Math.min(22, Math.max(10, 0.045 * Math.min(display.width, display.height))));
+    const laid = laidOut(display, dimensions);
+    if (!why) drawDistances(context, dimensions, laid, size);
+    if (!why && rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
+    drawVehicle(context, dimensions, laid);
+    if (why) return sign(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
+    drawScale(context, display, laid, size);
+    if (this.streams.some(({ camera }) => !camera.calibrated)) namePicture(context, "ESTIMATED", { left: 0, top: 0, bottom: display.height });
+    this.drawStates(context, laid, size, seen);
+  }
+
+  drawStates(context, laid, size, seen) {
+    const { width, height } = this.display;
+    const { dimensions } = this;
+    if (!dimensions) return;
+    for (const [i, { words, status }] of seen.entries()) {
+      if (!words) continue;
+      const { pose, name } = this.streams[i].camera;
+      const yaw = (pose.yaw_deg * Math.PI) / 180;
+      const at = toBox({ x: pose.x_m + AWAY_M * Math.cos(yaw), y: pose.y_m + AWAY_M * Math.sin(yaw) }, laid);
+      const [back, fore] = STANDING.includes(status) ? [RED, "#fff"] : MOVING.includes(status) ? [AMBER, "#000"] : ["#2b333c", "#e6ebf0"];
+      sign(context, at.x, at.y, size, `${words} ${name.replaceAll("_", " ")}`, back, fore, width);
+    }
+    const thick = 0.4 * size;
+    if (seen.some(({ status }) => STANDING.includes(status))) frame(context, width, height, thick, RED, []);
+    else if (seen.some(({ words, status }) => words && MOVING.includes(status))) frame(context, width, height, thick, AMBER, [2 * size, size]);
+  }
+
+  /** For tests: how it lies in its box, CSS px; what is said of the cameras, and what was when the picture was drawn. */
+  measure() {
+    const laid = this.dimensions && laidOut(this.display, this.dimensions);
+    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().words), drawn: this.finished };
+  }
+}
+
+/** Where a place on the ground is in the box: x ahead is up, y to the left. */
+const toBox = ({ x, y }, laid) => ({ x: laid.x - y * laid.px_per_m, y: laid.y - x * laid.px_per_m });
+
+/** Lines at equal distances from the vehicle. */
+function drawDistances(context, dimensions, laid, size) {
+  context.font = `600 ${size}px ${FONT}`;
+  context.textBaseline = "middle";
+  context.textAlign = "center";
+  for (const metres of DISTANCES_M) {
+    const [box, { px_per_m }] = [boxOf(outline(dimensions, metres), laid), laid];
+    for (const [thick, colour] of /** @type {[number, string][]} */ ([[2.5, "rgba(0,0,0,0.45)"], [1, "rgba(255,255,255,0.8)"]])) {
+      context.lineWidth = thick;
+      context.strokeStyle = colour;
+      context.beginPath();
+      context.roundRect(box.x, box.y, box.width, box.height, metres * px_per_m);
+      context.stroke();
+    }
+    if (px_per_m < size) continue; // no room between two lines
+    context.lineWidth = size / 4;
+    context.strokeStyle = "rgba(0,0,0,0.7)";
+    context.strokeText(`${metres} m`, box.x + box.width / 2, box.y);
+    context.fillStyle = "#fff";
+    context.fillText(`${metres} m`, box.x + box.width / 2, box.y);
+  }
+}
+
+/** Where the wheels go. */
+function drawPaths(context, paths, laid) {
+  context.lineWidth = 2;
+  context.strokeStyle = COLOURS.path;
+  for (const { places } of paths) {
+    context.beginPath();
+    for (const { x, y } of places.map((place) => toBox(place, laid))) context.lineTo(x, y);
+    context.stroke();
+  }
+}
+
+/** The vehicle from above, with a wedge that points ahead. */
+function drawVehicle(context, dimensions, laid) {
+  const { x, y, width, height } = boxOf(outline(dimensions), laid);
+  context.fillStyle = "#39434d";
+  context.strokeStyle = "#fff";
+  context.lineWidth = 1.5;
+  context.beginPath();
+  context.rect(x, y, width, height);
+  context.fill();
+  context.stroke();
+  context.fillStyle = "#c9d3dc";
+  context.beginPath();
+  context.moveTo(x + width / 2, y + 0.08 * height);
+  context.lineTo(x + 0.8 * width, y + 0.25 * height);
+  context.lineTo(x + 0.2 * width, y + 0.25 * height);
+  context.fill();
+}
+
+/** How many px a metre has, and 5 m as a bar. */
+function drawScale(context, { width, height }, { px_per_m }, size) {
+  const [right, bottom, long] = [width - size, height - size, 5 * px_per_m];
+  context.font = `600 ${size}px ${FONT}`;
+  context.textAlign = "right";
+  context.textBaseline = "bottom";
+  const words = `5 m · ${px_per_m.toFixed(1)} px/m`;
+  for (const [thick, colour] of /** @type {[number, string][]} */ ([[size / 4 + 3, "#000"], [size / 4, "#fff"]])) {
+    context.strokeStyle = colour;
+    context.lineWidth = thick;
+    context.beginPath();
+    context.moveTo(right - long, bottom);
+    context.lineTo(right, bottom);
+    context.stroke();
+  }
+  context.strokeStyle = "rgba(0,0,0,0.7)";
+  context.lineWidth = size / 4;
+  context.strokeText(words, right, bottom - size / 3);
+  context.fillStyle = "#fff";
+  context.fillText(words, right, bottom - size / 3);
+}
+
+/** Words on a plate, inside of the box. */
+function sign(context, x, y, size, words, back, fore, width) {
+  context.font = `700 ${size}px ${FONT}`;
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  const wide = Math.min(width, context.measureText(words).width + size);
+  const middle = Math.min(width - wide / 2, Math.max(wide / 2, x));
+  context.fillStyle = back;
+  context.fillRect(middle - wide / 2, y - 0.8 * size, wide, 1.6 * size);
+  context.fillStyle = fore;
+  context.fillText(words, middle, y, wide);
+}
+
+function boxOf({ rear, front, right, left }, laid) {
+  const [a, b] = [toBox({ x: front, y: left }, laid), toBox({ x: rear, y: right }, laid)];
+  return { x: a.x, y: a.y, width: b.x - a.x, height: b.y - a.y };
+}

@@ -1,0 +1,44 @@
+/** Regions of interest, chosen by hand: zoomed, moved, in the full image's aspect ratio. Pure; px of the full image. */
+
+export const SMALLEST = 16;
+
+/** @typedef {import("./framing.js").Rectangle} Rectangle */
+/** @typedef {import("./framing.js").Size} Size */
+
+/**
+ * The nearest region in whole px that lies inside the image and is not too small.
+ * @param {Rectangle} region  @param {Size} full
+ * @returns {Rectangle}
+ */
+export function inside({ x, y, width, height }, full) {
+  const [wide, high] = [limit(Math.round(width), SMALLEST, full.width), limit(Math.round(height), SMALLEST, full.height)];
+  return { x: limit(Math.round(x), 0, full.width - wide), y: limit(Math.round(y), 0, full.height - high), width: wide, height: high };
+}
+
+const limit = (value, low, high) => Math.max(low, Math.min(value, high));
+
+/**
+ * A region larger by a factor, in which a point stays where it was. It keeps its aspect ratio, until a side is as long as
+ * the image's: then the other one grows alone, up to the full image.
+ * @param {Rectangle} region  @param {{x: number, y: number}} point  @param {number} factor  @param {Size} full
+ */
+export function zoomed({ x, y, width, height }, point, factor, full) {
+  const times = Math.max(factor, SMALLEST / width, SMALLEST / height);
+  const [wide, high] = [Math.min(full.width, width * times), Math.min(full.height, height * times)];
+  const share = (at, from, length) => limit((at - from) / length, 0, 1);
+  return inside({ x: x + share(point.x, x, width) * (width - wide), y: y + share(point.y, y, height) * (height - high), width: wide, height: high }, full);
+}
+
+/** @param {Rectangle} region  @param {{x: number, y: number}} way  @param {Size} full */
+export const moved = ({ x, y, ...size }, way, full) => inside({ x: x + way.x, y: y + way.y, ...size }, full);
+
+/**
+ * The largest part of a region with an aspect ratio, at the corner where a drag began.
+ * @param {Rectangle} region  @param {number} aspect width of a height  @param {{right: boolean, down: boolean}} towards where the drag went
+ * @returns {Rectangle}
+ */
+export function withAspect({ x, y, width, height }, aspect, { right, down }) {
+  const wide = Math.max(SMALLEST, SMALLEST * aspect, Math.min(width, height * aspect));
+  const high = wide / aspect;
+  return { x: right ? x : x + width - wide, y: down ? y : y + height - high, width: wide, height: high };
+}

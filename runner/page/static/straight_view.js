@@ -1,0 +1,32 @@
+/** A camera's picture, straightened by the worker. */
+
+import { straightMesh } from "./straight.js";
+import { FILLS, Warp } from "./warp.js";
+
+export class StraightView {
+  /**
+   * @param {any} camera as in hello
+   * @throws {Error} for people to read
+   */
+  constructor(camera) {
+    const { places, points, shares, triangles } = straightMesh(camera);
+    const { width, height } = camera;
+    this.warp = new Warp(new OffscreenCanvas(1, 1));
+    this.layer = this.warp.layer(places.map(({ x, y }) => ({ x, y: -y })), points);
+    this.layer.share(shares, triangles);
+    this.frame = { x: width / 2, y: -height / 2, width, height };
+  }
+
+  /**
+   * Fill a canvas with the straight image; black is what the picture does not show.
+   * @param {import("./picture.js").Picture} picture
+   * @param {import("./framing.js").Rectangle} region of the full image that it shows
+   * @throws {Error} for people to read
+   */
+  paint(context, picture, region) {
+    const { width, height } = context.canvas;
+    if (this.warp.lost) throw new Error("the browser has taken its graphics away");
+    this.warp.draw({ width, height }, this.frame, [{ layer: this.layer, fill: FILLS.picture, picture, region }]);
+    context.drawImage(this.warp.canvas, 0, 0);
+  }
+}

@@ -1,0 +1,200 @@
+"""The bird's-eye view in a real browser, measured on the screen: marks on the ground, the vehicle, lost pictures."""
+
+from __future__ import annotations
+
+import io
+import math
+import shutil
+
+import numpy as np
+import pytest
+from painted import ALL_AROUND, CAR, FINER, TOP_CAMERAS, TOP_SIZE, Mounted, corner, native_pictures, paint
+from stills import Station, on_screen, serving
+
+from browser import all_live, opened, shot, until
+from rig import CHROMIUM_FLAGS
+from runner.core.model import Pose
+
+pytestmark = [
+    pytest.mark.gst,
+    pytest.mark.soak,  # builds a street
+    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+]
+image = pytest.importorskip("PIL.Image")
+pytest.importorskip("cv2")
+pytest.importorskip("numba")
+
+WITHIN_M = 0.05
+AROUND_M = 0.3  # how far from its place a mark is looked for
+MOST_M = 0.65  # of a mark that is compared: the view ends 1 m beyond the last ones
+FRONT = Mounted(Pose(2.0, 0.0, 1.5, 0, 5), (), native=TOP_SIZE)
+BODY = (0x39, 0x43, 0x4D)
+AMBER = (0xFF, 0xB0, 0x00)
+RED = (0xE0, 0x1B, 0x24)
+
+
+@pytest.fixture(scope="module")
+def station(tmp_path_factory):
+    place = tmp_path_factory.mktemp("above")
+    paint(place / "world", ALL_AROUND)
+    cameras = {"front": FRONT, **TOP_CAMERAS}
+    pictures = dict(native_pictures(place / "world", cameras, FINER))
+    return Station(place, cameras, pictures, TOP_SIZE, estimated=["top_rear"])
+
+
+@pytest.fixture
+def page(chromium, station):
+    """The Drive view, large, without the bird's-eye view: one of its cameras is not calibrated."""
+    with serving(station) as served, opened(chromium, served.url, 1280, 800) as page:
+        all_live(page)
+        page.locator("body").press("v")
+        page.add_style_tag(content="#attention, #toasts { visibility: hidden; }")  # of a busy machine
+        yield page
+        station.silent.clear()
+
+
+def above(page):
+    return page.evaluate("tod.birdseye()")
+
+
+def shown_large(page):
+    """The bird's-eye view in place of the front camera, of pictures that all move; returns how it lies in its box."""
+    page.locator("body").press("e")
+    small = until(lambda: (view := above(page))["on"] and view)
+    page.locator("body").press("e")
+    return until(lambda: moves(view := above(page)) and view["px_per_m"] > 1.5 * small["px_per_m"] and view)
+
+
+def moves(view, still=()):
+    """Whether it shows moving pictures, of all cameras but those that stand still."""
+    assert view["why"] == ""
+    wanted = ["LOST" if name in still else "" for name in TOP_CAMERAS]
+    return view["on"] and all([words[:4] for words in view[key]] == wanted for key in ("drawn", "states"))
+
+
+def lying(view):
+    return {key: view[key] for key in ("px_per_m", "x", "y")}
+
+
+def seen(page, mode="RGB", still=()):
+    """What the screen shows while all pictures move but those, and how it lies there."""
+
+    def steady():
+        view = above(page)
+        changes = [change for change in page.evaluate("tod.measure()")["status_log"] if change[1] in TOP_CAMERAS]
+        return moves(view, still) and (lying(view), changes)
+
+    pixels, (view, _) = on_screen(image, page.locator("#birdseye"), steady, mode)
+    return pixels, view
+
+
+def test_marks_on_the_ground_are_where_they_are_within_5_cm(page):
+    shown_large(page)
+    page.add_style_tag(content="#birdseye-lines, #birdseye .head { visibility: hidden; }")
+    picture, scale = seen(page, "L")
+    shot(page, "birdseye-marks")
+    px, apart = scale["px_per_m"], {}
+    for mark in ALL_AROUND:
+        there = (scale["x"] - px * mark.y, scale["y"] - px * mark.x)
+        half = (px * min(0.8 * mark.aside, MOST_M), px * min(0.8 * mark.along, MOST_M))
+        apart[mark.x, mark.y] = round(math.dist(corner(picture, there, half, AROUND_M * px), there) / px, 3)
+    print(px, apart)
+    assert {place: metres for place, metres in apart.items() if metres > WITHIN_M} == {}
+
+
+def test_it_is_off_until_asked_for_and_labelled_where_a_camera_is_not_calibrated(page):
+    assert page.locator("#birdseye").is_hidden() and not above(page)["on"]
+    assert page.locator("[data-camera=top_rear]").is_visible()
+    page.locator("#to-birdseye").click()
+    until(lambda: moves(above(page)))
+    assert page.locator("#birdseye").is_visible()
+    assert page.locator("[data-camera=top_rear]").is_hidden()
+    assert share(colours(page)[-60:, :200], AMBER) > 0.02, "ESTIMATED"
+    page.reload()
+    until(lambda: moves(above(page)))
+    for _ in range(2):  # large, then off
+        page.locator("body").press("e")
+    assert page.locator("#birdseye").is_hidden()
+    assert page.locator("[data-camera=top_rear]").is_visible()
+    assert page.evaluate("localStorage.getItem('tod-birdseye')") == "off"
+
+
+def colours(page):
+    png = page.locator("#birdseye").screenshot()
+    return np.asarray(image.open(io.BytesIO(png)).convert("RGB"), float)
+
+
+def share(pixels, colour):
+    return (np.abs(pixels - colour).max(axis=-1) < 8).mean()
+
+
+def test_the_vehicle_is_as_large_as_it_is(page):
+    shown_large(page)
+    until(lambda: is_as_large_as_stated(page))  # on a busy machine words may lie over it for a moment
+    shot(page, "birdseye")
+
+
+def is_as_large_as_stated(page):
+    pixels, view = on_screen(image, page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
+    px, half = view["px_per_m"], CAR.width_m / 2
+    row, column = round(view["y"]), round(view["x"] + 0.8 * px * half)  # beside the wedge that points ahead
+    found = [*run(pixels[row], column), *run(pixels[:, column], row)]
+    expected = [view["x"] - px * half, view["x"] + px * half, view["y"] - px * CAR.front_m, view["y"] + px * CAR.rear_m]
+    print(found, expected)
+    return found == pytest.approx(expected, abs=2)
+
+
+def run(line, at):
+    """Where the vehicle's colour begins and ends along a line of pixels, around one of them."""
+    others = np.flatnonzero(np.abs(line - BODY).max(axis=-1) >= 3)
+    after = np.searchsorted(others, at)
+    return others[after - 1] + 1, others[after]
+
+
+def test_a_picture_that_stands_still_is_not_shown(page, station):
+    shown_large(page)
+    left, right = sides(*seen(page))
+    assert min(bright(left), bright(right)) > 0.06
+    assert max(red(left), red(right)) < 0.001
+    station.silent.add("top_left")
+    left, right = sides(*seen(page, still=["top_left"]))
+    shot(page, "birdseye-lost")
+    assert (red(left) > 0.2, red(right)) == (True, 0)
+    assert bright(left) < 0.02, "words and lines"
+    station.silent.clear()
+    assert red(sides(*seen(page))[0]) == 0
+
+
+def test_without_webgl_it_says_so_and_pictures_come_as_they_are(chromium, station):
+    flags = [*CHROMIUM_FLAGS, "--disable-software-rasterizer"]
+    other = chromium.browser_type.launch(executable_path=shutil.which("chromium"), args=flags)
+    try:
+        with serving(station) as served, opened(other, served.url, 1280, 720) as page:
+            all_live(page)
+            for key in "ve":
+                page.locator("body").press(key)
+            until(lambda: above(page)["why"] == "this browser has no WebGL 2")
+            assert share(colours(page), RED) > 0.01, "words on a red plate"
+            for key in "2r":
+                page.locator("body").press(key)
+            until(lambda: "cannot be straightened: this browser has no WebGL 2" in page.inner_text("#toasts"))
+            until(lambda: page.evaluate("tod.measure()")["cameras"]["top_front"]["status"] == "live")
+    finally:
+        other.close()
+
+
+def sides(pixels, view):
+    """The ground at the left and right of the vehicle, behind what is written there."""
+    px = view["px_per_m"]
+    rows = slice(*(round(view["y"] - px * metres) for metres in (1.5, -0.5)))
+    columns = (sorted(round(view["x"] - side * px * metres) for metres in (2, 8)) for side in (1, -1))
+    return [pixels[rows, slice(*each)] for each in columns]
+
+
+def bright(pixels):
+    """Share of what is as bright as a white field."""
+    return (pixels.min(axis=-1) > 150).mean()
+
+
+def red(pixels):
+    return ((pixels[..., 0] > 120) & (pixels[..., 1] < 60)).mean()
