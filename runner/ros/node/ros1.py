@@ -25,13 +25,14 @@ from xml.parsers.expat import ExpatError
 from xmlrpc.client import Error, ServerProxy, Transport
 
 from .inputs import NEWEST, SERVICES, TYPES, InputTopic
-from .pictures import ABSENT_S, LATE_NS, LOOK_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
+from .pictures import LATE_NS, LOOK_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
 from .port import NodeError, Port
 
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 DEPTH = 10  # pictures of a topic that wait to be passed on, of which the oldest go first
 BUFFER_BYTES = 1 << 24  # read at once: all that has come, so that the newest is seen
 ANSWER_S = 5.0  # for a master or node on a busy machine
+RECONNECT_S = 2.0  # between two attempts to reach a publisher, which rospy makes once
 CALL_S = 30.0  # within which the other side of the port has answered any call
 ABSENT = (OSError, Error, HTTPException, ExpatError)  # from whoever does not answer, or not as ROS does
 ANY_LOOPBACK = "127.255.255.254"  # where only a server on all addresses answers
@@ -207,8 +208,8 @@ class Ros1PictureTopic(PictureTopic):
         return self._subscriber is not None and self._subscriber.get_num_connections() > 0
 
     def _subscribe(self, kind: str) -> None:
-        """Subscribe, again for another type, and where a connection has been lost, which rospy does not renew."""
-        is_lost = not self._is_connected() and time.monotonic() - self._began > ABSENT_S
+        """Subscribe, again for another type, and where there is no connection."""
+        is_lost = not self._is_connected() and time.monotonic() - self._began > RECONNECT_S
         if self._kind == kind and not is_lost:
             return
         import rospy
