@@ -65,13 +65,14 @@ class Ros:
         return []
 
     def start(self, script, *words, large=True):
-        """A script; `large`: it has shared memory for many pictures."""
+        """A script, which may use `ros_either`; `large`: it has shared memory for many pictures."""
+        profile = {"FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)} if large else {}
         return subprocess.Popen(
             [self.python, str(HERE / script), *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, **({"FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)} if large else {})},
+            env={**os.environ, "PYTHONPATH": str(HERE), **profile},
         )
 
     @contextmanager

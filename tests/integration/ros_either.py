@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable
 from typing import Any
 
@@ -68,9 +69,10 @@ class Ros2Node:
     def stop(self, timer: Any) -> None:
         self._node.destroy_timer(timer)
 
-    def run(self, ended: threading.Event) -> None:
+    def run(self, ended: threading.Event, at_end: Callable[[], None] = lambda: None) -> None:
         while not ended.is_set():
             self._executor.spin_once(timeout_sec=0.5)
+        at_end()
         rclpy.try_shutdown()
 
 
@@ -111,19 +113,24 @@ class Ros1Node:
     def stop(self, timer: Any) -> None:
         self._timers = [one for one in self._timers if one[2] != timer]
 
-    def run(self, ended: threading.Event) -> None:
+    def run(self, ended: threading.Event, at_end: Callable[[], None] = lambda: None) -> None:
         while not ended.is_set():
             due, period, do = min(self._timers, key=lambda timer: timer[0], default=(time.monotonic() + 0.5, 0, None))
             if ended.wait(max(0.0, due - time.monotonic())) or do is None:
                 continue
             self._timers = [(due + period, period, do) if one == (due, period, do) else one for one in self._timers]
             do()
+        at_end()
         rospy.signal_shutdown("ended")
-        sys.stdout.flush()
         os._exit(0)  # threads of rospy may still wait for others
 
 
 Node = Ros2Node if "rclpy" in sys.modules else Ros1Node
+
+
+def as_data(data: bytes) -> Any:
+    """The data of an Image, as the library takes it without a look at each byte."""
+    return data if Node is Ros1Node else array("B", data)
 
 
 def set_stamp(message: Any, ns: int) -> None:
