@@ -5,8 +5,8 @@
   python bench/ros.py CLIP.mp4 --version 1
 
 Starts a node that publishes the clip as topics of 480x270 (all at once, in ROS 2 reliable), the demo with source=ros
-and ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C with
-a fifth of the bitrate, and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
+and ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C
+with a fifth of the bitrate, and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
 """
 
 from __future__ import annotations

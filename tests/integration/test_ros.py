@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from xmlrpc.client import ServerProxy
 
 import numpy as np
 import pytest
@@ -414,6 +415,19 @@ def test_a_name_that_is_taken_is_refused(ros1):
         assert (status, lines[-1][: len(why)]) == (1, why)
         assert lines[-1].endswith(": give another ros.node")
         assert told(reported, "the ROS node") == []
+
+
+def test_a_node_that_is_ended_over_ros_is_started_again(ros1):
+    with (
+        publishing(ros1, front={}, rear={}),
+        subscribing(ros1) as (_, plans, reported),
+        watched(plans, reported) as both,
+    ):
+        ServerProxy(ros1.master.call("lookupNode", "/tod_runner")).shutdown("/test", "as rosnode kill does")
+        why = "another node of the same name has come, or it was ended over ROS"
+        until(lambda: f"the ROS node ended: {why}; starting it again" in reported)
+        until(lambda: told(reported, "the ROS node works again"))
+        goes_on(both[0])
 
 
 def test_a_node_of_ros_1_leaves_no_files(ros1, monkeypatch, tmp_path):

@@ -69,11 +69,10 @@ class RosMaster:
 
     def look(self) -> Registrations | None:
         """What it knows; None: it does not answer, which is reported once."""
-        try:
+        known = None
+        with suppress(*ABSENT):
             publishers, subscribers, services = (dict(pairs) for pairs in self._call("getSystemState"))
             known = Registrations(publishers, subscribers, services, dict(self._call("getTopicTypes")))
-        except ABSENT:
-            known = None
         if (known is None) != self._is_absent:
             self._is_absent = known is None
             self._port.report(f"the ROS master at {self._uri} {'does not answer' if self._is_absent else 'answers'}")
@@ -306,7 +305,8 @@ class Ros1Services:
     def _call(self, name: str, request: Any) -> tuple[bool, str]:
         """In a thread of the call."""
         call = uuid.uuid4().hex
-        self._waiting[call] = answer = Future()
+        answer: Future[tuple[bool, str]] = Future()
+        self._waiting[call] = answer
         self._port.say("call", topic=name, call=call, value=getattr(request, "data", None))
         try:
             return answer.result(CALL_S)
