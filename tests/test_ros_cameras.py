@@ -180,7 +180,7 @@ def test_version_1_refuses_keys_of_ros_2_all_at_once():
     assert configuration([*WORDS, *TOPICS, *words]).vehicle().ros.interpreter == ".venv-ros2/bin/python"
     assert configuration([*WORDS, *TOPICS, "ros.version=1"]).vehicle().ros.interpreter == "/usr/bin/python3"
     with pytest.raises(ConfigError) as failed:
-        configuration([*WORDS, *TOPICS, *words, "ros.version=1"])
+        configuration([*WORDS, *TOPICS, *words, "ros.version=1"]).vehicle()
     assert str(failed.value).splitlines() == [
         "command line: ros.use_sim_time: is of ROS 2, and ros.version is 1: "
         "a node follows the parameter /use_sim_time of its master",

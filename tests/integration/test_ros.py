@@ -344,9 +344,10 @@ def test_a_master_that_dies_and_returns(ros1):
             assert "/clock" not in known
             assert told(reported, "no publisher") == []
         until(lambda: len(told(reported, "/image: no publisher for 5 s")) == 2)
-        with publishing(ros1, front={}, rear={}), watching(plans[0]) as front:
+        with publishing(ros1, front={}, rear={}):
             until(lambda: len(told(reported, "/image: pictures come again")) == 2)
-            goes_on(front)
+            with watching(plans[0]) as front:
+                goes_on(front)
         assert children_named(os.getpid(), SCRIPT) == [node]
     assert told(reported, "the ROS node") == []
 
@@ -390,9 +391,10 @@ def test_a_publisher_that_dies_without_a_word(ros1):
         publisher.process.kill()
         publisher.process.wait(20)
         until(lambda: "front: /front/image: its publisher cannot be reached for 5 s" in reported)
-        with publishing(ros1, front={}, rear={}), watching(plans[0]) as front:
+        with publishing(ros1, front={}, rear={}):
             until(lambda: told(reported, "front: /front/image: pictures come again, after "))
-            goes_on(front)
+            with watching(plans[0]) as front:
+                goes_on(front)
 
 
 def test_a_master_that_any_machine_can_reach_is_refused(ros1):
