@@ -126,7 +126,7 @@ class NodeProcess:
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     def start(self) -> None:
-        """Start the node, and wait until it works, or waits for the master of ROS 1 itself.
+        """Start the node, and wait until it works, or has reported that it waits for the master of ROS 1.
 
         raises  RunError with the remedy
         """
