@@ -6,6 +6,7 @@
 # make deadspot  two drives over a recorded uplink: the picture of the README
 # make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
+# make ros1   ROS 1, which is end-of-life, as Debian's packages
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -16,7 +17,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; each would compile the project again where the environment forbids keeping bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak ros2 clean
+.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -71,7 +72,10 @@ soak: $(TEST_READY) $(NODE_READY)
 
 setup: $(READY)
 
-# The vehicle's tests with ROS run where this has been made.
+# Tests with a version of ROS run where that has been made.
+ros1:
+	scripts/setup-ros1
+
 ros2: $(ROS2)/.ready
 
 $(ROS2)/.ready: scripts/setup-ros2 scripts/packages-ros2.txt

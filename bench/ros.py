@@ -1,19 +1,18 @@
-"""A clip as image topics of ROS 2, through vehicle and operator, to a subscriber: what arrives, how large, how late.
+"""A clip as image topics of ROS, through vehicle and operator, to a subscriber: what arrives, how large, how late.
 
   python bench/ros.py CLIP.mp4
   python bench/ros.py CLIP.mp4 --cameras 2 --fps 2 --seconds 20
+  python bench/ros.py CLIP.mp4 --version 1
 
-Starts a node that publishes the clip as topics of 480x270 (reliable, all at once), the demo with source=ros and
-ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C with a
-fifth of the bitrate, and smaller pictures. Needs `make ros2`.
+Starts a node that publishes the clip as topics of 480x270 (all at once, in ROS 2 reliable), the demo with source=ros
+and ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C
+with a fifth of the bitrate, and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import random
 import subprocess
 import sys
 import tempfile
@@ -26,12 +25,12 @@ import cv2
 import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+from ros_domain import MISSING, Ros, running
+
 from rig import CHECKOUT, free_port
 from runner.configuration.config import configuration
 from runner.ros.inputs import ros_name
-from runner.ros.process import PROFILE
 
-PYTHON = CHECKOUT / ".venv-ros2/bin/python"
 WIDTH, HEIGHT = 480, 270
 PICTURES = 100  # of the clip, which repeat
 KBPS = 500  # for each camera in mode A
@@ -58,24 +57,27 @@ def main() -> int:
     parser.add_argument("clip", type=Path)
     for name, default in (("cameras", 8), ("fps", 10), ("seconds", 30)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--version", type=int, choices=(2, 1), default=2, help="of ROS")
     asked = parser.parse_args()
-    if not PYTHON.is_file():
-        print(f"{PYTHON}: no such file; `make ros2` makes it", file=sys.stderr)
+    if MISSING[asked.version]:
+        print(MISSING[asked.version], file=sys.stderr)
         return 1
     cameras = list(configuration([]).vehicle().cameras)[: asked.cameras]
-    os.environ |= {"ROS_DOMAIN_ID": str(random.randrange(1, 100)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with tempfile.NamedTemporaryFile(suffix=".bgr") as file:
+    with tempfile.TemporaryDirectory() as directory, running(asked.version, Path(directory)) as ros:
+        file = Path(directory, "clip.bgr")
         try:
-            file.write(pictures_of(asked.clip))
+            file.write_bytes(pictures_of(asked.clip))
         except ValueError as error:
             print(error, file=sys.stderr)
             return 1
-        file.flush()
         topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
         decoded = {name: f"{NODE}/camera/{ros_name(name)}/image" for name in cameras}
-        form = map(str, (file.name, WIDTH, HEIGHT, asked.fps))
-        with node("publish", *form, *topics.values()) as publisher, node("subscribe", *decoded.values()) as subscriber:
-            status = subprocess.run(demo(topics, asked.fps, asked.seconds), check=False, cwd=CHECKOUT).returncode
+        form = map(str, (file, WIDTH, HEIGHT, asked.fps))
+        with (
+            node(ros, "publish", *form, *topics.values()) as publisher,
+            node(ros, "subscribe", *decoded.values()) as subscriber,
+        ):
+            status = subprocess.run(demo(ros, topics, asked.fps, asked.seconds), check=False, cwd=CHECKOUT).returncode
             delivered, published = ended(subscriber), ended(publisher)
     if status == 0:
         show([row(name, published[topics[name]], delivered[decoded[name]]) for name in cameras])
@@ -95,7 +97,7 @@ def pictures_of(clip: Path) -> bytes:
     return b"".join(rows)
 
 
-def demo(topics: Mapping[str, str], fps: int, seconds: int) -> list[str]:
+def demo(ros: Ros, topics: Mapping[str, str], fps: int, seconds: int) -> list[str]:
     left_out = [f"~cameras.{name}" for name in configuration([]).vehicle().cameras if name not in topics]
     mounted = [f"cameras.{name}.topic={topic}" for name, topic in topics.items()]
     size = [f"cameras.{name}.{key}" for name in topics for key in (f"width_px={WIDTH}", f"height_px={HEIGHT}")]
@@ -107,22 +109,19 @@ def demo(topics: Mapping[str, str], fps: int, seconds: int) -> list[str]:
         "source=ros",
         "modes=paper",
         f"fps_max={fps * 1.2:g}",
-        f"ros.python={PYTHON}",
+        *ros.words,
         "ros.pictures=true",
         "page.serve=false",
     ]
     own += ["pqos=constant", f"pqos.kbps={total}", f"+experiment.requests=[{change}, {less}]"]
-    own += ["+experiment.about='Image topics of ROS 2'", f"+experiment.duration_s={seconds}"]
+    own += ["+experiment.about='Image topics of ROS'", f"+experiment.duration_s={seconds}"]
     own += [f"media.port={free_port()}", f"control.port={free_port()}", f"duration_s={seconds}"]
     return [sys.executable, "-m", "runner", "demo", *left_out, *mounted, *size, *own]
 
 
 @contextmanager
-def node(*words: str) -> Iterator[subprocess.Popen[str]]:
-    command = [str(PYTHON), "-P", str(Path(__file__).with_name("ros_node.py")), *words]
-    environment = {**os.environ, "FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)}
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
+def node(ros: Ros, *words: str) -> Iterator[subprocess.Popen[str]]:
+    with ros.start(Path(__file__).with_name("ros_node.py"), *words) as process:
         try:
             yield process
         finally:

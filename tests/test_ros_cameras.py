@@ -1,8 +1,9 @@
-"""What is made of the pictures of a topic of ROS 2, without ROS: what is passed on, and what is reported."""
+"""What is made of the pictures of a topic of ROS, without ROS: what is passed on, and what is reported."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 
 import pytest
@@ -11,8 +12,8 @@ from runner.bag.pictures import SECOND_NS
 from runner.configuration.config import configuration
 from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
-from runner.ros import node
 from runner.ros.cameras import CameraStream
+from runner.ros.node import pictures, ros1
 from runner.ros.process import check_discovery
 
 WORDS = ["vehicle=delivery_robot", "source=ros", "fps_max=10"]
@@ -149,26 +150,76 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
     check_discovery(open_to_all, insecure=False)
 
 
-def test_doctor_names_what_makes_the_environment(tod):
-    done = tod("doctor", "ros", "ros.python=no/python")
+@pytest.mark.parametrize(
+    "uri, rule",
+    [
+        ("http://10.0.0.1:11311", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
+        ("http://robot:11311/", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
+        ("10.0.0.1:11311", "must be http://HOST:PORT"),
+        ("http://localhost", "must be http://HOST:PORT"),
+        ("http://localhost:master", "must be http://HOST:PORT"),
+    ],
+)
+def test_a_master_of_another_machine_needs_insecure(monkeypatch, uri, rule):
+    settings = RosSettings(version=1)
+    monkeypatch.delenv("ROS_MASTER_URI", raising=False)
+    check_discovery(settings, insecure=False)
+    for own in ("", "http://127.0.0.1:1", "http://localhost:11311/"):
+        monkeypatch.setenv("ROS_MASTER_URI", own)
+        check_discovery(settings, insecure=False)
+    monkeypatch.setenv("ROS_MASTER_URI", uri)
+    with pytest.raises(UserError, match=re.escape(f"environment: ROS_MASTER_URI: {uri}: {rule}")):
+        check_discovery(settings, insecure=False)
+    check_discovery(RosSettings(), insecure=False)
+    if rule.startswith("admits"):
+        check_discovery(settings, insecure=True)
+
+
+def test_version_1_refuses_keys_of_ros_2_all_at_once():
+    words = ["ros.qos={/front: {depth: 1}}", "ros.discovery=subnet", "ros.use_sim_time=true"]
+    assert configuration([*WORDS, *TOPICS, *words]).vehicle().ros.interpreter == ".venv-ros2/bin/python"
+    assert configuration([*WORDS, *TOPICS, "ros.version=1"]).vehicle().ros.interpreter == "/usr/bin/python3"
+    with pytest.raises(ConfigError) as failed:
+        configuration([*WORDS, *TOPICS, *words, "ros.version=1"]).vehicle()
+    assert str(failed.value).splitlines() == [
+        "command line: ros.use_sim_time: is of ROS 2, and ros.version is 1: "
+        "a node follows the parameter /use_sim_time of its master",
+        "command line: ros.discovery: is of ROS 2, and ros.version is 1: "
+        "ROS_MASTER_URI names the master, which knows all nodes",
+        "command line: ros.qos: is of ROS 2, and ros.version is 1: subscribers ask for nothing",
+        "3 problems, nothing was started",
+    ]
+
+
+@pytest.mark.parametrize(
+    "version, library, remedy",
+    [(2, "rclpy", "`make ros2` makes .venv-ros2"), (1, "rospy", "`make ros1` installs it")],
+)
+def test_doctor_names_what_makes_the_environment(tod, version, library, remedy):
+    done = tod("doctor", "ros", f"ros.version={version}", "ros.python=no/python")
     assert done.status == 1
-    why = "[Errno 2] No such file or directory: 'no/python'; `make ros2` makes .venv-ros2, see docs/ros.md"
-    assert f"MISSING rclpy for ros.python no/python: {why}" in done.out.splitlines()
+    why = f"[Errno 2] No such file or directory: 'no/python'; {remedy}, see docs/ros.md"
+    assert f"MISSING {library} for ros.python no/python: {why}" in done.out.splitlines()
+
+
+def test_names_are_as_rospy_has_them():
+    remap = {"~/state": "/robot/state", "/front": "image", "front": "~/image"}
+    assert ros1.remappings(remap) == ["~state:=/robot/state", "/front:=image", "front:=~image"]
 
 
 def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", counted=None):
     """What is told after COUNT_S about pictures with these numbers."""
-    counted = counted or node.PictureCount()
+    counted = counted or pictures.PictureCount()
     for number in numbers:
-        counted.add({"publisher_gid": {"data": publisher}, "publication_sequence_number": number})
+        counted.add(publisher, number)
     counted.untransported, counted.late = untransported, late
-    later = node.time.monotonic() + node.COUNT_S
-    monkeypatch.setattr(node.time, "monotonic", lambda: later)
+    later = pictures.time.monotonic() + pictures.COUNT_S
+    monkeypatch.setattr(pictures.time, "monotonic", lambda: later)
     return counted.take_news()
 
 
 def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypatch):
-    counted, told = node.PictureCount(), "pictures were lost"
+    counted, told = pictures.PictureCount(), "pictures were lost"
     assert losses(monkeypatch, range(7, 107), counted=counted) == ""
     assert losses(monkeypatch, range(112, 208), counted=counted) == ""  # 5 of 101, not more than one in twenty
     where = "3 between publisher and node, 3 since the node ran late; docs/ros.md states what helps"
@@ -179,8 +230,8 @@ def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypa
 
 
 def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_knows(monkeypatch):
-    counted = node.PictureCount()
+    counted = pictures.PictureCount()
     for _ in range(9):
-        counted.add({"publisher_gid": None, "publication_sequence_number": None})
+        counted.add(None, None)
     told = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
     assert losses(monkeypatch, [], untransported=1, counted=counted).startswith(told)

@@ -127,6 +127,9 @@ class Builder:
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None  # older drives
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
+        ros = _ros(document.get("ros", {}))  # older drives lack it
+        for error in ros.misplaced():
+            self._report(("ros",), error)
         listening = {"page.port": page.port} if page.serve else {}
         self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
@@ -156,7 +159,7 @@ class Builder:
             keys=keys,
             insecure=document.get("insecure", False),
             metrics=MetricsPorts(**document.get("metrics", {})),
-            ros=_ros(document.get("ros", {})),
+            ros=ros,
             dimensions=dimensions,
             inputs=inputs or Inputs(),
         )

@@ -220,7 +220,7 @@ class Source:
     render      name of the procedural drive that makes the clip, or ""
     render_s    length of that drive, s
     plays_bags  frames are the pictures of a topic of a bag, which are pushed into its first element
-    subscribes  the same for a topic of ROS 2
+    subscribes  the same for a topic of ROS
     stand_in    elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
     """
 
@@ -416,7 +416,7 @@ class Camera:
 
     @property
     def topic(self) -> str | None:
-        """The topic of ROS 2 that its source subscribes to; None: it does not, or none is named."""
+        """The topic of ROS that its source subscribes to; None: it does not, or none is named."""
         topic = self.mount.get("topic", self.source.settings.get("topic"))
         return str(topic) if self.source.subscribes and topic else None
 
@@ -535,29 +535,39 @@ class RosQos:
 
 @dataclass(frozen=True, slots=True)
 class RosPrediction:
-    """Predictions of the bitrate on a topic of ROS 2, by one node alone: its full name."""
+    """Predictions of the bitrate on a topic of ROS, by one node alone: its full name."""
 
     topic: str
     node: str
 
 
+ROS_PYTHON = {1: "/usr/bin/python3", 2: ".venv-ros2/bin/python"}  # by version
+OF_ROS_2 = {  # keys, and what is so in ROS 1
+    "use_sim_time": "a node follows the parameter /use_sim_time of its master",
+    "discovery": "ROS_MASTER_URI names the master, which knows all nodes",
+    "qos": "subscribers ask for nothing",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class RosSettings:
-    """The node of ROS 2, which runs in a process of its own.
+    """The node of ROS, which runs in a process of its own.
 
-    python        interpreter that can import rclpy
+    version       of ROS, 1 or 2
+    python        interpreter that can import rclpy or rospy; None: that of `make ros2` or `make ros1`
     node          its name
     namespace     absolute
     remap         names of topics and nodes by the names that are used here
-    use_sim_time  whether stamps are of the time on /clock
-    discovery     whose nodes it finds: off, localhost, subnet, system_default
-    qos           by topic
+    use_sim_time  whether stamps are of the time on /clock; of ROS 2
+    discovery     whose nodes it finds: off, localhost, subnet, system_default; of ROS 2
+    qos           by topic; of ROS 2
     position      topic with the vehicle's position, for the verb `ros`; None: none
     prediction    predictions, for the verb `ros`; None: none
     pictures      whether the operator's side publishes what it decodes
     """
 
-    python: str = ".venv-ros2/bin/python"
+    version: int = 2
+    python: str | None = None
     node: str = "tod_runner"
     namespace: str = "/"
     remap: Mapping[str, str] = field(default_factory=dict)
@@ -567,6 +577,18 @@ class RosSettings:
     position: str | None = None
     prediction: RosPrediction | None = None
     pictures: bool = False
+
+    @property
+    def interpreter(self) -> str:
+        return self.python or ROS_PYTHON[self.version]
+
+    def misplaced(self) -> Iterator[ModelError]:
+        """Keys that are set although the version of ROS does not have what they stand for."""
+        if self.version == 1:
+            absent = RosSettings()
+            for key, rule in OF_ROS_2.items():
+                if getattr(self, key) != getattr(absent, key):
+                    yield ModelError(key, None, f"is of ROS 2, and ros.version is 1: {rule}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -582,7 +604,7 @@ class Vehicle:
     keys       directory that `tod-runner keys` made for this side; None: nothing is encrypted or authenticated
     insecure   whether that is intended where video or control leave this machine
     metrics    where both sides serve figures for Prometheus
-    ros        the node of ROS 2, for cameras whose source subscribes to topics
+    ros        the node of ROS, for cameras whose source subscribes to topics
     dimensions None: unknown
     inputs     keys and buttons of the operator's page
     """

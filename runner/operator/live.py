@@ -196,7 +196,7 @@ class _Measured(Listener):
 
 
 def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
-    """The node of ROS 2 that publishes decoded pictures; None: none does.
+    """The node of ROS that publishes decoded pictures; None: none does.
 
     raises  UserError
     """

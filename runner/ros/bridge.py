@@ -1,4 +1,4 @@
-"""The control link of a vehicle as topics and services of ROS 2: state out, requests in, answers out."""
+"""The control link of a vehicle as topics and services of ROS: state out, requests in, answers out."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ EVERY_S = 0.1  # between two positions, and between two predictions
 
 
 class Bridge:
-    """One end of a vehicle's control link, and a node of ROS 2, from `start` until `close`.
+    """One end of a vehicle's control link, and a node of ROS, from `start` until `close`.
 
     keyring    whose name and role requests have; None: for a broker that does not ask, under an id of its own
     on_report  called with one line on what is wrong, from any thread
@@ -72,16 +72,26 @@ class Bridge:
             inputs[vehicle.ros.position] = "fix"
         if vehicle.ros.prediction:
             inputs[vehicle.ros.prediction.topic] = "newest_number"
-        services = {name: its.kind for name, its in self._services.items()}
-        take, report = self._on_message, self._on_node_report
-        self._node = NodeProcess(vehicle.ros, take, report, inputs=inputs, services=services)
+        self._urls = {
+            f"{URL}/{ros_name(name)}": rtsp_url(vehicle.media, name)
+            for name, camera in vehicle.cameras.items()
+            if camera.graph.transport == "rtsp"
+        }
+        self._node = NodeProcess(
+            vehicle.ros,
+            self._on_message,
+            self._on_node_report,
+            inputs=inputs,
+            outputs={REPLY: False, TELEMETRY: False, STATE: True, **dict.fromkeys(self._urls, True)},
+            services={name: its.kind for name, its in self._services.items()},
+            insecure=vehicle.insecure,
+        )
 
     def start(self) -> None:
         """raises RunError if the node does not start"""
         self._node.start()
-        for name, camera in self._vehicle.cameras.items():
-            if camera.graph.transport == "rtsp":
-                self._node.publish(f"{URL}/{ros_name(name)}", rtsp_url(self._vehicle.media, name), kept=True)
+        for name, url in self._urls.items():
+            self._node.publish(name, url)
         self._link.connect()
 
     def close(self) -> None:
@@ -99,7 +109,7 @@ class Bridge:
 
     def _on_state(self, message: MqttMessage) -> None:
         read_state(message.payload)
-        self._node.publish(STATE, message.payload.decode(), kept=True)
+        self._node.publish(STATE, message.payload.decode())
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)

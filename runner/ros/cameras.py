@@ -1,4 +1,4 @@
-"""Pictures of topics of ROS 2 for cameras: what they are, whether they may be passed on, what to report about them."""
+"""Pictures of topics of ROS for cameras: what they are, whether they may be passed on, what to report about them."""
 
 from __future__ import annotations
 
@@ -55,6 +55,7 @@ class SharedPicture:
 class RosCameras:
     """The node that subscribes to the topics of cameras, from `start` until `close`.
 
+    insecure   whether a node of another machine may be found that need not prove who it is
     push       called with a camera's name and its next picture, which it closes; from one thread
     on_report  called with a camera's name, "" for all of them, and one line; from the same thread
     """
@@ -65,13 +66,14 @@ class RosCameras:
         cameras: Iterable[Camera],
         push: Callable[[str, SharedPicture], bool],
         on_report: Callable[[str, str], None],
+        insecure: bool = False,
     ) -> None:
         self._push, self._on_report = push, on_report
         self._streams: dict[str, list[CameraStream]] = {}  # by topic
         for camera in cameras:
             if camera.topic:
                 self._streams.setdefault(camera.topic, []).append(CameraStream(camera, on_report))
-        self._node = NodeProcess(settings, self._take, self._report, pictures=self._streams)
+        self._node = NodeProcess(settings, self._take, self._report, pictures=self._streams, insecure=insecure)
 
     def start(self) -> None:
         """raises RunError if the node does not start"""

@@ -1,4 +1,4 @@
-"""Operator inputs as topics and services of ROS 2: which there are, and what each requests of the vehicle. Pure."""
+"""Operator inputs as topics and services of ROS: which there are, and what each requests of the vehicle. Pure."""
 
 from __future__ import annotations
 

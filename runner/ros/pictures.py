@@ -1,4 +1,4 @@
-"""Decoded pictures of the operator's side as topics of ROS 2, with the intrinsics of what was delivered."""
+"""Decoded pictures of the operator's side as topics of ROS, with the intrinsics of what was delivered."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ class DecodedPictures:
         check_discovery(vehicle.ros, vehicle.insecure)
         settings = replace(vehicle.ros, node=f"{vehicle.ros.node}_operator")
         self._cameras = vehicle.cameras
-        self._node = NodeProcess(settings, lambda *_: None, lambda _, what: on_report(what), publishes=True)
+        self._node = NodeProcess(
+            settings, lambda *_: None, lambda _, what: on_report(what), publishes=True, insecure=vehicle.insecure
+        )
 
     def start(self) -> None:
         """raises RunError if the node does not start"""

@@ -1,4 +1,4 @@
-"""The process of the node of ROS 2: started, started again when it has ended, received from."""
+"""The process of the node of ROS: started, started again when it has ended, received from."""
 
 from __future__ import annotations
 
@@ -13,22 +13,29 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from runner.core.model import RosQos, RosSettings
 from runner.errors import RunError, UserError
-from runner.ros import node
+from runner.ros.node.port import MAX_MESSAGE_BYTES, shared_memory
+from runner.security.exposure import is_loopback
 from runner.system import children
 
-START_S = 30.0  # rclpy is loaded, and its node there, within a second; on a machine that boots much later
+START_S = 30.0  # ROS is loaded, and its node there, within a second; on a machine that boots much later
 RETRY_S = (1.0, 10.0)  # between two starts: doubled from the first value up to the second while they fail
 END_S = 2.0
 LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
 
-PROFILE = Path(node.__file__).with_name("fastdds.xml")
+MAKE = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}  # by version of ROS, what brings its Python
+MASTER = "http://localhost:11311"  # of ROS 1, as in rosgraph
+
+SCRIPT = Path(__file__).parent / "node" / "__main__.py"
+PROFILE = Path(__file__).with_name("fastdds.xml")
 OWN_TRANSPORTS = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
 
 Message = Mapping[str, Any]
 NOTHING: Mapping[str, str] = {}
+NO_OUTPUTS: Mapping[str, bool] = {}
 
 
 def check_discovery(settings: RosSettings, insecure: bool) -> None:
@@ -36,10 +43,42 @@ def check_discovery(settings: RosSettings, insecure: bool) -> None:
 
     raises  UserError
     """
+    if settings.version == 1:
+        _check_master(insecure)
+        return
     enforced = os.environ.get("ROS_SECURITY_ENABLE") == "true" and os.environ.get("ROS_SECURITY_STRATEGY") == "Enforce"
     if settings.discovery not in LOCAL and not enforced and not insecure:
         rule = "admits any node of the network: set up SROS 2 (ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce)"
         raise UserError("command line", "ros.discovery", settings.discovery, f"{rule}, or give insecure=true")
+
+
+def _check_master(insecure: bool) -> None:
+    uri = _master_uri()
+    try:
+        parts = urlsplit(uri)
+        is_address = parts.scheme == "http" and bool(parts.hostname and parts.port)
+    except ValueError:  # no port is written so
+        is_address = False
+    if not is_address:
+        raise UserError("environment", "ROS_MASTER_URI", uri, "must be http://HOST:PORT")
+    if not is_loopback(parts.hostname or "") and not insecure:
+        rule = "admits any node of the network, and ROS 1 has no keys: must be of this machine, or give insecure=true"
+        raise UserError("environment", "ROS_MASTER_URI", uri, rule)
+
+
+def _master_uri() -> str:
+    return os.environ.get("ROS_MASTER_URI") or MASTER
+
+
+def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict[str, str]:
+    """What a node's process has in addition to the environment of this one."""
+    if settings.version == 1:
+        own = {"ROS_MASTER_URI": _master_uri(), "ROS_NAMESPACE": settings.namespace}
+        return own if insecure else {**own, "ROS_HOSTNAME": "127.0.0.1"}  # listens there alone
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
+    if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
+        own["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
+    return own
 
 
 class NodeProcess:
@@ -49,9 +88,11 @@ class NodeProcess:
                 memory, which is then the callee's to close
     on_report   called with a topic and one line about it; "" stands for the node itself
     pictures    topics with pictures, to subscribe to
-    inputs      other topics to subscribe to, with the kind of their messages, see `runner.ros.node.Input`
-    services    to offer, with the kind of their calls, see `runner.ros.node.Services`; each is answered by `answer`
+    inputs      other topics to subscribe to, with the kind of their messages, see `runner.ros.node.inputs`
+    outputs     topics of texts, with whether the newest is kept for subscribers that come later
+    services    to offer, with the kind of their calls, see `runner.ros.node.inputs`; each is answered by `answer`
     publishes   whether it publishes pictures, too, for which the middleware needs more shared memory than it takes
+    insecure    whether a node of another machine may be found that need not prove who it is
 
     Both are called from one thread.
     """
@@ -64,17 +105,18 @@ class NodeProcess:
         *,
         pictures: Iterable[str] = (),
         inputs: Mapping[str, str] = NOTHING,
+        outputs: Mapping[str, bool] = NO_OUTPUTS,
         services: Mapping[str, str] = NOTHING,
         publishes: bool = False,
+        insecure: bool = False,
     ) -> None:
         self._settings, self._on_message, self._on_report = settings, on_message, on_report
         asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
-        own = {key: getattr(settings, key) for key in ("node", "namespace", "use_sim_time")}
-        offered = {"inputs": dict(inputs), "services": dict(services)}
-        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, **offered}
-        self._environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
-        if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
-            self._environment["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
+        own = {key: getattr(settings, key) for key in ("version", "node", "namespace", "use_sim_time")}
+        offered = {"inputs": dict(inputs), "outputs": dict(outputs), "services": dict(services)}
+        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, **offered, "admit_all": insecure}
+        self._outputs = outputs
+        self._environment = _environment(settings, insecure, publishes)
         self._kept: dict[str, str] = {}  # text by topic
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None  # while there is a process
@@ -84,12 +126,13 @@ class NodeProcess:
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     def start(self) -> None:
-        """Start the node, and wait until it works.
+        """Start the node, and wait until it works, or has reported that it waits for the master of ROS 1.
 
         raises  RunError with the remedy
         """
-        if shutil.which(self._settings.python) is None:
-            raise RunError(f"ros.python: {self._settings.python}: no such program; `make ros2` makes .venv-ros2")
+        python = self._settings.interpreter
+        if shutil.which(python) is None:
+            raise RunError(f"ros.python: {python}: no such program; {MAKE[self._settings.version]}")
         self._thread.start()
         if not self._tried.wait(START_S):
             self.close()
@@ -98,15 +141,15 @@ class NodeProcess:
             self.close()
             raise RunError(f"the ROS node does not start: {self._fault}")
 
-    def publish(self, topic: str, text: str, *, kept: bool = False) -> None:
+    def publish(self, topic: str, text: str) -> None:
         """Publish a text as std_msgs/String, from any thread. While there is no node, only what is kept comes later.
 
-        kept  for subscribers that come later
+        topic  one of the outputs
         """
         with self._lock:
-            if kept:
+            if self._outputs[topic]:
                 self._kept[topic] = text
-            self._send(topic=topic, text=text, kept=kept)
+            self._send(topic=topic, text=text)
 
     def answer(self, call: str, success: bool, text: str) -> None:
         """Answer a call of a service, from any thread."""
@@ -116,10 +159,10 @@ class NodeProcess:
     def publish_picture(self, picture: str, data: bytes, **about: Any) -> None:
         """Publish a picture as PICTURE/image and PICTURE/camera_info, from any thread.
 
-        about  see `runner.ros.node.Pictures`
+        about  see `runner.ros.node.pictures`: frame_id, stamp, fields of the message, intrinsics
         raises  OSError
         """
-        memory = node.shared_memory(data)
+        memory = shared_memory(data)
         try:
             with self._lock:
                 self._send(memory, picture=picture, **about)
@@ -129,7 +172,7 @@ class NodeProcess:
     def _send(self, *memory: int, **values: Any) -> None:
         """Under the lock."""
         order = json.dumps(values).encode()
-        if self._socket and self._is_ready and len(order) <= node.MAX_MESSAGE_BYTES:
+        if self._socket and self._is_ready and len(order) <= MAX_MESSAGE_BYTES:
             with suppress(OSError):  # the node is behind, or has just ended
                 socket.send_fds(self._socket, [order], memory, socket.MSG_DONTWAIT)
 
@@ -169,7 +212,7 @@ class NodeProcess:
         with own, its:
             own.send(json.dumps(self._task).encode())
             process = subprocess.Popen(
-                children.bound([self._settings.python, "-P", str(Path(node.__file__)), str(its.fileno())]),
+                children.bound([self._settings.interpreter, "-P", str(SCRIPT), str(its.fileno())]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,  # what rclpy prints is in its own log, too
@@ -191,7 +234,7 @@ class NodeProcess:
         """Until the process ends, or this one closes the connection."""
         while True:
             with suppress(ConnectionResetError):
-                data, memory, _, _ = socket.recv_fds(own, node.MAX_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC)
+                data, memory, _, _ = socket.recv_fds(own, MAX_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC)
                 if data:
                     self._take(json.loads(data), memory)
                     continue
@@ -200,6 +243,7 @@ class NodeProcess:
     def _take(self, message: Message, memory: list[int]) -> None:
         match message["kind"]:
             case "report":
+                self._tried.set()  # the node works, though it may wait for the master of ROS 1
                 self._on_report(message["topic"], message["text"])
             case "fatal":
                 self._fatal = message["text"]
@@ -207,7 +251,7 @@ class NodeProcess:
                 with self._lock:
                     self._is_ready = True
                     for topic, text in self._kept.items():
-                        self._send(topic=topic, text=text, kept=True)
+                        self._send(topic=topic, text=text)
                 if self._fault:
                     self._fault = ""
                     self._on_report("", "the ROS node works again")

@@ -291,7 +291,7 @@ class _VehicleControl:
 
 
 def _check_ros(vehicle: Vehicle) -> None:
-    """raises UserError if the node of ROS 2 would find others that need not prove who they are"""
+    """raises UserError if the node of ROS would find others that need not prove who they are"""
     if any(camera.topic for camera in vehicle.cameras.values()):
         from runner.ros.process import check_discovery
 
@@ -309,7 +309,7 @@ def ros_cameras(
     def on_report(camera: str, what: str) -> None:
         report(f"{camera}: {what}" if camera else what)
 
-    return RosCameras(vehicle.ros, vehicle.cameras.values(), push, on_report)
+    return RosCameras(vehicle.ros, vehicle.cameras.values(), push, on_report, vehicle.insecure)
 
 
 @contextmanager

@@ -52,7 +52,7 @@ VERBS = {
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
     "latency": Verb("measure glass-to-glass latency", "runner.verbs.latency", ("camera", "duration_s", "loop")),
-    "ros": Verb("the control link as topics of ROS 2", "runner.verbs.ros", ("duration_s",)),
+    "ros": Verb("the control link as topics of ROS", "runner.verbs.ros", ("duration_s",)),
     "demo": Verb(
         "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
     ),

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint, Vehicle, suggest
+from runner.core.model import Endpoint, RosSettings, Vehicle, suggest
 from runner.errors import MissingBindings, RunError, UserError
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
@@ -27,7 +27,7 @@ from runner.system.ports import check_port_free
 from runner.system.usb import UsbCamera, buses
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
-IMPORT_S = 30  # rclpy is loaded within a second
+IMPORT_S = 30  # rclpy or rospy is loaded within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
 STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
 NEEDED = {  # extras of this package that a verb needs with any configuration
@@ -94,7 +94,7 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
     publishes = vehicle.ros.pictures and verb in ("operator", "demo")
     if verb == "ros" or publishes or (subscribes and verb in ("vehicle", "demo")):
-        yield _rclpy(vehicle.ros.python)
+        yield _ros_library(vehicle.ros)
 
 
 def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[str]:
@@ -117,16 +117,20 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield from ["cluster"] if study["workers"] == "dask" else []
 
 
-def _rclpy(python: str) -> Diagnosis:
-    """Another Python, which must have rclpy."""
+def _ros_library(settings: RosSettings) -> Diagnosis:
+    """Another Python, which must have rclpy or rospy."""
+    from runner.ros.node.start import LIBRARIES
+    from runner.ros.process import MAKE
+
+    library = LIBRARIES[settings.version]
     try:
-        command = [python, "-c", "import rclpy, sensor_msgs.msg"]
+        command = [settings.interpreter, "-c", f"import {library}, sensor_msgs.msg, std_srvs.srv"]
         done = subprocess.run(command, capture_output=True, timeout=IMPORT_S, check=False)
         why = None if done.returncode == 0 else done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
     except (OSError, subprocess.TimeoutExpired) as error:
         why = str(error)
-    hint = f": {why}; `make ros2` makes .venv-ros2, see docs/ros.md" if why is not None else ""
-    return Diagnosis(why is None, f"rclpy for ros.python {python}{hint}")
+    hint = f": {why}; {MAKE[settings.version]}, see docs/ros.md" if why is not None else ""
+    return Diagnosis(why is None, f"{library} for ros.python {settings.interpreter}{hint}")
 
 
 def _bindings() -> Iterator[Diagnosis]:

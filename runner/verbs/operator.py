@@ -10,7 +10,7 @@ DIR/operator.jsonl, for `report` and `export`. With experiment= it sends that ex
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
   tod-runner operator page.serve=false     the table only
-  tod-runner operator ros.pictures=true    with decoded pictures as topics of ROS 2, see docs/ros.md
+  tod-runner operator ros.pictures=true    with decoded pictures as topics of ROS, see docs/ros.md
 """
 
 from __future__ import annotations

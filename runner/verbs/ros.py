@@ -1,7 +1,8 @@
 """usage: tod-runner ros [OVERRIDE ...] [duration_s=N]
 
-The vehicle's control link as topics and services of ROS 2, by a node in a process of its own, on either side. Needs an
-MQTT broker at control.host, and rclpy for ros.python: `make ros2`. Ends with Ctrl-C or after duration_s.
+The vehicle's control link as topics and services of ROS, by a node in a process of its own, on either side. Needs an
+MQTT broker at control.host, and rclpy for ros.python: `make ros2`. With ros.version=1 it needs rospy, `make ros1`, and
+a ROS master. Ends with Ctrl-C or after duration_s.
 
 All texts are std_msgs/String. Out: ~/state and ~/telemetry as the vehicle publishes them (schemas/control.schema.json),
 and the RTSP address of each camera in ~/url/CAMERA, kept for late subscribers such as rtsp_image_transport. In:
@@ -13,6 +14,7 @@ With ros.position, a topic of sensor_msgs/NavSatFix tells the vehicle where it i
 std_msgs/Float64 predicts the bitrate, kbit/s, if the named node alone publishes it. docs/ros.md says more.
 
   tod-runner ros vehicle=delivery_robot
+  tod-runner ros vehicle=delivery_robot ros.version=1
   tod-runner ros ros.position=/gps/fix 'ros.prediction={topic: /pqos/kbps, node: /pqos}'
 """
 

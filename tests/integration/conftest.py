@@ -7,9 +7,11 @@ time that these leave over.
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from ros_domain import running
 
 from rig import CHROMIUM_FLAGS, free_port
 from runner.core.model import Endpoint
@@ -57,3 +59,22 @@ def broker() -> Iterator[Endpoint]:
     endpoint = Endpoint("127.0.0.1", free_port())
     with private_broker(endpoint):
         yield endpoint
+
+
+@pytest.fixture(params=[2, 1], ids=["ros2", "ros1"])
+def ros(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
+    """Each version of ROS that is installed here; see ros_domain.py."""
+    with running(request.param, tmp_path) as version:
+        yield version
+
+
+@pytest.fixture
+def ros1(tmp_path: Path) -> Iterator[Any]:
+    with running(1, tmp_path) as version:
+        yield version
+
+
+@pytest.fixture
+def ros2(tmp_path: Path) -> Iterator[Any]:
+    with running(2, tmp_path) as version:
+        yield version

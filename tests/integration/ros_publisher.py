@@ -1,14 +1,14 @@
 """usage: python ros_publisher.py WIDTH HEIGHT BITS
 
-Run by a Python that has rclpy. Each line on standard input is a JSON object for one topic; a later one for the same
-topic changes it. Without further keys the topic has numbered pictures, as `numbered.numbered`, with right stamps.
+Run by a Python that has rclpy or rospy. Each line on standard input is a JSON object for one topic; a later one for the
+same topic changes it. Without further keys it has numbered pictures, as `numbered.numbered`, with right stamps.
 
     topic      its name
     fps        pictures a second; 0: none any more, and no publisher
     encoding   bgr8
     half       true: pictures of half the size
     late_s     by how much stamps are behind the clock; null: no stamps
-    reliability, durability   of the publisher
+    reliability, durability   of the publisher, in ROS 2
     file, width, height, step, big   publish the bytes of this file instead, as sensor_msgs/Image
     format     publish the bytes of the file as sensor_msgs/CompressedImage
 
@@ -20,37 +20,30 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_either import Node, set_stamp
 from sensor_msgs.msg import CompressedImage, Image
 
 WIDTH, HEIGHT, BITS = map(int, sys.argv[1:])
 
 
 class Camera:
-    def __init__(self, node: rclpy.node.Node, **wishes: object) -> None:
+    def __init__(self, node: Node, **wishes: object) -> None:
         self.node, self.number = node, -1
-        self.wishes = {"encoding": "bgr8", "late_s": 0.0, "reliability": "reliable", "durability": "volatile"} | wishes
-        kind = CompressedImage if "format" in wishes else Image
-        qos = QoSProfile(
-            depth=1,
-            reliability=ReliabilityPolicy[self.wishes["reliability"].upper()],
-            durability=DurabilityPolicy[self.wishes["durability"].upper()],
-        )
-        self.publisher = node.create_publisher(kind, wishes["topic"], qos)
-        self.timer = node.create_timer(1 / wishes["fps"], self.publish)
+        self.wishes = {"encoding": "bgr8", "late_s": 0.0} | wishes
+        self.kind = CompressedImage if "format" in wishes else Image
+        qos = {key: wishes[key] for key in ("reliability", "durability") if key in wishes}
+        self.publisher = node.publisher(self.kind, wishes["topic"], depth=1, **qos)
+        self.timer = node.every(1 / wishes["fps"], self.publish)
 
     def publish(self) -> None:
-        wishes, message = self.wishes, self.publisher.msg_type()
-        stamp = 0
-        if wishes["late_s"] is not None:
-            stamp = self.node.get_clock().now().nanoseconds - round(1e9 * wishes["late_s"])
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        wishes, message = self.wishes, self.kind()
+        stamp = 0 if wishes["late_s"] is None else time.time_ns() - round(1e9 * wishes["late_s"])
+        set_stamp(message, stamp)
         if "file" in wishes:
             self.fill(message)
         else:
@@ -79,13 +72,12 @@ class Camera:
         message.step, message.data = 3 * width, np.tile(row, height).tobytes()
 
     def end(self) -> None:
-        self.node.destroy_timer(self.timer)
-        self.node.destroy_publisher(self.publisher)
+        self.node.stop(self.timer)
+        self.node.withdraw(self.publisher)
 
 
 def main() -> None:
-    rclpy.init()
-    node = rclpy.create_node("cameras")
+    node = Node("cameras")
     cameras: dict[str, Camera] = {}
     orders: list[dict] = []
     ended = threading.Event()
@@ -104,13 +96,9 @@ def main() -> None:
             if wishes["fps"]:
                 cameras[wishes["topic"]] = Camera(node, **wishes)
 
-    node.create_timer(0.02, obey)
+    node.every(0.02, obey)
     threading.Thread(target=read, daemon=True).start()
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    while not ended.is_set():
-        executor.spin_once(timeout_sec=0.5)
-    rclpy.try_shutdown()
+    node.run(ended)
 
 
 main()

@@ -1,4 +1,4 @@
-"""Topics of ROS 2 as sources of a real vehicle, against real rclpy: pixels, capture times, faults, recovery."""
+"""Topics of ROS as sources of a real vehicle, against real rclpy and rospy: pixels, capture times, faults, recovery."""
 
 from __future__ import annotations
 
@@ -6,30 +6,29 @@ import json
 import os
 import re
 import signal
-import subprocess
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from fractions import Fraction
+from http.client import HTTPException
 from pathlib import Path
+from xmlrpc.client import ServerProxy
 
 import numpy as np
 import pytest
 from bags import filmed
 from numbered import BITS, HEIGHT, WIDTH, encoded, number_of
-from ros_domain import MARKS, PYTHON, domain  # noqa: F401
+from ros_domain import MARKS, ROS2_PYTHON, SCRIPT, running
 from shared_data import shared
 
-from rig import CHECKOUT, children_named, free_port, run, streaming, until, watching
+from rig import children_named, free_port, run, streaming, until, watching
 from runner.bag.pictures import FORMATS
 from runner.core.commands import Command
-from runner.core.model import RosSettings
 from runner.operator.frames import live_frames
 
 pytestmark = MARKS
 RATE = 15
-PROFILE = CHECKOUT / "runner/ros/fastdds.xml"
 
 
 class Publisher:
@@ -38,15 +37,8 @@ class Publisher:
     large  it has shared memory for many pictures
     """
 
-    def __init__(self, size=(WIDTH, HEIGHT), large=True):
-        script = Path(__file__).with_name("ros_publisher.py")
-        self.process = subprocess.Popen(
-            [str(PYTHON), "-P", str(script), *map(str, (*size, BITS))],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **({"FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)} if large else {})},
-        )
+    def __init__(self, ros, size=(WIDTH, HEIGHT), large=True):
+        self.process = ros.start("ros_publisher.py", *map(str, (*size, BITS)), large=large)
         self.sent = []  # topic, number, stamp
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -60,9 +52,9 @@ class Publisher:
 
 
 @contextmanager
-def publishing(publisher=None, **cameras):
+def publishing(ros, publisher=None, **cameras):
     """A publisher, with one topic /NAME/image for each camera, whose value are its wishes."""
-    publisher = publisher or Publisher()
+    publisher = publisher or Publisher(ros)
     try:
         for name, wishes in cameras.items():
             publisher.publish(f"/{name}/image", **wishes)
@@ -72,9 +64,9 @@ def publishing(publisher=None, **cameras):
         publisher.process.wait(20)
 
 
-def robot(*words):
+def robot(ros, *words):
     return (
-        *("vehicle=delivery_robot", "source=ros", "~cameras.mast", f"fps_max={RATE}", f"ros.python={PYTHON}"),
+        *("vehicle=delivery_robot", "source=ros", "~cameras.mast", f"fps_max={RATE}", *ros.words),
         *("cameras.front.topic=/front/image", "cameras.rear.topic=/rear/image"),
         *(f"cameras.front.width_px={WIDTH}", f"cameras.front.height_px={HEIGHT}", "~cameras.front.native"),
         *(f"cameras.rear.width_px={WIDTH}", f"cameras.rear.height_px={HEIGHT}"),
@@ -83,11 +75,11 @@ def robot(*words):
 
 
 @contextmanager
-def subscribing(*words):
+def subscribing(ros, *words):
     """A vehicle's cameras, fed by topics. Yields (vehicle, plans, what was reported)."""
     from runner.vehicle.live import ros_cameras
 
-    with streaming(*robot(*words), cameras=()) as (side, vehicle, plans, reported):
+    with streaming(*robot(ros, *words), cameras=()) as (side, vehicle, plans, reported):
         cameras = ros_cameras(vehicle, side.push_shared, reported.append)
         cameras.start()
         try:
@@ -157,12 +149,12 @@ def published(tmp_path, encoding, padding, big=False):
     return {"file": str(file), **form}, rgb
 
 
-def test_pixels_of_each_encoding(tmp_path):
+def test_pixels_of_each_encoding(ros, tmp_path):
     """With rows of any length; and JPEG and PNG."""
     import cv2
 
     wanted = {}
-    with publishing() as publisher:
+    with publishing(ros) as publisher:
         for number, encoding in enumerate(FORMATS):
             wishes, rgb = published(tmp_path, encoding, padding=number % 4 * 3)
             wanted[encoding] = rgb
@@ -180,7 +172,7 @@ def test_pixels_of_each_encoding(tmp_path):
                 os.close(picture.memory)
             pictures.setdefault(name, picture)
 
-        with camera_feed(wanted, push) as reported:
+        with camera_feed(ros, wanted, push) as reported:
             until(lambda: len(pictures) == len(wanted))
     for name, rgb in wanted.items():
         found = shown(pictures[name])
@@ -201,10 +193,10 @@ def take(received, seen):
     return True
 
 
-def test_pictures_arrive_in_order_with_the_times_of_their_stamps():
-    with publishing(front={}, rear={"late_s": 0.2}) as publisher, subscribing() as (vehicle, _, reported):
+def test_pictures_arrive_in_order_with_the_times_of_their_stamps(ros):
+    with publishing(ros, front={}, rear={"late_s": 0.2}) as publisher, subscribing(ros) as (vehicle, _, reported):
         seen = {"front": [], "rear": []}
-        with live_frames([*robot(), f"media.port={vehicle.media.port}"]) as received:
+        with live_frames([*robot(ros), f"media.port={vehicle.media.port}"]) as received:
             until(lambda: take(received, seen) and min(map(len, seen.values())) > 60)
     for name, pictures in seen.items():
         stamps = [(number, stamp / 1e9) for topic, number, stamp in publisher.sent if topic == f"/{name}/image"]
@@ -220,11 +212,11 @@ def test_pictures_arrive_in_order_with_the_times_of_their_stamps():
     }
 
 
-def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on():
+def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
     unknown, size = "encoding 'bayer_rggb8' is not supported", "pictures are BGR 192x108"
     with (
-        publishing(front={}, rear={}) as publisher,
-        subscribing() as (_, plans, reported),
+        publishing(ros, front={}, rear={}) as publisher,
+        subscribing(ros) as (_, plans, reported),
         watched(plans, reported) as (front, rear),
     ):
         publisher.publish("/front/image", encoding="bayer_rggb8")
@@ -272,52 +264,193 @@ def goes_on(client):
     until(lambda: len(client.sizes) > before + RATE)
 
 
-def test_a_node_that_dies_is_started_again():
-    with publishing(front={}, rear={}), subscribing() as (_, plans, reported), watched(plans, reported) as (front, _):
-        (node,) = children_named(os.getpid(), "node.py")
+def test_a_node_that_dies_is_started_again(ros):
+    with (
+        publishing(ros, front={}, rear={}),
+        subscribing(ros) as (_, plans, reported),
+        watched(plans, reported) as (front, _),
+    ):
+        (node,) = children_named(os.getpid(), SCRIPT)
         os.kill(node, signal.SIGKILL)
         until(lambda: told(reported, "the ROS node ended: killed by SIGKILL; starting it again"))
         until(lambda: told(reported, "the ROS node works again"))
         goes_on(front)
-        (again,) = children_named(os.getpid(), "node.py")
+        (again,) = children_named(os.getpid(), SCRIPT)
         assert again != node
     until(lambda: not Path(f"/proc/{again}").exists())
 
 
-def test_incompatible_qos_and_a_topic_of_another_type():
+def test_incompatible_qos(ros2):
     words = ["ros.qos={/front/image: {reliability: reliable}, /rear/image: {durability: transient_local}}"]
-    with publishing(front={"reliability": "best_effort"}, rear={}), subscribing(*words) as (_, _, reported):
+    with (
+        publishing(ros2, front={"reliability": "best_effort"}, rear={}),
+        subscribing(ros2, *words) as (_, _, reported),
+    ):
         for name, policy in (("front", "reliability reliable"), ("rear", "durability transient_local")):
             why = f"incompatible QoS: ros.qos asks for {policy}, its publisher offers less"
             until(lambda line=f"{name}: /{name}/image: {why}": line in reported)
-    with publishing(), subscribing("cameras.front.topic=/rosout", "cameras.rear.topic=/never") as (_, _, reported):
-        kind = "has messages of type rcl_interfaces/msg/Log, must be sensor_msgs/msg/Image or "
-        until(lambda: told(reported, f"front: /rosout: {kind}sensor_msgs/msg/CompressedImage"))
+
+
+def test_a_topic_of_another_type(ros):
+    log = {1: "rosgraph_msgs/Log", 2: "rcl_interfaces/msg/Log"}[ros.version]
+    topics = ("cameras.front.topic=/rosout", "cameras.rear.topic=/never")
+    with publishing(ros), subscribing(ros, *topics) as (_, _, reported):
+        image, compressed = (ros.type("sensor_msgs", name) for name in ("Image", "CompressedImage"))
+        until(lambda: f"front: /rosout: has messages of type {log}, must be {image} or {compressed}" in reported)
         until(lambda: told(reported, "rear: /never: no publisher for 5 s"))
         assert len(reported) == 2
 
 
-def test_names_are_those_of_the_node_and_ages_are_by_its_clock():
+def test_names_are_those_of_the_node_and_ages_are_by_its_clock(ros):
     """A clock of a simulation that nobody publishes stands at 0."""
     words = ("ros.namespace=/front", "cameras.front.topic=image", "ros.remap={/seen: /rear/image}")
-    simulated = ("cameras.rear.topic=/seen", "ros.use_sim_time=true")
-    with publishing(front={}, rear={}), subscribing(*words, *simulated) as (_, _, reported):
+    simulated = ("cameras.rear.topic=/seen", *ros.simulated())
+    with publishing(ros, front={}, rear={}), subscribing(ros, *words, *simulated) as (_, _, reported):
         for name in ("front: image", "rear: /seen"):
             until(lambda line=f"{name}: pictures are BGR 384x216": line in reported)
             (line,) = told(reported, f"{name}: a stamp is ")
             assert line.endswith(" s in the future: the latency of these pictures is unknown")
 
 
+def test_both_versions_one_after_the_other(tmp_path):
+    """One key chooses."""
+    for version in (1, 2):
+        with running(version, tmp_path) as ros, publishing(ros, front={}, rear={}):
+            ros.words = [f"ros.version={version}"]
+            with subscribing(ros) as (_, plans, reported), watched(plans, reported) as (front, rear):
+                goes_on(front)
+                goes_on(rear)
+        assert {line.partition(": ")[2] for line in calm(reported) if "/image" in line} == {
+            *("/front/image: pictures are BGR 384x216", "/rear/image: pictures are BGR 384x216")
+        }
+
+
+# --- ROS 1: a master that knows the nodes -----------------------------------------------------------------------------
+
+
+def test_a_master_that_dies_and_returns(ros1):
+    """Pictures go on without it; with the next one come topics of publishers that register there."""
+    absent, there = (f"the ROS master at {ros1.master.uri} {what}" for what in ("does not answer", "answers"))
+    with subscribing(ros1) as (_, plans, reported):
+        with publishing(ros1, front={}, rear={}), watched(plans, reported) as (front, rear):
+            (node,) = children_named(os.getpid(), SCRIPT)
+            for times in (1, 2):
+                ros1.master.kill()
+                until(lambda times=times: len(told(reported, absent)) == times)
+                goes_on(front)
+                goes_on(rear)
+                ros1.master.start()
+                until(lambda times=times: len(told(reported, there)) == times)
+            known = until(lambda: {"/front/image", "/rear/image"} <= subscribed(ros1) and subscribed(ros1))
+            assert "/clock" not in known
+            assert told(reported, "no publisher") == []
+        until(lambda: len(told(reported, "/image: no publisher for 5 s")) == 2)
+        with publishing(ros1, front={}, rear={}):
+            until(lambda: len(told(reported, "/image: pictures come again")) == 2)
+            with watching(plans[0]) as front:
+                goes_on(front)
+        assert children_named(os.getpid(), SCRIPT) == [node]
+    assert told(reported, "the ROS node") == []
+
+
+def subscribed(ros1):
+    """Topics that the vehicle's node subscribes to, as the master knows it."""
+    return {topic for topic, nodes in ros1.master.call("getSystemState")[1] if "/tod_runner" in nodes}
+
+
+def test_a_master_that_comes_late(ros1):
+    ros1.master.kill()
+    with subscribing(ros1) as (_, plans, reported):
+        until(lambda: f"the ROS master at {ros1.master.uri} does not answer" in reported)
+        ros1.master.start()
+        with publishing(ros1, front={}, rear={}), watched(plans, reported) as (front, _):
+            goes_on(front)
+    assert len(told(reported, "the ROS master")) == 2
+
+
+def test_a_master_that_hangs(ros1):
+    with (
+        publishing(ros1, front={}, rear={}),
+        subscribing(ros1) as (_, plans, reported),
+        watched(plans, reported) as (front, _),
+    ):
+        ros1.master.process.send_signal(signal.SIGSTOP)
+        until(lambda: told(reported, "does not answer"))
+        goes_on(front)
+        ros1.master.process.send_signal(signal.SIGCONT)
+        until(lambda: told(reported, f"the ROS master at {ros1.master.uri} answers"))
+        goes_on(front)
+
+
+def test_a_publisher_that_dies_without_a_word(ros1):
+    """The master still names it."""
+    publisher = Publisher(ros1)
+    with subscribing(ros1) as (_, plans, reported):
+        for name in ("front", "rear"):
+            publisher.publish(f"/{name}/image")
+        until(lambda: len(told(reported, ": pictures are ")) == 2)
+        publisher.process.kill()
+        publisher.process.wait(20)
+        until(lambda: "front: /front/image: its publisher cannot be reached for 5 s" in reported)
+        with publishing(ros1, front={}, rear={}):
+            until(lambda: told(reported, "front: /front/image: pictures come again, after "))
+            with watching(plans[0]) as front:
+                goes_on(front)
+
+
+def test_a_master_that_any_machine_can_reach_is_refused(ros1):
+    ros1.master.kill()
+    ros1.master.start(host=None)
+    status, lines = refused(ros1)
+    assert (status, lines[-1]) == (
+        1,
+        f"the ROS node does not start: the ROS master at {ros1.master.uri} admits any node of the network: "
+        "start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true",
+    )
+
+
+def test_a_name_that_is_taken_is_refused(ros1):
+    """The master would end the node that has it."""
+    with publishing(ros1, front={}), subscribing(ros1) as (_, _, reported):
+        until(lambda: told(reported, "pictures are"))
+        status, lines = refused(ros1)
+        why = "the ROS node does not start: a node of the name /tod_runner runs already, at http://127.0.0.1:"
+        assert (status, lines[-1][: len(why)]) == (1, why)
+        assert lines[-1].endswith(": give another ros.node")
+        assert told(reported, "the ROS node") == []
+
+
+def test_a_node_that_is_ended_over_ros_is_started_again(ros1):
+    with (
+        publishing(ros1, front={}, rear={}),
+        subscribing(ros1) as (_, plans, reported),
+        watched(plans, reported) as both,
+    ):
+        with suppress(OSError, HTTPException):  # it may end before it answers
+            ServerProxy(ros1.master.call("lookupNode", "/tod_runner")).shutdown("/test", "as rosnode kill does")
+        why = "another node of the same name has come, or it was ended over ROS"
+        until(lambda: f"the ROS node ended: {why}; starting it again" in reported)
+        until(lambda: told(reported, "the ROS node works again"))
+        goes_on(both[0])
+
+
+def test_a_node_of_ros_1_leaves_no_files(ros1, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("ROS_LOG_DIR")
+    with subscribing(ros1) as (_, _, reported):
+        until(lambda: told(reported, "/front/image: no publisher for 5 s"))
+    assert not (tmp_path / "home/.ros").exists()
+
+
 @contextmanager
-def camera_feed(names, push):
+def camera_feed(ros, names, push):
     """The topics /NAME/image of some cameras, without a vehicle. Yields what was reported."""
     from runner.configuration.config import configuration
     from runner.ros.cameras import RosCameras
 
-    one, reported = configuration(robot(), runnable=False).vehicle().cameras["front"], []
+    one, reported = configuration(robot(ros), runnable=False).vehicle().cameras["front"], []
     cameras = [replace(one, name=name, mount={"topic": f"/{name}/image"}) for name in names]
-    settings = RosSettings(python=str(PYTHON))
-    subscriber = RosCameras(settings, cameras, push, lambda name, what: reported.append(f"{name}: {what}"))
+    subscriber = RosCameras(ros.settings, cameras, push, lambda name, what: reported.append(f"{name}: {what}"))
     subscriber.start()
     try:
         yield reported
@@ -329,7 +462,7 @@ def camera_feed(names, push):
 
 
 @contextmanager
-def counted(publisher, names):
+def counted(ros, publisher, names):
     """Topics of a publisher. Yields how late their pictures came, s, by name, and what was reported."""
     late_s = {name: [] for name in names}
 
@@ -337,15 +470,15 @@ def counted(publisher, names):
         os.close(picture.memory)
         late_s[name].append((time.monotonic_ns() - picture.captured) / 1e9)
 
-    with publishing(publisher, **{name: {"fps": 0} for name in names}), camera_feed(names, push) as reported:
+    with publishing(ros, publisher, **{name: {"fps": 0} for name in names}), camera_feed(ros, names, push) as reported:
         yield late_s, reported
 
 
-def test_eight_topics_arrive():
+def test_eight_topics_arrive(ros2):
     """480x270 at 10 Hz from one process, which is what the middleware's own settings lose pictures of."""
     names, fps, seconds = [f"camera_{number}" for number in range(8)], 10, 30
-    publisher = Publisher((480, 270))
-    with counted(publisher, names) as (late_s, reported):
+    publisher = Publisher(ros2, (480, 270))
+    with counted(ros2, publisher, names) as (late_s, reported):
         for name in names:
             publisher.publish(f"/{name}/image", fps=fps)
         until(lambda: all(late_s.values()))
@@ -360,54 +493,63 @@ def test_eight_topics_arrive():
     assert [line for line in told(reported, "were lost") if " lost, 0 between publisher and node" not in line] == []
 
 
-@pytest.mark.parametrize("large", [True, False])
-def test_where_pictures_were_lost_is_reported(large):
-    """A node that does not run for 0.7 s: a segment of shared memory that is too small is overwritten meanwhile."""
-    publisher = Publisher(large=large)
-    with counted(publisher, ["front", "rear"]) as (late_s, reported):
+def losses(ros, large=True):
+    """What is reported on pictures that were lost while the node did not run: in all, between, and here."""
+    publisher = Publisher(ros, large=large)
+    with counted(ros, publisher, ["front", "rear"]) as (late_s, reported):
         for name in late_s:
             publisher.publish(f"/{name}/image", fps=10)
         until(lambda: all(late_s.values()))
-        (node,) = children_named(os.getpid(), "node.py")
+        (node,) = children_named(os.getpid(), SCRIPT)
         os.kill(node, signal.SIGSTOP)
         before = len(publisher.sent)
         until(lambda: len(publisher.sent) - before >= 14)
         os.kill(node, signal.SIGCONT)
         line = until(lambda: told(reported, "pictures were lost"))[0]
         until(lambda: told(reported, "no pictures are lost any more"))
-    lost, between, here = map(int, re.search(r": (\d+) of .* lost, (\d+) between .*, (\d+) since", line).groups())
-    assert lost == between + here
-    assert (here if large else between) > lost / 2
     assert max(late for every in late_s.values() for late in every) < 2
+    return map(int, re.search(r": (\d+) of .* lost, (\d+) between .*, (\d+) since", line).groups())
+
+
+def test_pictures_that_were_lost_since_the_node_ran_late_are_reported(ros):
+    lost, between, here = losses(ros)
+    assert lost == between + here
+    assert here > lost / 2
+
+
+def test_pictures_that_a_small_segment_of_shared_memory_lost_are_reported(ros2):
+    """It is overwritten while the node does not run."""
+    lost, between, here = losses(ros2, large=False)
+    assert lost == between + here
+    assert between > lost / 2
 
 
 # --- what keeps a vehicle from starting -------------------------------------------------------------------------------
 
 
-def refused(*words):
-    done = run("vehicle", *robot(*words), f"media.port={free_port()}", f"control.port={free_port()}")
+def refused(ros, *words):
+    done = run("vehicle", *robot(ros, *words), f"media.port={free_port()}", f"control.port={free_port()}")
     return done.returncode, (done.stdout + done.stderr).splitlines()
 
 
-def test_a_vehicle_without_rclpy_does_not_start(tmp_path):
-    assert refused("ros.python=no/python") == (
-        1,
-        ["ros.python: no/python: no such program; `make ros2` makes .venv-ros2"],
-    )
-    status, lines = refused("ros.python=/usr/bin/python3")
+def test_a_vehicle_without_the_library_does_not_start(ros):
+    remedy = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}[ros.version]
+    assert refused(ros, "ros.python=no/python") == (1, [f"ros.python: no/python: no such program; {remedy}"])
+    library, other = {1: ("rospy", ROS2_PYTHON), 2: ("rclpy", "/usr/bin/python3")}[ros.version]
+    status, lines = refused(ros, f"ros.python={other}")
     assert status == 1
-    why = "the ROS node does not start: ros.python: /usr/bin/python3 cannot load rclpy for Python 3."
+    why = f"the ROS node does not start: ros.python: {other} cannot load {library} for Python 3."
     assert lines[-1].startswith(why)
-    assert lines[-1].endswith(": No module named 'rclpy'")
+    assert lines[-1].endswith(f": No module named '{library}'")
 
 
-def test_nodes_of_other_machines_are_not_found_unless_they_prove_who_they_are():
-    status, (line,) = refused("ros.discovery=subnet")
+def test_nodes_of_other_machines_are_not_found_unless_they_prove_who_they_are(ros2):
+    status, (line,) = refused(ros2, "ros.discovery=subnet")
     assert status == 2
     assert line.startswith("command line: ros.discovery: subnet: admits any node of the network: set up SROS 2 ")
 
 
-def test_a_camera_without_a_topic():
-    status, lines = refused("~cameras.rear.topic")
+def test_a_camera_without_a_topic(ros):
+    status, lines = refused(ros, "~cameras.rear.topic")
     assert status == 2
     assert lines[0].endswith("topic: null: must be given, here or for each mounted camera as topic")

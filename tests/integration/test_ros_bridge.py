@@ -1,4 +1,4 @@
-"""The control link as topics of ROS 2: `tod-runner ros` between a real vehicle and nodes of real rclpy."""
+"""The control link as topics of ROS: `tod-runner ros` between a real vehicle and nodes of real rclpy and rospy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 from contextlib import contextmanager
 
 import pytest
-from ros_domain import MARKS, NODE, PYTHON, client, domain  # noqa: F401
+from ros_domain import MARKS, NODE, SCRIPT
 
 from keyed import VEHICLE, WATCHER, issue
 from rig import SMALL_ROBOT, Operator, children_named, free_port, process, until, watching
@@ -27,7 +27,7 @@ def lines():
 
 
 @contextmanager
-def bridged(lines, *words, keys=None):
+def bridged(ros, lines, *words, keys=None):
     """A vehicle, its broker, and a bridge, whose output goes to `lines`. Yields words of both, broker, both processes.
 
     keys  of everybody; those of the bridge are a watcher's
@@ -35,7 +35,7 @@ def bridged(lines, *words, keys=None):
     broker = Endpoint("127.0.0.1", free_port())
     ports = [f"control.port={broker.port}", f"media.port={free_port()}"]
     own = ["source=test", "fps_max=15", "modes=open_loop", "pqos=live", "page.serve=false"]
-    both = [*SMALL_ROBOT, *own, *ports, f"ros.python={PYTHON}"]
+    both = [*SMALL_ROBOT, *own, *ports, *ros.words]
     of = [[f"keys={keys / name}"] if keys else [] for name in (VEHICLE, WATCHER)]
     with (
         private_broker(broker, keys / "broker" if keys else None),
@@ -52,8 +52,8 @@ def told(lines, part):
     return [line for line in tuple(lines) if part in line]
 
 
-def test_requests_are_answered_and_a_late_subscriber_knows_all(lines):
-    with bridged(lines) as (words, _, (vehicle, _)), client("interface", *HEARD) as operator:
+def test_requests_are_answered_and_a_late_subscriber_knows_all(ros, lines):
+    with bridged(ros, lines) as (words, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         assert operator.newest("state")["mode"] == "automatic"
         until(lambda: len(operator.texts("telemetry")) > 5)
         reply = operator.ask(id="one", event="mode_selected", mode="collective")
@@ -80,10 +80,10 @@ def test_requests_are_answered_and_a_late_subscriber_knows_all(lines):
     assert told(lines, "Traceback") == []
 
 
-def test_operator_inputs_are_topics_and_services(lines):
+def test_operator_inputs_are_topics_and_services(ros, lines):
     """Of an interface that knows nothing of this project's JSON."""
     remap = f"ros.remap={{{NODE}/camera/front/kbps: /operator/bitrate, {NODE}/mode/single: /operator/manual}}"
-    with bridged(lines, remap) as (_, _, (vehicle, _)), client("interface", *HEARD) as operator:
+    with bridged(ros, lines, remap) as (_, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         until(lambda: operator.texts("telemetry"))
         assert operator.call("mode/collective") == [True, "applied"]
         reply = operator.set("total_kbps", number=2500.0)
@@ -113,6 +113,16 @@ def test_operator_inputs_are_topics_and_services(lines):
     assert told(lines, "Traceback") == []
 
 
+def test_an_input_of_another_type_is_told_once(ros, lines):
+    with bridged(ros, lines), ros.client("interface", *HEARD) as operator:
+        operator.publish(f"{NODE}/total_kbps", text="no number")
+        found, expected = (ros.type("std_msgs", name) for name in ("String", "Float64"))
+        until(lambda: told(lines, f"~/total_kbps: has messages of type {found}, must be {expected}"))
+        until(lambda: operator.texts("telemetry"))
+        assert operator.call("mode/collective") == [True, "applied"]
+    assert len(told(lines, "has messages of type")) == 1
+
+
 def with_roi(operator, roi):
     decided = operator.newest("state")["cameras"]["front"]
     return decided if decided["roi"] == roi else None
@@ -123,8 +133,8 @@ def offline(operator):
     return reply if reply["reason"] == "the vehicle is offline" else None
 
 
-def test_a_request_that_the_vehicle_does_not_answer_times_out(lines):
-    with bridged(lines) as (_, _, (vehicle, _)), client("interface", *HEARD) as operator:
+def test_a_request_that_the_vehicle_does_not_answer_times_out(ros, lines):
+    with bridged(ros, lines) as (_, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         operator.newest("telemetry")
         assert operator.ask(id="one", event="mode_selected", mode="collective")["result"] == "applied"
         vehicle.send_signal(signal.SIGSTOP)
@@ -134,22 +144,38 @@ def test_a_request_that_the_vehicle_does_not_answer_times_out(lines):
         assert reply["reason"] == "the vehicle has not answered within 3 s"
 
 
-def test_a_node_that_dies_is_started_again_with_what_late_subscribers_need(lines):
-    with bridged(lines) as (_, _, (_, bridge)), client("interface", *HEARD) as operator:
+def test_a_node_that_dies_is_started_again_with_what_late_subscribers_need(ros, lines):
+    with bridged(ros, lines) as (_, _, (_, bridge)), ros.client("interface", *HEARD) as operator:
         until(lambda: operator.texts("url/front") and operator.texts("telemetry"))
-        (node,) = children_named(bridge.pid, "node.py")
+        (node,) = children_named(bridge.pid, SCRIPT)
         os.kill(node, signal.SIGKILL)
         until(lambda: told(lines, "the ROS node works again"))
         assert len(told(lines, "the ROS node ended: killed by SIGKILL; starting it again")) == 1
-        with client("late", *HEARD) as late:
+        with ros.client("late", *HEARD) as late:
             assert late.newest("state")["mode"] == "automatic"
             until(lambda: late.texts("url/front") and late.texts("url/rear"))
             reply = late.ask(id="one", event="mode_selected", mode="collective")
             assert reply["result"] == "applied"
 
 
-def test_requests_have_the_role_of_their_keys(lines, tmp_path):
-    with bridged(lines, keys=issue(tmp_path / "keys")) as _, client("interface", *HEARD) as operator:
+def test_a_new_master_knows_all_topics_and_services(ros1, lines):
+    with bridged(ros1, lines) as (_, _, (_, bridge)):
+        (node,) = children_named(bridge.pid, SCRIPT)
+        ros1.master.kill()
+        until(lambda: told(lines, f"the ROS master at {ros1.master.uri} does not answer"))
+        ros1.master.start()
+        until(lambda: told(lines, f"the ROS master at {ros1.master.uri} answers"))
+        with ros1.client("late", *HEARD) as late:
+            assert late.newest("state")["mode"] == "automatic"
+            until(lambda: late.texts("url/front") and late.texts("url/rear") and late.texts("telemetry"))
+            assert late.call("mode/collective") == [True, "applied"]
+            assert late.set("total_kbps", number=2500.0)["result"] == "applied"
+        assert children_named(bridge.pid, SCRIPT) == [node]
+    assert len(told(lines, "the ROS ")) == 2
+
+
+def test_requests_have_the_role_of_their_keys(ros, lines, tmp_path):
+    with bridged(ros, lines, keys=issue(tmp_path / "keys")) as _, ros.client("interface", *HEARD) as operator:
         until(lambda: operator.texts("telemetry"))
         reply = operator.ask(id="one", event="mode_selected", mode="collective")
         assert (reply["result"], reply["reason"]) == (
@@ -169,9 +195,13 @@ def predicted(reader):
     return reader.newest("telemetry")["predicted_kbps"]
 
 
-def test_positions_and_predictions_of_one_named_node(lines):
+def test_positions_and_predictions_of_one_named_node(ros, lines):
     words = ["ros.position=/gps/fix", "ros.prediction={topic: /pqos/kbps, node: /pqos}"]
-    with bridged(lines, *words) as (_, broker, _), client("pqos") as pqos, client("interface", *HEARD) as reader:
+    with (
+        bridged(ros, lines, *words) as (_, broker, _),
+        ros.client("pqos") as pqos,
+        ros.client("interface", *HEARD) as reader,
+    ):
         reader.newest("telemetry")
         reply = reader.ask(id="one", event="operator_connected")
         assert (reply["result"], reply["reason"][:34]) == ("refused", "this node reports positions or pre")
@@ -181,7 +211,7 @@ def test_positions_and_predictions_of_one_named_node(lines):
         until(lambda: [pqos.publish("/gps/fix", fix=[48.25, 11.5, 0]), position(reader) == here][-1], every_s=0.1)
         # Its node is discovered a moment after its topic.
         until(lambda: [pqos.publish("/pqos/kbps", number=2345.0), predicted(reader) == 2345][-1], every_s=0.1)
-        with client("impostor") as other:
+        with ros.client("impostor") as other:
             why = "is published by /impostor, must be by /pqos alone: predictions are left out"
             until(lambda: [other.publish("/pqos/kbps", number=9.0), told(lines, why)][-1], every_s=0.1)
             asker = Operator(broker)

@@ -1,4 +1,4 @@
-"""Decoded pictures as topics of ROS 2: of a real vehicle, through a real operator's side, with real rclpy."""
+"""Decoded pictures as topics of ROS: of a real vehicle, through a real operator's side, with real rclpy and rospy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from math import radians, tan
 
 import pytest
-from ros_domain import MARKS, PYTHON, client, domain  # noqa: F401
+from ros_domain import MARKS
 
 from rig import Operator, free_port, process, until
 from runner.core.model import Endpoint
@@ -44,7 +44,7 @@ WORDS = (
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
-def test_a_point_is_where_camera_info_says(lens):
+def test_a_point_is_where_camera_info_says(ros, lens):
     """After the crop of the native picture, and then with a region of interest and a factor, too."""
     broker = Endpoint("127.0.0.1", free_port())
     words = [*WORDS, f"cameras.front.lens={lens}", f"control.port={broker.port}", f"media.port={free_port()}"]
@@ -52,8 +52,8 @@ def test_a_point_is_where_camera_info_says(lens):
     with (
         private_broker(broker),
         process("vehicle", *words),
-        process("operator", *words, "ros.pictures=true", f"ros.python={PYTHON}"),
-        client("viewer", IMAGE, INFO) as viewer,
+        process("operator", *words, "ros.pictures=true", *ros.words),
+        ros.client("viewer", IMAGE, INFO) as viewer,
     ):
         until(lambda: close(viewer, lens), every_s=0.2)
         image = viewer.texts(IMAGE)[-1]

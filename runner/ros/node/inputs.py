@@ -1,0 +1,60 @@
+"""Topics whose messages are passed on as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from .port import Port
+
+MAX_TEXT = 20_000  # characters, which JSON may write as six bytes each
+
+# By kind of an input, package and name of its type. All messages of EACH count, of NEWEST only the newest.
+REGION = ("sensor_msgs", "RegionOfInterest")
+EACH = {"text": ("std_msgs", "String"), "number": ("std_msgs", "Float64"), "region": REGION}
+NEWEST = {"fix": ("sensor_msgs", "NavSatFix"), "newest_number": ("std_msgs", "Float64"), "sign": ("std_msgs", "Empty")}
+TYPES = {**EACH, **NEWEST}
+SERVICES = {"trigger": ("std_srvs", "Trigger"), "switch": ("std_srvs", "SetBool")}  # by kind of their calls
+
+
+class InputTopic:
+    """A topic that is subscribed to for as long as the node is there.
+
+    kind  of its messages, see TYPES
+    """
+
+    def __init__(self, port: Port, name: str, kind: str) -> None:
+        self._port, self.name, self.kind = port, name, kind
+        self._wrong: list[str] = []
+
+    def publishing_nodes(self, message: Any) -> list[str]:
+        """Names of all nodes that publish the topic, when a message comes; none as long as one is unknown."""
+        raise NotImplementedError
+
+    def check_types(self, found: Iterable[str], expected: str) -> None:
+        """Report types of publishers that are not the expected one, once each time they change."""
+        wrong = sorted(set(found) - {expected})
+        if wrong and wrong != self._wrong:
+            self._port.report(f"has messages of type {', '.join(wrong)}, must be {expected}", self.name)
+        self._wrong = wrong
+
+    def on_message(self, message: Any) -> None:
+        match self.kind:
+            case "fix":
+                self._pass_on(lat=message.latitude, lon=message.longitude, fixed=message.status.status >= 0)
+            case "newest_number":
+                self._pass_on(number=message.data, nodes=self.publishing_nodes(message))
+            case "number":
+                self._pass_on(number=message.data)
+            case "region":
+                corner = {"x": message.x_offset, "y": message.y_offset}
+                self._pass_on(**corner, width=message.width, height=message.height)
+            case "sign":
+                self._pass_on()
+            case _ if len(message.data) <= MAX_TEXT:
+                self._pass_on(text=message.data)
+            case _:
+                self._port.report(f"a text is longer than {MAX_TEXT}: left out", self.name)
+
+    def _pass_on(self, **values: Any) -> None:
+        self._port.say(self.kind, topic=self.name, **values)

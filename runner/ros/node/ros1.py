@@ -1,0 +1,432 @@
+"""The node of ROS 1, by rospy.
+
+rospy asks the ROS master without a limit in time, and asks again until it answers. So what needs the master happens in
+the main thread alone, after the master has answered within a limit; all else happens in others, and goes on without it.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import socket
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from http.client import HTTPConnection, HTTPException
+from importlib import import_module
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
+from xmlrpc.client import Error, ServerProxy, Transport
+
+from .inputs import NEWEST, SERVICES, TYPES, InputTopic
+from .pictures import LATE_NS, LOOK_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
+from .port import NodeError, Port
+
+IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
+DEPTH = 10  # pictures of a topic that wait to be passed on, of which the oldest go first
+BUFFER_BYTES = 1 << 24  # read at once: all that has come, so that the newest is seen
+ANSWER_S = 5.0  # for a master or node on a busy machine
+RECONNECT_S = 2.0  # between two attempts to reach a publisher, which rospy makes once
+CALL_S = 30.0  # within which the other side of the port has answered any call
+ABSENT = (OSError, Error, HTTPException, ExpatError)  # from whoever does not answer, or not as ROS does
+ANY_LOOPBACK = "127.255.255.254"  # where only a server on all addresses answers
+
+
+class Registrations(NamedTuple):
+    """What a ROS master knows: names of nodes by topic or service, and the types of topics."""
+
+    publishers: dict[str, list[str]]
+    subscribers: dict[str, list[str]]
+    services: dict[str, list[str]]
+    types: dict[str, str]
+
+
+class _LimitedTransport(Transport):
+    def make_connection(self, host: Any) -> HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = ANSWER_S
+        return connection
+
+
+class RosMaster:
+    """The ROS master, which may be absent, and may come back without any registration. Used in one thread.
+
+    node       whole name of this node
+    admit_all  whether it may be one that any node of the network can register with
+    raises     NodeError
+    """
+
+    def __init__(self, port: Port, uri: str, node: str, admit_all: bool) -> None:
+        self._port, self._uri, self._node, self._admit_all = port, uri, node, admit_all
+        self._proxy = _proxy(uri)
+        self._is_absent = False  # as reported
+
+    def look(self) -> Registrations | None:
+        """What it knows; None: it does not answer, which is reported once."""
+        known = None
+        with suppress(*ABSENT):
+            publishers, subscribers, services = (dict(pairs) for pairs in self._call("getSystemState"))
+            known = Registrations(publishers, subscribers, services, dict(self._call("getTopicTypes")))
+        if (known is None) != self._is_absent:
+            self._is_absent = known is None
+            self._port.report(f"the ROS master at {self._uri} {'does not answer' if self._is_absent else 'answers'}")
+        return known
+
+    def _call(self, method: str, *words: Any) -> Any:
+        """raises  one of ABSENT, also if the master refuses"""
+        code, text, value = getattr(self._proxy, method)(self._node, *words)
+        if code != 1:
+            raise ConnectionError(text)
+        return value
+
+    def check(self) -> None:
+        """Refuse a master that admits any node of the network.
+
+        raises  NodeError
+        """
+        if self._admit_all:
+            return
+        try:
+            socket.create_connection((ANY_LOOPBACK, urlsplit(self._uri).port or 80), ANSWER_S).close()
+        except OSError:
+            return
+        rule = "admits any node of the network: start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true"
+        raise NodeError(f"the ROS master at {self._uri} {rule}")
+
+    def check_name(self) -> None:
+        """Refuse the name of a node that runs: the master would end that one.
+
+        raises  NodeError
+        """
+        try:
+            uri = self._call("lookupNode", self._node)
+            _proxy(uri).getPid(self._node)
+        except ABSENT:
+            return
+        raise NodeError(f"a node of the name {self._node} runs already, at {uri}: give another ros.node")
+
+    def register(self, known: Registrations) -> None:
+        """Register what rospy has registered before and the master does not know: it has been started anew.
+
+        raises  NodeError
+        """
+        import rospy
+        from rospy.impl.registration import get_service_manager, get_topic_manager
+
+        topics, services, uri = get_topic_manager(), get_service_manager(), rospy.get_node_uri()
+
+        def unknown(those: list[list[str]], to: dict[str, list[str]]) -> list[list[str]]:
+            return [one for one in those if self._node not in to.get(one[0], ())]
+
+        publications = unknown(topics.get_publications(), known.publishers)
+        subscriptions = unknown(topics.get_subscriptions(), known.subscribers)
+        offers = unknown(services.get_services(), known.services)
+        if publications or subscriptions or offers:
+            self.check()
+        for name, kind in publications:
+            self._call("registerPublisher", name, kind, uri)
+        for name, kind in subscriptions:
+            publishers = self._call("registerSubscriber", name, kind, uri)
+            _proxy(uri).publisherUpdate(self._node, name, publishers)  # as the master does
+        for name, where in offers:
+            self._call("registerService", name, where, uri)
+
+
+def _proxy(uri: str) -> ServerProxy:
+    try:
+        return ServerProxy(uri, transport=_LimitedTransport())
+    except OSError as error:  # another protocol than HTTP
+        raise NodeError(f"{uri}: {error}") from error
+
+
+class Worker:
+    """A thread that does one thing after another."""
+
+    def __init__(self) -> None:
+        self._tasks: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._failed: Exception | None = None
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def add(self, task: Callable[..., object], *arguments: object) -> None:
+        """From any thread."""
+        self._tasks.put(partial(task, *arguments))
+
+    def check(self) -> None:
+        """raises what a task has raised; nothing is done after that"""
+        if self._failed:
+            raise self._failed
+
+    def _work(self) -> None:
+        try:
+            while True:
+                self._tasks.get()()
+        except Exception as error:
+            self._failed = error
+
+
+class Ros1PictureTopic(PictureTopic):
+    """Subscribes once the topic has a publisher. Pictures and reports are the worker's."""
+
+    def __init__(self, port: Port, name: str, worker: Worker) -> None:
+        import rospy
+
+        super().__init__(port, name, lambda: int(rospy.Time.now().to_nsec()))
+        self._worker = worker
+        self._subscriber: Any = None
+        self._kind, self._began = "", 0.0  # of the subscription
+        self._lock = threading.Lock()
+        self._waiting: deque[Any] = deque()  # pictures
+        self._dropped: list[Any] = []  # headers of pictures that have waited too long
+
+    def look(self, known: Registrations | None) -> None:
+        """To be called every LOOK_S by the main thread with what the master knows, if it answers."""
+        import rospy
+
+        name = rospy.resolve_name(own_name(self.name))
+        publishers = known.publishers.get(name, []) if known else []
+        if known and publishers:
+            self._check_type(known.types.get(name, ""))
+        if self._is_connected():
+            self._worker.add(self.judge, "its publisher sends no picture")
+        elif known:  # otherwise it is reported that the master does not answer
+            self._worker.add(self.judge, "its publisher cannot be reached" if publishers else "no publisher")
+
+    def _check_type(self, kind: str) -> None:
+        if kind in (IMAGE, COMPRESSED):
+            self._subscribe(kind)
+        else:
+            self._worker.add(self.fail, f"has messages of type {kind}, must be {IMAGE} or {COMPRESSED}")
+
+    def _is_connected(self) -> bool:
+        return self._subscriber is not None and self._subscriber.get_num_connections() > 0
+
+    def _subscribe(self, kind: str) -> None:
+        """Subscribe, again for another type, and where there is no connection."""
+        is_lost = not self._is_connected() and time.monotonic() - self._began > RECONNECT_S
+        if self._kind == kind and not is_lost:
+            return
+        import rospy
+        from sensor_msgs.msg import CompressedImage, Image
+
+        if self._subscriber:
+            self._subscriber.unregister()
+        message = Image if kind == IMAGE else CompressedImage
+        own, options = own_name(self.name), {"buff_size": BUFFER_BYTES, "tcp_nodelay": True}
+        self._subscriber = rospy.Subscriber(own, message, self._on_message, **options)
+        self._kind, self._began = kind, time.monotonic()
+
+    def _on_message(self, message: Any) -> None:
+        """In a thread of the connection, which reads on whatever becomes of this picture."""
+        with self._lock:
+            self._waiting.append(message)
+            is_first = len(self._waiting) == 1
+            if len(self._waiting) > DEPTH:
+                self._dropped.append(identity_of(self._waiting.popleft()))
+        if is_first:
+            self._worker.add(self._take)
+
+    def _take(self) -> None:
+        """Pass on the pictures that wait. Where this node runs late, the newest win."""
+        with self._lock:
+            dropped, waiting = tuple(self._dropped), tuple(self._waiting)
+            self._dropped.clear()
+            self._waiting.clear()
+        for identity in dropped:
+            self._count(*identity)
+            self.losses.late += 1
+        newest = waiting[-1].header.stamp.to_nsec()
+        for message in waiting:
+            self._count(*identity_of(message))
+            stamp = message.header.stamp.to_nsec()
+            if newest - stamp > LATE_NS:
+                self.losses.late += 1
+            else:
+                self.pass_on(message, stamp)
+
+    def _count(self, publisher: str, number: int) -> None:
+        # TCP loses nothing: what is missing has been replaced by newer pictures where it was published.
+        self.losses.untransported += self.losses.add(publisher, number)
+
+
+def identity_of(message: Any) -> tuple[str, int]:
+    """The publisher of a picture, and its number, which every publisher's library counts."""
+    return message._connection_header.get("callerid", ""), message.header.seq
+
+
+def own_name(name: str) -> str:
+    """A name as rospy has it: ROS 1 writes ~name where ROS 2 writes ~/name."""
+    return f"~{name[2:]}" if name.startswith("~/") else name
+
+
+class Ros1InputTopic(InputTopic):
+    def __init__(self, port: Port, name: str, kind: str) -> None:
+        import rospy
+
+        super().__init__(port, name, kind)
+        package, type_name = TYPES[kind]
+        self._type = f"{package}/{type_name}"
+        self._publishers: list[str] = []  # names of nodes, as the master knew them last
+        message = getattr(import_module(f"{package}.msg"), type_name)
+        size = 1 if kind in NEWEST else None
+        self._subscriber = rospy.Subscriber(own_name(name), message, self.on_message, queue_size=size, tcp_nodelay=True)
+
+    def look(self, known: Registrations) -> None:
+        """To be called every LOOK_S with what the master knows."""
+        name = self._subscriber.resolved_name
+        self._publishers = known.publishers.get(name, [])
+        self.check_types([known.types.get(name, self._type)] if self._publishers else [], self._type)
+
+    def publishing_nodes(self, message: Any) -> list[str]:
+        return sorted({message._connection_header.get("callerid", ""), *self._publishers})
+
+
+class Ros1Services:
+    """Services whose calls the other side of the port answers.
+
+    kinds  by name, see SERVICES
+    """
+
+    def __init__(self, port: Port, kinds: dict[str, str]) -> None:
+        import rospy
+
+        self._port = port
+        self._waiting: dict[str, Future[tuple[bool, str]]] = {}
+        for name, kind in kinds.items():
+            package, type_name = SERVICES[kind]
+            service = getattr(import_module(f"{package}.srv"), type_name)
+            rospy.Service(own_name(name), service, partial(self._call, name))
+
+    def _call(self, name: str, request: Any) -> tuple[bool, str]:
+        """In a thread of the call."""
+        call = uuid.uuid4().hex
+        answer: Future[tuple[bool, str]] = Future()
+        self._waiting[call] = answer
+        self._port.say("call", topic=name, call=call, value=getattr(request, "data", None))
+        try:
+            return answer.result(CALL_S)
+        finally:
+            self._waiting.pop(call, None)
+
+    def answer(self, order: dict[str, Any]) -> None:
+        """Calls that nobody waits for any more are left out."""
+        if answer := self._waiting.pop(order["call"], None):
+            answer.set_result((order["success"], order["text"]))
+
+
+class Ros1Outputs:
+    """Publishers of std_msgs/String.
+
+    kept  by topic, whether the newest text is kept for subscribers that come later
+    """
+
+    def __init__(self, kept: dict[str, bool]) -> None:
+        import rospy
+        from std_msgs.msg import String
+
+        self._publishers = {
+            topic: rospy.Publisher(own_name(topic), String, queue_size=10, latch=keep) for topic, keep in kept.items()
+        }
+
+    def publish(self, order: dict[str, Any]) -> None:
+        self._publishers[order["topic"]].publish(order["text"])
+
+
+class Ros1Pictures(PictureQueue):
+    """Publishers of sensor_msgs/Image and CameraInfo, made with the first picture for their topics."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._publishers: dict[str, tuple[Any, Any]] = {}
+
+    def publish(self, topic: str) -> None:
+        """Publish the picture that waits."""
+        order, memory = self.take(topic)
+        try:
+            image, info = self._publishers_of(topic)
+            if image.get_num_connections():
+                data = os.pread(memory, order["step"] * order["height"], 0)
+                image.publish(stamped(image.data_class(data=data, **image_fields(order)), order))
+            if info.get_num_connections():
+                info.publish(stamped(info.data_class(**info_fields(order)), order))
+        finally:
+            os.close(memory)
+
+    def _publishers_of(self, topic: str) -> tuple[Any, Any]:
+        import rospy
+        from sensor_msgs.msg import CameraInfo, Image
+
+        if topic not in self._publishers:
+            image, info = (
+                rospy.Publisher(own_name(f"{topic}/{name}"), kind, queue_size=2, tcp_nodelay=True)
+                for kind, name in ((Image, "image"), (CameraInfo, "camera_info"))
+            )
+            self._publishers[topic] = image, info
+        return self._publishers[topic]
+
+
+def stamped(message: Any, order: dict[str, Any]) -> Any:
+    message.header.frame_id = order["frame_id"]
+    message.header.stamp.secs, message.header.stamp.nsecs = divmod(order["stamp"], SECOND_NS)
+    return message
+
+
+def run(port: Port, task: dict[str, Any]) -> None:
+    """Be the node until the other side of the port closes it.
+
+    raises  NodeError
+    """
+    import rospy
+
+    master = RosMaster(
+        port, os.environ["ROS_MASTER_URI"], f"{task['namespace'].rstrip('/')}/{task['node']}", task["admit_all"]
+    )
+    while not master.look():
+        if port.closes(LOOK_S):
+            return
+    master.check()
+    master.check_name()
+    rospy.core.configure_logging = lambda *_: None  # would write below ~/.ros; what people are to know is reported
+    rospy.init_node(task["node"], argv=remappings(task["remap"]), disable_signals=True, disable_rosout=True)
+    worker = Worker()
+    topics = [Ros1PictureTopic(port, name, worker) for name in task["pictures"]]
+    inputs = [Ros1InputTopic(port, name, kind) for name, kind in task["inputs"].items()]
+    outputs, pictures = Ros1Outputs(task["outputs"]), Ros1Pictures()
+    services = Ros1Services(port, task["services"])
+
+    def obey() -> None:
+        for order, memory in port.orders():
+            if memory < 0:
+                worker.add(services.answer if "call" in order else outputs.publish, order)
+            elif pictures.put(order, memory):
+                worker.add(pictures.publish, order["picture"])
+
+    port.say("ready")
+    threading.Thread(target=obey, daemon=True).start()
+    while not port.closes(LOOK_S):
+        worker.check()
+        if rospy.is_shutdown():
+            raise NodeError("another node of the same name has come, or it was ended over ROS")
+        look(master, topics, inputs)
+    rospy.signal_shutdown("closed")
+
+
+def look(master: RosMaster, topics: list[Ros1PictureTopic], inputs: list[Ros1InputTopic]) -> None:
+    known = master.look()
+    if known:
+        with suppress(*ABSENT):  # it has gone meanwhile: the next look reports it
+            master.register(known)
+        for one in inputs:
+            one.look(known)
+    for topic in topics:
+        topic.look(known)
+
+
+def remappings(remap: dict[str, str]) -> list[str]:
+    """As on the command line of a node."""
+    return [f"{own_name(name)}:={own_name(used)}" for name, used in remap.items()]
