@@ -118,12 +118,13 @@ def vehicle_file(cameras, size, estimated):
 def serving(station):
     """The page's server, which sends the pictures of all cameras but the silent ones."""
     page, ended = PageServer(station.vehicle, station), threading.Event()
+    page.behind_s = 0.0  # how long ago pictures were captured
 
     def send():
         while not ended.wait(EVERY_S):
             for name, data in station.units.items():
                 if name not in station.silent:
-                    page.show(name, read_unit(data, time.time(), time.time()))
+                    page.show(name, read_unit(data, time.time() - page.behind_s, time.time()))
 
     page.start()
     sending = threading.Thread(target=send)

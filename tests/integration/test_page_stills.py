@@ -84,7 +84,7 @@ def test_lines_end_where_marks_on_the_ground_are(page):
 
 def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(page, station):
     number = list(CAMERAS).index("fisheye") + 1
-    for key in (str(number), "Enter", "g", "r"):
+    for key in (str(number), "Enter", "g", "l"):
         page.locator("body").press(key)
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "straight, 100° of 130°")
     until(lambda: scale_of(page, "fisheye", CAMERAS["fisheye"]) > 1)
@@ -111,7 +111,7 @@ def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(
     drag(page, (box["x"] + 300, box["y"] + 200), (box["x"] + 500, box["y"] + 400))
     until(lambda: "no ROI can be chosen on a straightened picture" in page.inner_text("#toasts"))
     assert station.asked is None
-    page.locator("body").press("r")
+    page.locator("body").press("l")
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "")
 
 

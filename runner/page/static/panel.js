@@ -29,7 +29,7 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
-const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show it as it comes (r)", onclick: () => toggleStraight() }, "Straighten");
+const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show it as it comes (l)", onclick: () => toggleStraight() }, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({

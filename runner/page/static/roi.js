@@ -66,7 +66,7 @@ export function fullRegion(name) {
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
-  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; straighten it no longer (r), or type its numbers";
+  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; straighten it no longer (l), or type its numbers";
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
