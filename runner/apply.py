@@ -138,8 +138,10 @@ class _Glib:
         """Run a function in the loop's thread and wait for it; its exceptions are raised here.
 
         what    the function's work, for messages
-        raises  RunError if it is not done within CALL_S
+        raises  RunError if it is not done within CALL_S, or the loop has ended
         """
+        if self._called < 0:
+            raise RunError(f"GStreamer's thread has ended: {what}")
         done = threading.Event()
         raised: list[BaseException] = []
 
@@ -176,7 +178,8 @@ class _Glib:
         self._thread.join(timeout=5)
         if not self._thread.is_alive():
             GLib.source_remove(self._watch)
-            os.close(self._called)
+            called, self._called = self._called, -1  # its number may soon be another file's
+            os.close(called)
 
 
 def _kept(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:

@@ -140,30 +140,31 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
 
 
+async def stated(station, attention):
+    for _ in range(500):
+        if station.attention == attention:
+            return
+        await asyncio.sleep(0.01)
+    assert station.attention == attention
+
+
 def test_the_station_is_told_whether_the_driver_watches():
     """By the page in control alone; a page that is closed is absent, one that gives control away says nothing."""
 
     async def drive(own, station):
-        async def stated(attention):
-            for _ in range(500):
-                if station.attention == attention:
-                    return
-                await asyncio.sleep(0.01)
-            assert station.attention == attention
-
         async with aiohttp.ClientSession() as session:
             driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
-            await stated(None)
+            await stated(station, None)
             await driver.send_json({"attention": "watching"})
-            await stated("watching")
+            await stated(station, "watching")
             async with session.ws_connect(f"{own}/live?viewer=other", origin=own) as other:
                 await other.send_json({"attention": "hidden"})
                 await driver.send_json({"attention": "slow"})
-                await stated("slow")
+                await stated(station, "slow")
                 await other.send_json({"take_control": True})
-                await stated("hidden")
+                await stated(station, "hidden")
                 await driver.send_json({"take_control": True})
-                await stated("slow")
+                await stated(station, "slow")
                 for invalid in ("absent", "asleep", 1, None):
                     await driver.send_json({"attention": invalid, "id": "1"})
                     while (told := await driver.receive_json(timeout=5))["kind"] != "reply":
@@ -171,12 +172,12 @@ def test_the_station_is_told_whether_the_driver_watches():
                     assert told["result"] == "refused"
             assert station.attention == "slow"
             await driver.close()
-            await stated("absent")
+            await stated(station, "absent")
             driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
             await driver.send_json({"attention": "unfocused"})
-            await stated("unfocused")
+            await stated(station, "unfocused")
             await driver.send_json({"release_control": True})
-            await stated(None)
+            await stated(station, None)
 
     with served() as (port, station):
         asyncio.run(drive(f"http://localhost:{port}", station))
@@ -267,35 +268,28 @@ def test_a_monitor_has_selection_and_control_of_the_page_of_its_browser():
 
 def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one():
     async def steps(windows, station):
-        async def stated(attention):
-            for _ in range(500):
-                if station.attention == attention:
-                    return
-                await asyncio.sleep(0.01)
-            assert station.attention == attention
-
         page = await windows.open("driver", "here")
         monitor = await windows.open("m", "here", show="rear_center")
         stranger = await windows.open("s", "there", show="rear_center")
         await page.send_json({"attention": "watching"})
-        await stated("watching")
+        await stated(station, "watching")
         await told(monitor, "control", elsewhere=True)
         await stranger.send_json({"attention": "hidden"})
         await monitor.send_json({"attention": "unfocused"})
         await page.send_json({"attention": "unfocused"})
-        await stated("unfocused")
+        await stated(station, "unfocused")
         await told(monitor, "control", elsewhere=False)
         await monitor.send_json({"attention": "watching"})
-        await stated("watching")
+        await stated(station, "watching")
         await told(page, "control", elsewhere=True)
         await monitor.send_json({"attention": "slow"})
-        await stated("slow")
+        await stated(station, "slow")
         await monitor.send_json({"attention": "hidden"})
-        await stated("hidden")
+        await stated(station, "hidden")
         await monitor.close()
-        await stated("unfocused")
+        await stated(station, "unfocused")
         await page.close()
-        await stated("absent")
+        await stated(station, "absent")
 
     in_windows(steps)
 

@@ -91,25 +91,26 @@ class OneShot:
     """A probe that can be armed again and again. While it is not, a buffer costs nothing.
 
     on_buffer  called in the streaming thread with the pad and each buffer that passes it, until it returns True
+    armed      whether a buffer is awaited
     """
 
     def __init__(self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool]) -> None:
         self._pad, self._on_buffer = pad, on_buffer
         self._key = next(_keys)
-        self._armed = False
+        self.armed = False
         _shots[self._key] = self
 
     def arm(self) -> None:
         """Look at the next buffer, unless one is awaited already. To be called by one thread at a time."""
-        if not self._armed:
-            self._armed = True
+        if not self.armed:
+            self.armed = True
             address = int(_pointer(self._pad.__gpointer__, None))
             _add_probe(address, Gst.PadProbeType.BUFFER, _on_probe, self._key, None)
 
     def look(self, address: int) -> int:
         if not self._on_buffer(self._pad, PassingBuffer(address)):
             return int(Gst.PadProbeReturn.OK)
-        self._armed = False
+        self.armed = False
         return int(Gst.PadProbeReturn.REMOVE)
 
 

@@ -33,7 +33,6 @@ class EncoderWatch:
         encoder = next((element for element in elements if _is_encoder(element)), None)
         self._into = OneShot(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
         self._out = OneShot(encoder.get_static_pad("src"), self._on_coded) if encoder else None
-        self._awaited = False
         self._left = 0
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
         self._measured = RecentValue[SenderStages]()
@@ -43,8 +42,7 @@ class EncoderWatch:
 
         To be called a few times a second, from one thread.
         """
-        if self._into and not self._awaited:
-            self._awaited = True
+        if self._into and self._out and not self._out.armed:
             self._into.arm()
         return self._measured.get()
 
@@ -66,7 +64,6 @@ class EncoderWatch:
             return False  # one that the encoder took earlier
         if abs(ahead_s) < SAME_S:  # else the encoder has dropped the picture
             self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
-        self._awaited = False
         return True
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import subprocess
 import threading
 import time
@@ -12,6 +13,7 @@ from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from painted import CAR
 
 from browser import until
@@ -23,6 +25,15 @@ from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
 from runner.records import CameraState, VehicleState, applied_to_json
+
+MARKS = [
+    pytest.mark.gst,
+    pytest.mark.soak,  # builds a street
+    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+]
+image = pytest.importorskip("PIL.Image")
+pytest.importorskip("cv2")
+pytest.importorskip("numba")
 
 FPS = 1  # as the page knows it; pictures come more often, so that none is late on a busy machine
 EVERY_S = 0.4
@@ -137,7 +148,7 @@ def serving(station):
         page.stop()
 
 
-def on_screen(image, locator, before, mode="L"):
+def on_screen(locator, before, mode="L"):
     """A part of the screen in a mode of PIL, and what `before` returned both before and after it: something true."""
 
     def pictured():

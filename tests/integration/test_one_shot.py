@@ -119,7 +119,7 @@ def test_an_owner_that_is_gone_is_called_no_more(playing):
     last = OneShot(pad, lambda _pad, _buffer: True)
     pipeline.set_state(Gst.State.PLAYING)
     last.arm()
-    until(lambda: not last._armed)
+    until(lambda: not last.armed)
     assert seen == []
 
 

@@ -9,20 +9,13 @@ import shutil
 import numpy as np
 import pytest
 from painted import ALL_AROUND, CAR, FINER, TOP_CAMERAS, TOP_SIZE, Mounted, corner, native_pictures, paint
-from stills import Station, on_screen, serving
+from stills import MARKS, Station, image, on_screen, serving
 
 from browser import all_live, opened, shot, until
 from rig import CHROMIUM_FLAGS
 from runner.core.model import Pose
 
-pytestmark = [
-    pytest.mark.gst,
-    pytest.mark.soak,  # builds a street
-    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
-]
-image = pytest.importorskip("PIL.Image")
-pytest.importorskip("cv2")
-pytest.importorskip("numba")
+pytestmark = MARKS
 
 WITHIN_M = 0.05
 AROUND_M = 0.3  # how far from its place a mark is looked for
@@ -84,7 +77,7 @@ def seen(page, mode="RGB", still=()):
         changes = [change for change in page.evaluate("tod.measure()")["status_log"] if change[1] in TOP_CAMERAS]
         return moves(view, still) and (lying(view), changes)
 
-    pixels, (view, _) = on_screen(image, page.locator("#birdseye"), steady, mode)
+    pixels, (view, _) = on_screen(page.locator("#birdseye"), steady, mode)
     return pixels, view
 
 
@@ -135,7 +128,7 @@ def test_the_vehicle_is_as_large_as_it_is(page):
 
 
 def is_as_large_as_stated(page):
-    pixels, view = on_screen(image, page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
+    pixels, view = on_screen(page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
     px, half = view["px_per_m"], CAR.width_m / 2
     row, column = round(view["y"]), round(view["x"] + 0.8 * px * half)  # beside the wedge that points ahead
     found = [*run(pixels[row], column), *run(pixels[:, column], row)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import threading
 import time
 from contextlib import contextmanager
@@ -11,19 +10,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from painted import CAMERAS, SIZE, WITHIN_PX, ends_of, found, native_pictures, paint
-from stills import Station, on_screen, serving
+from stills import MARKS, Station, on_screen, serving
 
 from browser import PADS, all_live, opened, shot, until
 from runner.records import Sample
 
-pytestmark = [
-    pytest.mark.gst,
-    pytest.mark.soak,  # builds a street
-    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
-]
-image = pytest.importorskip("PIL.Image")
-pytest.importorskip("cv2")
-pytest.importorskip("numba")
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +150,7 @@ def seen(page, name):
     def live():
         return page.evaluate("tod.measure()")["cameras"][name]["status"] == "live" and guides(page, name)
 
-    return on_screen(image, page.locator(f"[data-camera={name}] .picture"), live)
+    return on_screen(page.locator(f"[data-camera={name}] .picture"), live)
 
 
 def scale_of(page, name, camera):
