@@ -156,7 +156,7 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
         with RtspClient(vehicle.url()) as client:
             began = time.monotonic()
             assert client.open() == [503]
-            assert time.monotonic() - began < 1
+            assert time.monotonic() - began < 3  # after OPEN_S, 0.9 s
         assert max(took) < 0.2
         frame = bytes(1920 * 1040 * 3 // 2)
         until(lambda: vehicle.side.push(CAMERA, frame))

@@ -117,6 +117,7 @@ function supervise() {
 function connection(open) {
   if (station.connected === open) return;
   station.connected = open;
+  if (!open) judgeAll();
   tell({ kind: "socket", open });
 }
 
@@ -154,7 +155,9 @@ function hello(message) {
 
 function decided(message) {
   if (message.online && !station.online) streams.forEach((stream) => stream.started());
+  const gone = station.online && !message.online;
   station.online = message.online;
+  if (gone) judgeAll(); // each picture is marked before the banner names the cause
   for (const stream of streams) if (message.cameras?.[stream.name]) stream.decide(message.cameras[stream.name]);
 }
 
