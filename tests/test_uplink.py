@@ -15,7 +15,7 @@ from simulated_link import Link, busy, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, LinkCap, advanced
+from runner.core.link_cap import LEAST, LinkCap, Overuse, advanced
 from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, updated
 from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
@@ -312,6 +312,20 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
         t += 0.1
         cap = advanced(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
     assert cap.kbps is None or cap.kbps >= 5000
+
+
+@pytest.mark.parametrize("after, known", [(1870, 1870), (2520, 1900), (1300, 1300)])
+def test_a_low_rate_amid_the_burst_after_a_stall_counts_no_more_once_more_has_arrived(after: int, known: int) -> None:
+    """As measured on a busy machine; the cap then stayed at 1200 kbit/s for seconds."""
+    overuse = Overuse(0.0, Fraction(1900), Fraction(4200))
+    cap = LinkCap(kbps=Fraction(1760), overuse=overuse, before=Fraction(1400), began=-9.0, changed=0.6, measured=0.6)
+    burst = [("stalled", 1400, 0), ("filling", 2100, 84), ("filling", 1235, 65), ("filling", after, 250)]
+    for number, (state, kbps, queue_ms) in enumerate(burst):
+        t = 0.7 + 0.06 * number
+        link = LinkMeasured(t=t, kbps=Fraction(kbps), queue_ms=queue_ms, loss=0, state=LinkState(state), rtt_ms=4)
+        cap = advanced(cap, link, t, Fraction(4200))
+    assert cap.overuse
+    assert cap.overuse.carried == known
 
 
 def test_no_sequence_of_reports_breaks_the_cap() -> None:

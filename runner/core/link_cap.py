@@ -62,6 +62,13 @@ class Overuse(NamedTuple):
     limit: Kbps
 
 
+class Lowering(NamedTuple):
+    """When the link proved to carry less while no cut was due (t), and what it was known to carry before, kbit/s."""
+
+    t: float
+    known: Kbps
+
+
 class Stall(NamedTuple):
     """Time in which nothing arrives: since when (t), and how often the cap was halved in it."""
 
@@ -92,6 +99,7 @@ class LastLimit(NamedTuple):
 
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
+NOT_LOWERED = Lowering(-float("inf"), Fraction(0))
 NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
@@ -118,6 +126,7 @@ class LinkCap:
     losses      of packets
     limit       the last one
     short       t at which the queue was shorter than JITTER_MS, last
+    lowering    of what the overused link is known to carry, the last one
     """
 
     kbps: Kbps | None = None
@@ -139,6 +148,7 @@ class LinkCap:
     losses: Losses = NONE_LOST
     limit: LastLimit = NO_LIMIT
     short: float = -float("inf")
+    lowering: Lowering = NOT_LOWERED
 
 
 UNCAPPED = LinkCap()
@@ -318,7 +328,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return _learned(_lowered(cap, carried), link, t)
+        return _learned(_lowered(cap, carried, link, t), link, t)
     return replace(
         cap,
         kbps=_short(target),
@@ -331,19 +341,33 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     )
 
 
-def _lowered(cap: LinkCap, carried: Kbps) -> LinkCap:
+def _lowered(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float) -> LinkCap:
     """The cap where the link proves to carry less than at its last overuse, and no cut is due."""
     if cap.overuse is None or carried >= cap.overuse.carried:
         return cap
-    return replace(cap, overuse=cap.overuse._replace(carried=carried))
+    known = max(cap.overuse.carried, cap.lowering.known if _is_recent(cap.lowering.t, link, t) else carried)
+    return replace(cap, overuse=cap.overuse._replace(carried=carried), lowering=Lowering(t, known))
 
 
 def _learned(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The cap soon after an overuse, while its queue lasts: the link carries what arrives, if more than it seemed."""
+    """The cap soon after an overuse, while its queue lasts: the link carries what arrives, if more than it seemed.
+
+    Likewise soon after a measurement that showed less, but then no more than was known before. After a stall units
+    arrive in bursts, of which one measurement may hold a pause.
+    """
     last = cap.overuse
-    if last is None or link.kbps is None or link.kbps <= last.carried or t - last.t > SEEN_S + _rtt_s(link):
+    if last is None or link.kbps is None or link.kbps <= last.carried:
         return cap
-    return replace(cap, overuse=last._replace(carried=link.kbps))
+    if _is_recent(last.t, link, t):
+        return replace(cap, overuse=last._replace(carried=link.kbps))
+    if _is_recent(cap.lowering.t, link, t):
+        return replace(cap, overuse=last._replace(carried=max(last.carried, min(link.kbps, cap.lowering.known))))
+    return cap
+
+
+def _is_recent(since: float, link: LinkMeasured, t: float) -> bool:
+    """Whether a measured rate may still hold something of that time."""
+    return t - since <= SEEN_S + _rtt_s(link)
 
 
 def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
