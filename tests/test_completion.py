@@ -20,6 +20,7 @@ from helpers import Command, UserConf
 from runner.configuration.files import GROUPS
 from runner.verbs import VERBS
 from runner.verbs.completion import SCRIPTS, candidates
+from runner.verbs.export import OUTPUTS
 
 PROGRAM = Path(sys.executable).with_name("tod-runner")
 
@@ -43,6 +44,9 @@ def van(conf: UserConf) -> UserConf:
         ("print -m -", []),
         ("validate -", []),
         ("print fo", ["format="]),
+        ("print format=", ["format=text", "format=json", "format=yaml"]),
+        ("validate all=t", ["all=true"]),
+        ("report output=", []),
         ("print mod", ["modes=", "mode=", "modes."]),
         ("print mode=", ["mode=single", "mode=automatic", "mode=collective"]),
         ("print insecure=", ["insecure=true", "insecure=false"]),
@@ -66,6 +70,10 @@ def van(conf: UserConf) -> UserConf:
 def test_what_is_offered(line: str, expected: list[str]) -> None:
     *before, last = line.split(" ")
     assert candidates(before, last) == expected
+
+
+def test_every_format_of_an_export_is_offered() -> None:
+    assert VERBS["export"].choices["format"] == tuple(OUTPUTS)
 
 
 @pytest.mark.parametrize("verb", VERBS)

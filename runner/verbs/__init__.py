@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +22,7 @@ class Verb(NamedTuple):
     takes     meaning of words without =, any number of them; "": none are accepted
     sweeps    whether -m is accepted
     composes  whether it reads a configuration, and so takes overrides
+    choices   the words that an argument may have, by argument; the first is the default
     """
 
     summary: str
@@ -30,8 +31,10 @@ class Verb(NamedTuple):
     takes: str = ""
     sweeps: bool = False
     composes: bool = True
+    choices: Mapping[str, tuple[str, ...]] = {}
 
 
+NO_YES = ("false", "true")
 CONVERSION = ("output", "vehicle", "bag", "width_px", "height_px", "fps", "overwrite")
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
@@ -40,18 +43,38 @@ VERBS = {
         "runner.verbs.print",
         ("total_kbps", "format"),
         sweeps=True,
+        choices={"format": ("text", "json", "yaml")},
     ),
-    "init": Verb("a directory of your own to start from", "runner.verbs.init", ("files",), "DIR", composes=False),
-    "validate": Verb("check configuration files and their combinations", "runner.verbs.validate", ("all",), "FILE"),
+    "init": Verb(
+        "a directory of your own to start from",
+        "runner.verbs.init",
+        ("files",),
+        "DIR",
+        composes=False,
+        choices={"files": ("all", "schemas")},
+    ),
+    "validate": Verb(
+        "check configuration files and their combinations",
+        "runner.verbs.validate",
+        ("all",),
+        "FILE",
+        choices={"all": NO_YES},
+    ),
     "replay": Verb(
         "events in, decisions out, no video",
         "runner.verbs.replay",
         ("input", "output", "log", "link", "positions", "topic"),
         sweeps=True,
+        choices={"link": ("logged", "again")},
     ),
     "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
     "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
-    "latency": Verb("measure glass-to-glass latency", "runner.verbs.latency", ("camera", "duration_s", "loop")),
+    "latency": Verb(
+        "measure glass-to-glass latency",
+        "runner.verbs.latency",
+        ("camera", "duration_s", "loop"),
+        choices={"loop": NO_YES},
+    ),
     "ros": Verb("the control link as topics of ROS", "runner.verbs.ros", ("duration_s",)),
     "demo": Verb(
         "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
@@ -73,9 +96,21 @@ VERBS = {
         DRIVE,
         composes=False,
     ),
-    "export": Verb("a drive as MCAP or ROS 2 bag", "runner.verbs.export", ("output", "format"), DRIVE, composes=False),
+    "export": Verb(
+        "a drive as MCAP or ROS 2 bag",
+        "runner.verbs.export",
+        ("output", "format"),
+        DRIVE,
+        composes=False,
+        choices={"format": ("mcap", "rosbag2")},
+    ),
     "convert": Verb(
-        "a vehicle from the paper's own camera list", "runner.verbs.convert", CONVERSION, "FILE", composes=False
+        "a vehicle from the paper's own camera list",
+        "runner.verbs.convert",
+        CONVERSION,
+        "FILE",
+        composes=False,
+        choices={"overwrite": NO_YES},
     ),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
@@ -186,8 +221,9 @@ class Arguments:
         inner = {key: str(path / name) for key in keys if (path := self.path(key))}
         return replace(self, values=self.values | inner)
 
-    def choice(self, key: str, options: Sequence[str]) -> str:
-        """One of some words; the first if not given."""
+    def choice(self, key: str, among: Sequence[str] = ()) -> str:
+        """One of the argument's choices, or of some of them; the first if not given."""
+        options = among or VERBS[self.verb].choices[key]
         value = self.values.get(key, options[0])
         if value not in options:
             raise UserError("command line", key, repr(value), f"must be one of {', '.join(options)}")

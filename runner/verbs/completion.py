@@ -79,7 +79,8 @@ def words(breaks: str, line: str) -> int:
 def candidates(before: Sequence[str], last: str) -> list[str]:
     """The words that may replace the last, unfinished one; `before`: those between the program and it."""
     found = _words(before[0], before[1:], last) if before else [*VERBS, "--help", "--version"]
-    return [word for word in dict.fromkeys(found) if word.startswith(last)]
+    # A key with nothing to offer behind its = is no word: the shell would put a blank behind it, in place of files.
+    return [word for word in dict.fromkeys(found) if word.startswith(last) and not (word == last and last[-1] in "=.")]
 
 
 def _words(verb: str, before: Sequence[str], last: str) -> Iterator[str]:
@@ -89,6 +90,8 @@ def _words(verb: str, before: Sequence[str], last: str) -> Iterator[str]:
     yield from WORDS.get(verb, ())
     yield from (["-m"] if its.sweeps and "-m" not in before else [])
     yield from (f"{name}=" for name in its.arguments)
+    if "=" in last:
+        yield from (f"{name}={value}" for name, values in its.choices.items() for value in values)
     if its.composes:
         yield "conf="
         yield from _overrides(_Place(before), last, ("study",) if verb in ("model", "doctor") else ())

@@ -55,7 +55,7 @@ def run(arguments: Arguments) -> int:
     texts = {output / "vehicle" / f"{name}.yaml": vehicle_text(name, kinds, cameras, bag, file.name)}
     for camera, document in zip(cameras, documents, strict=True):
         texts[output / "cameras" / f"{kinds[camera.name]}.yaml"] = camera_text(camera, document, file.name)
-    if arguments.choice("overwrite", ("false", "true")) == "false":
+    if arguments.choice("overwrite") == "false":
         _check_new(texts)
     for path, text in reversed(texts.items()):  # the vehicle last: it refers to the others
         write_whole(path, text.encode())

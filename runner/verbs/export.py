@@ -43,7 +43,7 @@ QUIET_S = 2.0  # a shorter export shows no progress
 
 
 def run(arguments: Arguments) -> int:
-    form = arguments.choice("format", tuple(OUTPUTS))
+    form = arguments.choice("format")
     if len(arguments.words) != 1:
         found = " ".join(arguments.words) or None
         raise UserError("command line", "", found, "must name one drive: a directory that log= wrote")

@@ -36,7 +36,7 @@ STARTING = {  # by path in the directory, the file in static/
 
 
 def run(arguments: Arguments) -> int:
-    everything = arguments.choice("files", ("all", "schemas")) == "all"
+    everything = arguments.choice("files") == "all"
     if len(arguments.words) != 1 or arguments.overrides:
         found = " ".join([*arguments.words, *arguments.overrides])
         raise UserError("command line", "", found or None, "must be one directory, and nothing to compose: init DIR")

@@ -62,7 +62,7 @@ def run(arguments: Arguments) -> int:
     from runner.page.server import PageServer
 
     duration = arguments.number("duration_s")
-    looped = arguments.choice("loop", ("false", "true")) == "true"
+    looped = arguments.choice("loop") == "true"
     vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
     camera = _camera(vehicle, arguments.values.get("camera"))
     keys = KeysOfAll.of(vehicle) if looped else None

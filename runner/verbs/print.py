@@ -41,7 +41,7 @@ from runner.verbs import Arguments
 
 
 def run(arguments: Arguments) -> int:
-    form = arguments.choice("format", ("json",) if arguments.sweeps else ("text", "json", "yaml"))
+    form = arguments.choice("format", ("json",) if arguments.sweeps else ())
     if arguments.sweeps:
         return _sweep(arguments)
     if form == "yaml":

@@ -124,7 +124,7 @@ def _answered(run: _Prepared, lines: Iterable[str], name: str, began: Began | No
 
 def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
     """What measures the link again; None: it was measured by the vehicle."""
-    if arguments.choice("link", ("logged", "again")) == "logged":
+    if arguments.choice("link") == "logged":
         return None
     from runner.vehicle.uplink import MeasuredUplink
 

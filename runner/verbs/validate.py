@@ -95,7 +95,7 @@ class ValidationTask(NamedTuple):
 
 
 def run(arguments: Arguments) -> int:
-    everything = arguments.choice("all", ("false", "true")) == "true"
+    everything = arguments.choice("all") == "true"
     files, configurations, notes = 0, 0, dict[str, None]()
     _composed.cache_clear()
     for conf, named in _directories(arguments).items():
