@@ -1,7 +1,7 @@
 """What the vehicle's side costs beside a bare GStreamer RTSP server with the same launch lines, in pairs.
 
   python bench/cost.py                                    three cameras, five pairs of 15 s: six minutes
-  python bench/cost.py --pairs 3 vehicle=tum_q7 fps_max=0 Table I in full
+  python bench/cost.py --pairs 3 vehicle=tum_q7         Table I in full
 
 Rows: processor time and memory of the vehicle's process, latency from capture to the client's parser, time from the
 start until every camera has a picture, and from the request for a new size until the first picture of that size has
@@ -134,7 +134,7 @@ def _own(words: Sequence[str], seconds: float) -> Cost:
     with private_broker(broker):
         began = time.time()
         with _running(["-m", "runner", "vehicle", *words]) as side:
-            operator = Operator(broker)
+            operator = Operator(broker, vehicle.name)
             operator.state(lambda state: state["online"])
             asked = count()
 
