@@ -1,7 +1,7 @@
 """What the vehicle's side costs beside a bare GStreamer RTSP server with the same launch lines, in pairs.
 
   python bench/cost.py                                    three cameras, five pairs of 15 s: six minutes
-  python bench/cost.py --pairs 3 vehicle=tum_q7         Table I in full
+  python bench/cost.py --pairs 3 vehicle=tum_q7           Table I, eight cameras at 3000 kbit/s in all
 
 Rows: processor time and memory of the vehicle's process, latency from capture to the client's parser, time from the
 start until every camera has a picture, and from the request for a new size until the first picture of that size has

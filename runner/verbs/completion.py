@@ -80,7 +80,7 @@ def candidates(before: Sequence[str], last: str) -> list[str]:
     """The words that may replace the last, unfinished one; `before`: those between the program and it."""
     found = _words(before[0], before[1:], last) if before else [*VERBS, "--help", "--version"]
     # A key with nothing to offer behind its = is no word: the shell would put a blank behind it, in place of files.
-    return [word for word in dict.fromkeys(found) if word.startswith(last) and not (word == last and last[-1] in "=.")]
+    return [word for word in dict.fromkeys(found) if word.startswith(last) and (word != last or word[-1] not in "=.")]
 
 
 def _words(verb: str, before: Sequence[str], last: str) -> Iterator[str]:
