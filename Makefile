@@ -28,7 +28,7 @@ test: $(TEST_READY) $(NODE_READY)
 
 timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
-	$(BIN)/pytest tests/integration -m "alone and not soak" -n 3 --dist worksteal --durations=10
+	$(BIN)/pytest tests/integration -m "alone and not soak" -n $$(nproc) --dist worksteal --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units

@@ -428,6 +428,11 @@ def test_json_that_is_nested_too_deeply(tod: Command, tmp_path: Path, depth: int
     assert result.err == f"{path}: line 1: not JSON: nested too deeply\n"
 
 
+def test_a_file_without_line_ends_is_not_loaded(tod: Command) -> None:
+    result = tod("replay", *PAPER, "input=/dev/zero")
+    assert result == (2, "", "/dev/zero: line 1: must be at most 16777216 characters long\n")
+
+
 def test_another_kind_of_camera_stays_in_its_place(tod: Command, drive: Path, tmp_path: Path) -> None:
     words = ("cameras@cameras.rear_center=wide_720p", "cameras.rear_center.weight=2")
     assert tod("replay", *words, f"input={drive}", f"log={tmp_path / 'if'}").status == 0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from statistics import median
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
@@ -32,6 +32,7 @@ T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
 # Of a vehicle's log, the lines that are neither an event nor a reception report, nor the first.
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "dropped", "ended")
+LONGEST_LINE = 1 << 24  # characters; the longest, the configuration of a drive, is a thousandth of it
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def read_drive(directory: Path) -> Drive:
 def _side(side: str, path: Path, warnings: list[str]) -> Side:
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            lines = [line for _, line in read_lines(file, str(path), warnings)]
+            lines = [line for _, line in read_lines(text_lines(file), str(path), warnings)]
     except OSError as error:
         raise UserError(str(path), "", None, (error.strerror or str(error)).lower()) from None
     began = check_began(lines[0] if lines else None, str(path))
@@ -128,6 +129,11 @@ def check_began(line: Json | None, name: str) -> Began:
     return from_json(Began, line)
 
 
+def text_lines(file: TextIO) -> Iterator[str]:
+    """The lines of a file; one longer than any of a drive is cut, so that a file without line ends is not loaded."""
+    return iter(partial(file.readline, LONGEST_LINE + 1), "")
+
+
 def read_lines(
     lines: Iterable[str], name: str, warnings: list[str], *, skipped: Container[str] = ()
 ) -> Iterator[tuple[int, Json]]:
@@ -141,6 +147,8 @@ def read_lines(
     """
     drive = False
     for number, text in enumerate(lines, 1):
+        if len(text) > LONGEST_LINE:
+            raise UserError(f"{name}: line {number}", "", None, f"must be at most {LONGEST_LINE} characters long")
         line, problem = read_line(text)
         if is_log(line):
             drive = True

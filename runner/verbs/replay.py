@@ -51,7 +51,7 @@ from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, Pos
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, log_run
-from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines
+from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
 from runner.errors import UserError
 from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
 from runner.schema import log_problem
@@ -273,7 +273,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
     path = arguments.path("input")
     if path is None:
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
-        yield "standard input", sys.stdin
+        yield "standard input", text_lines(sys.stdin)
         return
     try:
         path = path / FILES["vehicle"] if path.is_dir() else path
@@ -282,7 +282,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
     except OSError as error:
         raise UserError("command line", "input", repr(str(path)), (error.strerror or "").lower()) from None
     with file:
-        yield str(path), file
+        yield str(path), text_lines(file)
 
 
 def _keep(path: Path, output: Path | None) -> None:
