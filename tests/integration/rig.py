@@ -383,6 +383,13 @@ class Client:
         stride = len(data) // height
         return np.frombuffer(data, np.uint8).reshape(height, stride)[:, : width * 3].reshape(height, width, 3)
 
+    def insist(self) -> int:
+        """Frames so far; connects again if it was turned away (503): a camera's first frame may take longer than a
+        second on a busy machine."""
+        if self.errors and not self.sizes:
+            self.reconnect()
+        return len(self.sizes)
+
     def reconnect(self) -> None:
         self.close()
         self.errors.clear()

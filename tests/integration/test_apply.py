@@ -195,10 +195,8 @@ def received(side, plan, camera, frame):
     client = Client(plan, pictures=True)
 
     def pushed():
-        if client.errors and not client.sizes:  # 503: the first frame took more than a second on a busy machine
-            client.reconnect()
         time.sleep(0.02)
-        return side.push(camera, frame) and len(client.sizes) > 5
+        return side.push(camera, frame) and client.insist() > 5
 
     try:
         until(pushed)

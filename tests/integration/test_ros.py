@@ -101,10 +101,10 @@ def calm(reported):
 
 @contextmanager
 def watched(plans, reported):
-    """Viewers of both cameras, once these have pictures: one that comes earlier may be turned away."""
+    """Viewers of both cameras, once these have pictures."""
     until(lambda: len(told(reported, ": pictures are ")) == 2)
     with watching(plans[0]) as front, watching(plans[1]) as rear:
-        until(lambda: min(len(front.sizes), len(rear.sizes)) > 10)
+        until(lambda: min(front.insist(), rear.insist()) > 10)
         yield front, rear
 
 
