@@ -5,10 +5,10 @@ import { test } from "node:test";
 
 import { Alarm } from "../../runner/page/static/alarm.js";
 
-/** The tones of changes of status, each [ms, status]. */
+/** The tones of changes of status, each [ms, status, camera]. */
 function tones(...changes) {
   const alarm = new Alarm();
-  return changes.map(([now, status]) => alarm.due(status, now));
+  return changes.map(([now, status, camera = "front"]) => alarm.due(camera, status, now));
 }
 
 test("a picture that stands still and one that is late have tones of their own", () => {
@@ -17,8 +17,18 @@ test("a picture that stands still and one that is late have tones of their own",
   for (const status of ["live", "synchronising", "off", "paused"]) assert.deepEqual(tones([0, status]), [null]);
 });
 
-test("eight pictures that fail together are one tone, and fail again later", () => {
+test("a picture that fails again within two seconds sounds once", () => {
   assert.deepEqual(tones([0, "frozen"], [5, "frozen"], [900, "lost"], [2000, "lost"]), ["lost", null, null, "lost"]);
+});
+
+test("pictures that fail together are one tone, also while they get worse", () => {
+  const together = [[0, "frozen", "front"], [5, "frozen", "rear"], [900, "frozen", "left"]];
+  const worse = [[1500, "lost", "front"], [1500, "lost", "rear"], [1500, "lost", "left"]];
+  assert.deepEqual(tones(...together, ...worse), ["lost", null, null, null, null, null]);
+});
+
+test("a picture that fails a second after another one has a tone of its own", () => {
+  assert.deepEqual(tones([0, "frozen", "front"], [300, "live", "front"], [1000, "lost", "rear"]), ["lost", null, "lost"]);
 });
 
 test("a late picture does not hide one that stands still, but is hidden by it", () => {

@@ -1,17 +1,32 @@
 /** Which tone a change of a picture's status deserves, and how often. Pure; times in ms. */
 
-const AGAIN_MS = 2000; // a link that fails takes eight pictures with it: one tone
+const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one tone
+const AGAIN_MS = 2000; // a picture that flickers does not sound each time
 const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", late: "late", damaged: "late" };
+const never = () => ({ lost: -Infinity, late: -Infinity });
+
+/** When the last tone of this kind or of a worse one was. */
+const latest = (tones, kind) => Math.max(tones.lost, kind === "late" ? tones.late : -Infinity);
 
 export class Alarm {
-  last = { lost: -Infinity, late: -Infinity };
+  #last = never();
+  #of = {}; // by camera, the tones that announced it
 
-  /** @param {string} status of a picture, new  @param {number} now  @returns {"lost"|"late"|null} the tone that is due */
-  due(status, now) {
+  /**
+   * @param {string} camera
+   * @param {string} status new
+   * @param {number} now
+   * @returns {"lost"|"late"|null} the tone that is due
+   */
+  due(camera, status, now) {
     const kind = KINDS[status];
-    const since = now - Math.max(this.last.lost, kind === "late" ? this.last.late : -Infinity);
-    if (!kind || since < AGAIN_MS) return null;
-    this.last[kind] = now;
+    const own = (this.#of[camera] ??= never());
+    if (!kind || now - latest(own, kind) < AGAIN_MS) return null;
+    const tone = latest(this.#last, kind);
+    const announced = now - tone < TOGETHER_MS;
+    own[kind] = announced ? tone : now;
+    if (announced) return null;
+    this.#last[kind] = now;
     return kind;
   }
 }

@@ -41,9 +41,9 @@ function play(kind) {
   }
 }
 
-function heard({ status }) {
+function heard({ camera, status }) {
   if (!drives || store.view !== "drive") return;
-  const kind = alarm.due(status, performance.now());
+  const kind = alarm.due(camera, status, performance.now());
   if (!kind) return;
   publish("alarm", kind);
   if (!muted()) play(kind);
