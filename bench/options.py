@@ -108,7 +108,7 @@ def elements(raw: Raw, words: Sequence[str], scaling: Fraction, roi: Roi | None 
         "sending": True,
         "roi": roi,
         "size": output_size(roi, scaling),
-        "bitrate": Fraction(KBPS),
+        "bitrate": KBPS,
     }
     return turn_elements(camera, compile_graph(camera, vehicle.media).vehicle, knobs)
 
