@@ -86,7 +86,7 @@ def test_drives_that_cannot_give_a_map_are_reported(tod: Command, tmp_path: Path
     output = f"output={tmp_path / 'map.csv'}"
     for words, status, expected in (
         ((output,), 2, "command line: must name a drive: a directory that log= wrote"),
-        ((str(good),), 2, "command line: output: must be given, the map's file"),
+        ((str(good),), 2, "command line: output: must be given: the map's file"),
         ((str(good), output, "percentile=101"), 2, "command line: percentile: 101: must be at most 100"),
         ((str(good), output, "cell_m=0"), 2, "command line: cell_m: 0: must be at least 1"),
         ((str(tmp_path / "no"), output), 2, f"{tmp_path / 'no'}: no such directory"),

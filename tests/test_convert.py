@@ -113,7 +113,7 @@ NEEDED = "sizes and frame rates must be given: bag=BAG with pictures of each cam
             (*SIZE, "vehicle=a b"),
             "vehicle: 'a b': must be letters, digits, _ and -, and no number, true, false or null",
         ),
-        ((*SIZE, "mode=single"), "mode=single: a conversion has no configuration; see --help"),
+        ((*SIZE, "mode=single"), "mode=single: convert reads no configuration; see --help"),
     ],
 )
 def test_words_that_are_no_conversion(convert, words, problem):

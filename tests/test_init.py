@@ -73,7 +73,7 @@ def test_nothing_is_overwritten_and_every_problem_is_named(tod: Command, tmp_pat
     assert tod("init", str(tmp_path)) == (
         2,
         "",
-        f"{tmp_path}/cameras/my_camera.yaml: exists, and init overwrites nothing\n"
+        f"{tmp_path}/cameras/my_camera.yaml: already exists; init overwrites nothing\n"
         f"{tmp_path}/modes: must be a directory\n"
         f"{tmp_path}/{FOLDER}: must be a directory\n"
         "3 problems, nothing was written\n",

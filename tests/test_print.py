@@ -247,6 +247,6 @@ def test_yaml_writes_text_as_omegaconf_reads_it(text: str) -> None:
 
 def test_yaml_is_of_a_valid_configuration_and_decides_nothing(tod: Command) -> None:
     assert tod("print", "format=yaml", "total_kbps=3").err == (
-        "command line: total_kbps: decides nothing with format=yaml\n"
+        "command line: total_kbps: has no effect with format=yaml\n"
     )
     assert tod("print", "format=yaml", "fps_max=0").problems == ["command line: fps_max: 0: must be above 0"]

@@ -380,13 +380,13 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
     file.touch()
     out = f"output={tmp_path / 'out'}"
     wrong = [
-        ([out], "command line: DRIVE: must be given: a directory that log= was given to"),
-        ([str(drive)], "command line: output: must be given: the directory that the report is written to"),
+        ([out], "command line: DRIVE: must be given: a directory that log= wrote"),
+        ([str(drive)], "command line: output: must be given: the directory to write the report to"),
         (["/nowhere", out], "/nowhere: no such directory"),
-        ([str(drive), f"output={file}"], f"command line: output: '{file}': must be a directory, {file} is a file"),
+        ([str(drive), f"output={file}"], f"command line: output: '{file}': must be a directory, but {file} is a file"),
         (
             [str(drive), f"output={file}/deep"],
-            f"command line: output: '{file}/deep': must be a directory, {file} is a file",
+            f"command line: output: '{file}/deep': must be a directory, but {file} is a file",
         ),
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
         (

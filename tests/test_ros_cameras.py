@@ -193,7 +193,7 @@ def test_version_1_refuses_keys_of_ros_2_all_at_once():
 
 @pytest.mark.parametrize(
     "version, library, remedy",
-    [(2, "rclpy", "`make ros2` makes .venv-ros2"), (1, "rospy", "`make ros1` installs it")],
+    [(2, "rclpy", "`make ros2` creates .venv-ros2"), (1, "rospy", "`make ros1` installs it")],
 )
 def test_doctor_names_what_makes_the_environment(tod, version, library, remedy):
     done = tod("doctor", "ros", f"ros.version={version}", "ros.python=no/python")

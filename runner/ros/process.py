@@ -26,7 +26,7 @@ RETRY_S = (1.0, 10.0)  # between two starts: doubled from the first value up to 
 END_S = 2.0
 LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
 
-MAKE = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}  # by version of ROS, what brings its Python
+INSTALL_HINT = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}  # by version of ROS
 MASTER = "http://localhost:11311"  # of ROS 1, as in rosgraph
 
 SCRIPT = Path(__file__).parent / "node" / "__main__.py"
@@ -132,7 +132,7 @@ class NodeProcess:
         """
         python = self._settings.interpreter
         if shutil.which(python) is None:
-            raise RunError(f"ros.python: {python}: no such program; {MAKE[self._settings.version]}")
+            raise RunError(f"ros.python: {python}: no such program; {INSTALL_HINT[self._settings.version]}")
         self._thread.start()
         if not self._tried.wait(START_S):
             self.close()

@@ -392,7 +392,7 @@ def test_words_that_are_no_export(tmp_path):
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     (tmp_path / "empty").mkdir()
     (tmp_path / "there.mcap").write_text("precious")
-    there = "already exists; remove it, or name another one by output="
+    there = "already exists; remove it, or choose another path with output="
     name = "must name one drive: a directory that log= wrote"
     for words, expected in (
         ([], f"command line: {name}"),
@@ -401,7 +401,7 @@ def test_words_that_are_no_export(tmp_path):
         ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
         (
             [str(drive), "mode=single"],
-            "command line: mode=single: an export has no configuration, only format= and output=",
+            "command line: mode=single: export takes no overrides, only format= and output=",
         ),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],
@@ -490,7 +490,7 @@ def test_a_ros_2_bag_holds_what_the_mcap_file_holds(filmed, tmp_path):
             assert [m.data.encode() for _, m in found] == [message.data for message in same[topic][2]]
     assert ros.stdout.startswith(f"{drive}/rosbag2: {sum(len(found) for _, found in topics.values())} messages, ")
     again = run("export", str(drive), "format=rosbag2")
-    rule = "already exists; remove it, or name another one by output="
+    rule = "already exists; remove it, or choose another path with output="
     assert (again.returncode, again.stderr) == (2, f"command line: output: '{drive}/rosbag2': {rule}\n")
     assert sorted(path.name for path in drive.iterdir() if path.name.startswith(".")) == []
 

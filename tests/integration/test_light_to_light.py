@@ -17,7 +17,7 @@ RESULT = re.compile(
     r"rear: counter read in (\d+) of (\d+) pictures\n"
     r"  glass to glass +(\d+) ms median, \d+ ms p95\n"
     r"  capture to drawing +(\d+) ± (\d+) ms, as the page states it\n"
-    r"  camera and screen +(-?\d+) ± \d+ ms, the difference; nothing is in between\n"
+    r"  camera and screen +(-?\d+) ± \d+ ms, the difference; no camera or screen in between\n"
 )
 
 

@@ -167,7 +167,7 @@ def test_the_others_continue_if_a_source_fails(tmp_path, conf):
     done = run("record", *words, *mounted)
     assert done.returncode == 1
     part = output / ".rear.mkv.part"
-    assert f"rear: Failed after iterations as requested.; the part before is in {part}" in done.stderr
+    assert f"rear: Failed after iterations as requested.; what was recorded until then is in {part}" in done.stderr
     assert "mast: Cannot identify device '/dev/none'.\n" in done.stderr
     assert sorted(path.name for path in output.iterdir()) == [part.name, "front.mkv", "recording.json"]
     assert len(recorded(output / "front.mkv")) == 60

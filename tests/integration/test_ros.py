@@ -533,7 +533,7 @@ def refused(ros, *words):
 
 
 def test_a_vehicle_without_the_library_does_not_start(ros):
-    remedy = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}[ros.version]
+    remedy = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}[ros.version]
     assert refused(ros, "ros.python=no/python") == (1, [f"ros.python: no/python: no such program; {remedy}"])
     library, other = {1: ("rospy", ROS2_PYTHON), 2: ("rclpy", "/usr/bin/python3")}[ros.version]
     status, lines = refused(ros, f"ros.python={other}")
