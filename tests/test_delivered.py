@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, FilmedFile, UnitTimes, arrivals, matched
-from runner.drive.delivered import _nearest, _thumbnail, due
+from runner.drive.captures import SAME_NS, VideoFile, UnitTimes, arrivals, matched
+from runner.drive.delivered import _nearest, _thumbnail, displayed_units
 from runner.h264.access_unit import coded_picture
 
 MS = 1_000_000
@@ -19,33 +19,33 @@ def units(*times: tuple[int, int]) -> list[UnitTimes]:
 
 def test_a_picture_that_came_in_time_stands_for_its_moment() -> None:
     came = units((0, 30), (100, 30), (200, 30))
-    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 1, 2]
+    assert displayed_units([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 1, 2]
 
 
 def test_times_of_both_sides_may_differ_by_less_than_half_a_frame() -> None:
     came = units((0, 30), (100, 30))
-    assert due([100 * MS - SAME_NS // 2], came, DEADLINE) == [1]
-    assert due([100 * MS - SAME_NS], came, DEADLINE) == [0]
+    assert displayed_units([100 * MS - SAME_NS // 2], came, DEADLINE) == [1]
+    assert displayed_units([100 * MS - SAME_NS], came, DEADLINE) == [0]
 
 
 def test_a_late_picture_leaves_the_older_one_on_show() -> None:
     came = units((0, 30), (100, 301), (200, 300))
-    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 0, 2]
+    assert displayed_units([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 0, 2]
 
 
 def test_while_nothing_comes_the_last_picture_stands() -> None:
     came = units((0, 30), (1000, 30))
-    assert due([500 * MS, 900 * MS, 1000 * MS], came, DEADLINE) == [0, 0, 1]
+    assert displayed_units([500 * MS, 900 * MS, 1000 * MS], came, DEADLINE) == [0, 0, 1]
 
 
 def test_before_the_first_picture_nothing_stands() -> None:
-    assert due([-1000 * MS, 0], units((0, 400)), DEADLINE) == [-1, -1]
+    assert displayed_units([-1000 * MS, 0], units((0, 400)), DEADLINE) == [-1, -1]
 
 
 @given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 1000)), max_size=30), st.integers(0, 6000))
 def test_what_stands_was_captured_by_then_and_had_arrived(times: list[tuple[int, int]], at: int) -> None:
     came = sorted(units(*times))
-    (number,) = due([at * MS], came, DEADLINE)
+    (number,) = displayed_units([at * MS], came, DEADLINE)
     fits = [n for n, u in enumerate(came) if u.captured <= at * MS + SAME_NS // 2 and u.arrived <= at * MS + DEADLINE]
     assert number == (fits[-1] if fits else -1)
 
@@ -71,7 +71,7 @@ def test_arrivals_are_found_though_the_clocks_seem_to_differ() -> None:
 
 def test_times_of_a_file_are_those_of_its_last_shift() -> None:
     """In ms: the clock ran on through a pause of 5 s after the frame at 200, then a receiver was 30 behind."""
-    file = FilmedFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
+    file = VideoFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
     assert [file.captured(after * MS) // MS for after in (0, 200, 300, 400, 500, 900)] == [
         1000,
         1200,

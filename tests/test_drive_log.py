@@ -190,7 +190,7 @@ def test_an_unwritable_directory_is_reported_before_the_drive(tmp_path: Path) ->
     with pytest.raises(UserError, match=r"command line: log: '.*/file': (file exists|not a directory)"):
         begun(tmp_path / "file")
     begun(tmp_path / "drive").close()
-    with pytest.raises(UserError, match=r"holds a drive already \(drive.jsonl\), choose another directory"):
+    with pytest.raises(UserError, match=r"already contains a drive \(drive.jsonl\), choose another directory"):
         Log(tmp_path / "drive", "vehicle", {}, {}, print)
 
 

@@ -19,7 +19,7 @@ from helpers import Command, process
 
 from runner.configuration.editors import FOLDER
 from runner.resources import directory
-from runner.verbs.init import STARTING
+from runner.verbs.init import TEMPLATES
 
 CHECKOUT = directory("schemas").parent
 SERVER = CHECKOUT / "node_modules" / ".bin" / "yaml-language-server"
@@ -37,7 +37,7 @@ def files(place: Path) -> dict[str, str]:
 
 
 def test_the_directory_is_valid_at_once(tod: Command, fleet: Path) -> None:
-    assert set(files(fleet)) == {*STARTING, f"{FOLDER}/VERSION", *(f"{FOLDER}/{name}" for name in SCHEMAS)}
+    assert set(files(fleet)) == {*TEMPLATES, f"{FOLDER}/VERSION", *(f"{FOLDER}/{name}" for name in SCHEMAS)}
     assert tod("validate", f"conf={fleet}").err == ""
     status, out, err = tod("print", f"conf={fleet}", "vehicle=my_vehicle", "modes=my_modes", "source=v4l2")
     assert (status, err) == (0, "")

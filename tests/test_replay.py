@@ -448,7 +448,7 @@ def test_a_drive_is_never_overwritten(tod: Command, drive: Path, story: Path) ->
     before = (drive / "drive.jsonl").read_bytes()
     result = tod("replay", f"input={story}", f"log={drive}")
     assert result.status == 2
-    rule = "holds a drive already (drive.jsonl), choose another directory"
+    rule = "already contains a drive (drive.jsonl), choose another directory"
     assert result.err == f"command line: log: '{drive}': {rule}\n"
     assert (drive / "drive.jsonl").read_bytes() == before
 

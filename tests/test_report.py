@@ -56,9 +56,9 @@ def defined(path: Path) -> dict[str, Figure]:
 
 def drawn(figure: Figure) -> Any:
     """A figure as drawn for print."""
-    from runner.drive.print import drawn
+    from runner.drive.print import draw_sheet
 
-    return drawn(figure)
+    return draw_sheet(figure)
 
 
 def document(output: Path) -> dict[str, Any]:
@@ -219,7 +219,7 @@ def test_sides_that_are_missing(tod: Command, tmp_path: Path, sides: list[str], 
     content = document(tmp_path / "out")
     assert content["drives"][0]["link"] is None
     if "operator" not in sides:
-        left_out = "latency: left out, no latency was logged: that takes an operator's log"
+        left_out = "latency: left out, no latency was logged: an operator's log is needed"
         assert left_out in content["left_out"]
         assert left_out in out
 

@@ -186,7 +186,7 @@ def replay(
 
 def _with_positions(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
     """The events with the positions of a bag in place of their own."""
-    from runner.drive.positions import given_positions, spanned
+    from runner.drive.positions import given_positions, time_span
 
     recorded = given_positions(arguments.values)
     if began is None:
@@ -201,7 +201,7 @@ def _with_positions(inputs: Iterable[InputEvent], arguments: Arguments, began: B
         if not isinstance(event, PositionReported):
             yield document, event
     if not found:
-        raise recorded.refuse(f"the input: {spanned(began.time, began.time + last)}")
+        raise recorded.no_overlap(f"the input: {time_span(began.time, began.time + last)}")
 
 
 def _with_predictions(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
