@@ -16,7 +16,7 @@ from runner.drive.positions import reader
 from runner.drive.series import series
 from runner.errors import UserError
 from runner.pqos import build_track
-from runner.pqos.track import of_bag
+from runner.pqos.track import track_of_bag
 
 BEGAN_NS = round(EPOCH * 1e9)
 STORE = typestore("mcap")
@@ -38,7 +38,7 @@ def drive(tmp_path_factory):
 
 
 def test_a_bag_is_a_track(tmp_path):
-    track = of_bag(gps(tmp_path / "b", "/gps"), None, loop=False)
+    track = track_of_bag(gps(tmp_path / "b", "/gps"), None, loop=False)
     assert track.duration_s == pytest.approx(29.5)
     place = track.at(0.25)
     assert (place.lat, place.lon) == pytest.approx((48.00005, 11.5))
@@ -60,7 +60,7 @@ def test_a_bag_is_named_as_a_track(tmp_path, tod):
 
 def test_a_bag_with_one_place_is_no_track(tmp_path):
     with pytest.raises(ModelError, match="must have at least two positions with a fix, at different times"):
-        of_bag(gps(tmp_path / "b", "/gps", count=1), None, loop=False)
+        track_of_bag(gps(tmp_path / "b", "/gps", count=1), None, loop=False)
 
 
 @pytest.mark.parametrize("sides", [("vehicle", "operator"), ("operator",)])

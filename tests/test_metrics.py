@@ -339,10 +339,10 @@ def test_vmaf_without_scores(fake: Callable[[str], str]) -> None:
 
 
 def test_vmaf_gives_up_on_a_process_that_hangs(fake: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vmaf_module, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(vmaf_module, "TIMEOUT_S", 0.2)
     exe = fake("exec sleep 60")
     meter: Any = vmaf_module.VmafMeter(vmaf_module.Tool(exe, ""), VMAF_MODEL, (1280, 720), FPS, 1)
-    with pytest.raises(RunError, match=r"^ffmpeg has taken no picture for 0\.2 s$"):
+    with pytest.raises(RunError, match=r"^ffmpeg has accepted no picture for 0\.2 s$"):
         for number in range(20):
             meter.add(number, noise(0, 720, 1280), noise(0, 720, 1280))
     assert meter.close() == {} and meter._process.returncode is not None

@@ -308,7 +308,7 @@ def test_one_row_is_no_trace(tmp_path: Path) -> None:
     path.write_text("t_s,kbps\n0,5000\n")
     with pytest.raises(ModelError) as raised:
         build_pqos(TRACE, [tmp_path])
-    assert str(raised.value) == f"file: {path}: must have at least two rows, else the duration of a rate is unknown"
+    assert str(raised.value) == f"file: {path}: must have at least two rows, otherwise the duration of a rate is unknown"
 
 
 # --- the packaged configuration and its schema ------------------------------------------------------------------------

@@ -45,7 +45,7 @@ class _Text(NamedTuple):
 
     values  float64 (rows, columns); None: some cell is not a number
     names   name of each column in this file
-    rows    line number and cells of each row, read again to report a mistake
+    rows    line number and cells of each row, read again to report an error
     """
 
     values: NDArray[np.float64] | None
@@ -56,7 +56,7 @@ class _Text(NamedTuple):
 def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
     """The requested columns of a CSV file with a header, as float64 (rows, columns); other columns are ignored.
 
-    raises  ModelError with file, line, cell and rule of the first mistake
+    raises  ModelError with file, line, cell and rule of the first error
     """
     return _checked(path, columns, _csv(path, columns))
 
@@ -64,7 +64,7 @@ def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
 def read_map(path: Path) -> NDArray[np.float64]:
     """A bandwidth map as rows of lon, lat (degrees, WGS-84) and kbit/s: CSV, or the matrix in OpenCV's YAML.
 
-    raises  ModelError with file, line, cell and rule of the first mistake
+    raises  ModelError with file, line, cell and rule of the first error
     """
     columns = (LON, LAT, RATE)
     text = _matrix(path) if path.suffix.lower() in {".yaml", ".yml"} else _csv(path, columns)
@@ -81,7 +81,7 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
     found = header(path)
     names = [next((name for name in column.names if name in found), "") for column in columns]
     if "" in names:
-        # The content of the file is not shown: it may not be the file that was meant.
+        # The content is not shown: this may be the wrong file.
         wanted = ", ".join(" or ".join(column.names) for column in columns)
         lacks = ", ".join(column.names[0] for column, name in zip(columns, names, strict=True) if not name)
         raise ModelError("file", f"{path}:1: no column {lacks}", f"must be a header with the columns {wanted}")

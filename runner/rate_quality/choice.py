@@ -23,7 +23,7 @@ from runner.rate_quality.curves import (
     reaches,
 )
 
-FEW_FRAMES = 40  # scored frames, below which a mean is uncertain
+FEW_FRAMES = 40  # with fewer scored frames a mean is uncertain
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
 
 
 def pooled(groups: Sequence[Sequence[Point]]) -> list[Point]:
-    """Points of several cameras as those of one: the mean over all their frames."""
+    """Points of several cameras merged into those of one: the mean over all their frames."""
     by_lane: dict[tuple[Fraction, int], list[Point]] = {}
     for point in (point for group in groups for point in group):
         by_lane.setdefault((point.scaling, point.target_kbps), []).append(point)

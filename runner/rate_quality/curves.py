@@ -1,7 +1,7 @@
 """From measured points to a ladder of scaling factors: curves over bitrate, crossings, factors worth keeping. Pure.
 
 Quality is signed so that higher is better. Bitrates are the targets that an encoder was given, since the allocation
-commands targets; an encoding that does not hold its target is excluded.
+commands targets; an encoding that exceeds its target is excluded.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 GRID = 400  # bitrates at which curves are compared, log-spaced
-HOLDS = 1.1  # actual over target bitrate, up to which an encoding holds its target
-SATURATED = 0.8  # below it the encoder cannot use more
+HOLDS = 1.1  # largest ratio of actual to target bitrate at which an encoding meets its target
+SATURATED = 0.8  # below this ratio the encoder cannot use more bitrate
 RESAMPLED = 200  # bootstrap samples for the confidence of a crossing
 BLOCKS = 8  # time blocks that are resampled
 CONFIDENCE = (5, 95)  # percentiles
@@ -73,10 +73,10 @@ class Ladder:
     """A choice of factors and the bitrates from which each is used.
 
     scaling      increasing
-    bounds       kbit/s, one less: from bounds[i] on, scaling[i + 1] is used
+    bounds       kbit/s, one entry fewer: from bounds[i] on, scaling[i + 1] is used
     regret_max   largest loss of quality compared with the best of all factors
     regret_mean  the same on average over log bitrate
-    width_min    narrowest range: its end over its beginning
+    width_min    narrowest range: ratio of its end to its beginning
     """
 
     scaling: tuple[Fraction, ...]
@@ -138,10 +138,10 @@ def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
 def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
     """The bitrate from which the larger factor looks better; None if one of the two wins throughout.
 
-    Noisy curves may cross more than once: the bound is the one that loses least quality, summed over log bitrate.
+    Noisy curves may cross more than once: the bound chosen loses least quality, summed over log bitrate.
     """
     gain = _gain(curves.quality[upper], curves.quality[lower])
-    lost_below = np.concatenate([[0.0], np.cumsum(np.maximum(gain, 0))])  # by taking the lower one up to here
+    lost_below = np.concatenate([[0.0], np.cumsum(np.maximum(gain, 0))])  # by using the lower factor up to here
     lost_above = np.concatenate([np.cumsum(np.maximum(-gain, 0)[::-1])[::-1], [0.0]])
     at = int(np.argmin(lost_below + lost_above))
     if at in (0, len(gain)):
@@ -153,18 +153,18 @@ def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
 
 
 def _gain(upper: Values, lower: Values) -> Values:
-    """Gain of the larger factor, finite: all or nothing if only one of them works."""
+    """Gain of the larger factor, made finite: a large value if only one of them works."""
     return np.nan_to_num(upper - lower, nan=0.0, posinf=1e3, neginf=-1e3)
 
 
 def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Ladder, list[Ladder]]:
-    """The smallest choice of factors that loses no more than `tolerance` at any bitrate.
+    """The smallest set of factors that loses no more than `tolerance` at any bitrate.
 
     tolerance  quality, see `Metric.tolerance`
-    narrowest  a range must end at this many times its beginning, or its factor is not worth a switch
-    returns    the ladder, and for each number of factors the best one, to show what fewer would lose
+    narrowest  least ratio of the end of a range to its beginning; in a narrower one its factor is not worth a switch
+    returns    the ladder, and for each number of factors the best one, to show what fewer factors would lose
 
-    If no choice meets both, the one that loses least.
+    If no set meets both, the one that loses least is returned.
     """
     ladders = [ladder for chosen in _choices(curves) if (ladder := climb(curves, chosen)) is not None]
     wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
@@ -184,7 +184,7 @@ def _choices(curves: Curves) -> Iterator[tuple[Fraction, ...]]:
 
 
 def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
-    """These factors, each used in its range; None if one of them would have none."""
+    """The ladder of these factors; None if one of them would have no range."""
     bounds = [cross(curves, lower, upper) for lower, upper in pairwise(scaling)]
     found = [bound for bound in bounds if bound is not None]
     if len(found) < len(bounds) or any(a >= b for a, b in pairwise(found)):
@@ -192,7 +192,7 @@ def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
     quality = along(curves, scaling, found)
     best = curves.best
     regret = (best - quality)[np.isfinite(best)]
-    # The first range reaches down to 0 and the last has no end: only those between are narrow.
+    # The first range reaches down to 0 and the last has no end: only those in between can be narrow.
     width = min((b / a for a, b in pairwise(found)), default=np.inf)
     return Ladder(tuple(scaling), tuple(found), float(regret.max()), float(regret.mean()), width)
 
@@ -225,7 +225,7 @@ def crossings(points: Sequence[Point], ladder: Ladder, metric: str, sign: int) -
 
 
 def _resampled(frames: int) -> Iterator[Values]:
-    """Weights of the frames, summing to 1, for each bootstrap sample; always the same ones."""
+    """Weights of the frames, summing to 1, for each bootstrap sample; the same in every run."""
     random = np.random.default_rng(0)
     block = np.arange(frames) * min(BLOCKS, frames) // frames
     sizes = np.bincount(block)
@@ -236,7 +236,7 @@ def _resampled(frames: int) -> Iterator[Values]:
 
 
 def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
-    """The smallest bitrate at which a ladder reaches a quality and keeps it; None if it does not."""
+    """The smallest bitrate from which a ladder keeps a quality; None if there is none."""
     below = np.flatnonzero(along(curves, ladder.scaling, ladder.bounds) < quality)
     if not below.size:
         return float(curves.kbps[0])
@@ -245,7 +245,7 @@ def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
 
 
 def falls(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
-    """Pairs of neighbouring points of a factor in which more bitrate looks worse."""
+    """Pairs of neighbouring points of a factor where the higher bitrate looks worse."""
     found = []
     ordered = sorted(points, key=lambda p: (p.scaling, p.target_kbps))
     for before, after in pairwise(ordered):

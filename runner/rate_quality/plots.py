@@ -41,7 +41,7 @@ def plot(measured: Measured, path: Path) -> list[Path]:
     axes = figure.add_subplot()
     colours = _draw_curves(axes, measured, curves)
     _draw_ladder(axes, measured, curves, colours)
-    _dress(axes, measured, curves)
+    _label_axes(axes, measured, curves)
     return [_saved(figure, path, form) for form in FORMATS]
 
 
@@ -78,7 +78,7 @@ def _draw_ladder(axes: Axes, measured: Measured, curves: Curves, colours: dict[F
 
 
 def _mark(axes: Axes, kbps: float, text: str, *, left: bool) -> None:
-    """Text beside a vertical line."""
+    """Label a vertical line."""
     axes.annotate(
         text,
         xy=(kbps, 0.02),
@@ -92,7 +92,7 @@ def _mark(axes: Axes, kbps: float, text: str, *, left: bool) -> None:
     )
 
 
-def _dress(axes: Axes, measured: Measured, curves: Curves) -> None:
+def _label_axes(axes: Axes, measured: Measured, curves: Curves) -> None:
     clips = ", ".join(Path(clip.path).name for clip in measured.clips.values())
     axes.set_title(f"{measured.name}   ({clips})", fontsize=10)
     axes.set_xscale("log")

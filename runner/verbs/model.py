@@ -39,7 +39,7 @@ from runner.verbs import Arguments, study_word
 from runner.verbs.screen import progress_bar, say, streaming
 
 if TYPE_CHECKING:
-    from runner.rate_quality.sequence import Filmed
+    from runner.rate_quality.sequence import Footage
     from runner.rate_quality.study import Study
 
 NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named after a camera
@@ -108,7 +108,7 @@ def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     return vehicle, study, names
 
 
-def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
     """By camera, its clip, or its topic in a bag."""
     given = arguments.path("sequence")
     if given is None:
@@ -120,7 +120,7 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
     if not given.is_dir():
         rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
         raise UserError("command line", "sequence", repr(str(given)), rule)
-    found: dict[str, Filmed] = {}
+    found: dict[str, Footage] = {}
     problems = []
     for name in names:
         clips = sorted(path for path in given.glob(f"{name}.*") if path.suffix not in NO_CLIPS)
@@ -134,9 +134,9 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
     return found
 
 
-def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
     """By camera, its topic in a bag: that of its mount, or the only one with pictures."""
-    found: dict[str, Filmed] = {}
+    found: dict[str, Footage] = {}
     problems = []
     for name in names:
         camera = vehicle.cameras[name]
@@ -153,7 +153,7 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
     return found
 
 
-def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
+def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
     """By camera, the clip or the bag's pictures that its source plays; missing clips are rendered first."""
     from dataclasses import replace
 
@@ -162,7 +162,7 @@ def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Fi
     wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
     with progress_bar() as progress:
         render_missing(wanted, progress)
-    found: dict[str, Filmed] = {}
+    found: dict[str, Footage] = {}
     for plan in compile_plans(wanted):
         if plan.bag:
             found[plan.camera.name] = plan.bag

@@ -263,7 +263,7 @@ def test_nothing_is_overwritten(tmp_path):
 def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
     recordings.claim_files(tmp_path, ["rear"])["rear"].write_text("new")
     (tmp_path / "rear.mkv").write_text("old")
-    with pytest.raises(RunError, match=r"rear.mkv was created meanwhile; the recording is .*/\.rear\.mkv\.part"):
+    with pytest.raises(RunError, match=r"rear.mkv was created in the meantime; the recording is .*/\.rear\.mkv\.part"):
         recordings.keep(tmp_path, "rear")
     assert (tmp_path / "rear.mkv").read_text() == "old"
 

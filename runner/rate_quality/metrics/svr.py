@@ -65,7 +65,7 @@ class Regression:
 
 
 def scale(features: Vector, ranges: Ranges) -> Vector:
-    """Features scaled as in training; one that was constant there is 0, as svm-scale leaves it out."""
+    """Features scaled as in training; one that was constant there is 0, since svm-scale omits it."""
     span = ranges.most - ranges.least
     share = (features - ranges.least) / np.where(span > 0, span, 1)
     return np.where(span > 0, ranges.lower + (ranges.upper - ranges.lower) * share, 0.0)
@@ -74,7 +74,7 @@ def scale(features: Vector, ranges: Ranges) -> Vector:
 def load(model: Path, ranges: Path, features: int) -> Regression:
     """Read a regression of this many features, each file in either form.
 
-    raises  UserError that names file, place and rule
+    raises  UserError that names file, location and rule
     """
     found, spans = _read(model), _read(ranges)
     kernels = (_opencv_kernels if _is_opencv(found) else _libsvm_kernels)(model, found, features)
