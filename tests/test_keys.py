@@ -185,7 +185,7 @@ def test_mistakes_are_named(tmp_path, capsys, words, message):
 def test_a_directory_with_other_files_is_left_alone(tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["keys", f"output={tmp_path}", *FIRST]) == 2
-    assert "it holds other files" in capsys.readouterr().err
+    assert "it contains other files" in capsys.readouterr().err
     assert os.listdir(tmp_path) == ["mine.txt"]
 
 

@@ -73,8 +73,8 @@ def test_a_port_in_use_is_named() -> None:
 
 
 def test_every_figure_has_a_valid_name_of_its_own() -> None:
-    from runner.metrics.prometheus import FIGURES
+    from runner.metrics.prometheus import METRICS
 
-    names: list[Any] = [figure.name for parts in FIGURES.values() for part in parts for figure in part]
+    names: list[Any] = [metric.name for parts in METRICS.values() for part in parts for metric in part]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"[a-z][a-z_]*", name) for name in names)

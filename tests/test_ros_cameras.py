@@ -54,7 +54,7 @@ def test_capture_times_are_those_of_stamps_unless_a_clock_is_wrong():
         assert topic.get(at, age) == at
     assert topic.take_told() == ["a stamp is 1.01 s old: the latency of these pictures is unknown"]
     assert topic.get(11.5, 0.1) == 11.4
-    assert topic.take_told() == ["stamps are right again"]
+    assert topic.take_told() == ["stamps are correct again"]
     topic.get(11.6, None)
     assert topic.take_told() == ["pictures have no stamp: their latency is unknown"]
     topic.get(11.7)
@@ -141,7 +141,7 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
     check_discovery(settings, insecure=False)
     open_to_all = replace(settings, discovery="subnet")
     check_discovery(open_to_all, insecure=True)
-    with pytest.raises(UserError, match=r"ros.discovery: subnet: admits any node of the network: set up SROS 2"):
+    with pytest.raises(UserError, match=r"ros.discovery: subnet: admits any node on the network: set up SROS 2"):
         check_discovery(open_to_all, insecure=False)
     monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
     with pytest.raises(UserError):
@@ -153,8 +153,8 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
 @pytest.mark.parametrize(
     "uri, rule",
     [
-        ("http://10.0.0.1:11311", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
-        ("http://robot:11311/", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
+        ("http://10.0.0.1:11311", "admits any node on the network, and ROS 1 has no keys: must be on this machine, or"),
+        ("http://robot:11311/", "admits any node on the network, and ROS 1 has no keys: must be on this machine, or"),
         ("10.0.0.1:11311", "must be http://HOST:PORT"),
         ("http://localhost", "must be http://HOST:PORT"),
         ("http://localhost:master", "must be http://HOST:PORT"),
@@ -207,15 +207,15 @@ def test_names_are_as_rospy_has_them():
     assert ros1.remappings(remap) == ["~state:=/robot/state", "/front:=image", "front:=~image"]
 
 
-def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", counted=None):
+def losses(monkeypatch, numbers, *, lost_in_transport=0, late=0, publisher=b"a", counted=None):
     """What is told after COUNT_S about pictures with these numbers."""
     counted = counted or pictures.PictureCount()
     for number in numbers:
         counted.add(publisher, number)
-    counted.untransported, counted.late = untransported, late
+    counted.lost_in_transport, counted.late = lost_in_transport, late
     later = pictures.time.monotonic() + pictures.COUNT_S
     monkeypatch.setattr(pictures.time, "monotonic", lambda: later)
-    return counted.take_news()
+    return counted.update()
 
 
 def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypatch):
@@ -223,10 +223,11 @@ def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypa
     assert losses(monkeypatch, range(7, 107), counted=counted) == ""
     assert losses(monkeypatch, range(112, 208), counted=counted) == ""  # 5 of 101, not more than one in twenty
     where = "3 between publisher and node, 3 since the node ran late; docs/ros.md states what helps"
-    assert losses(monkeypatch, range(212, 311), untransported=3, late=2, counted=counted) == f"6 of 103 {told}, {where}"
+    found = losses(monkeypatch, range(212, 311), lost_in_transport=3, late=2, counted=counted)
+    assert found == f"6 of 103 {told}, {where}"
     assert losses(monkeypatch, [320], counted=counted) == ""  # told already
-    assert losses(monkeypatch, [1, 2], publisher=b"b", counted=counted) == "no pictures are lost any more"
-    assert counted.take_news() == ""
+    assert losses(monkeypatch, [1, 2], publisher=b"b", counted=counted) == "no more pictures are lost"
+    assert counted.update() == ""
 
 
 def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_knows(monkeypatch):
@@ -234,4 +235,4 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
     for _ in range(9):
         counted.add(None, None)
     told = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
-    assert losses(monkeypatch, [], untransported=1, counted=counted).startswith(told)
+    assert losses(monkeypatch, [], lost_in_transport=1, counted=counted).startswith(told)

@@ -75,7 +75,7 @@ class Authority:
         """
         own = self._own
         if not own.exists() and self.directory.is_dir() and any(self.directory.iterdir()):
-            rule = "must be a directory of `tod-runner keys`, or a new one: it holds other files"
+            rule = "must be a directory of `tod-runner keys`, or a new one: it contains other files"
             raise UserError("command line", "output", str(self.directory), rule)
         with _errors_named():
             own.mkdir(parents=True, exist_ok=True)

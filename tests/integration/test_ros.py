@@ -236,14 +236,14 @@ def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
         publisher.publish("/front/image", late_s=None)
         goes_on(front)
         publisher.publish("/front/image")
-        until(lambda: told(reported, "stamps are right again"))
+        until(lambda: told(reported, "stamps are correct again"))
         publisher.publish("/front/image", reliability="best_effort")
         goes_on(front)
         publisher.publish("/front/image", fps=0)
         until(lambda: told(reported, "/front/image: no publisher for 5 s"))
         until(lambda: told(reported, "front: source: no frame for 1 s"))
         publisher.publish("/front/image")
-        until(lambda: told(reported, "/front/image: pictures come again, after "))
+        until(lambda: told(reported, "/front/image: pictures are arriving again, after "))
         goes_on(front)
     lines = [line.removeprefix("front: /front/image: ") for line in reported if "/front/image" in line]
     assert [re.sub(r"[0-9.]+ s", "N s", line) for line in calm(lines)] == [
@@ -252,9 +252,9 @@ def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
         f"{size}, scaled up to the camera's 384x216; they were BGR 384x216",
         "a stamp is N s old: the latency of these pictures is unknown",
         "pictures are BGR 384x216; they were BGR 192x108",
-        "stamps are right again",
+        "stamps are correct again",
         "no publisher for N s",
-        "pictures come again, after N s",
+        "pictures are arriving again, after N s",
     ]
     assert calm(told(reported, "/rear/image")) == ["rear: /rear/image: pictures are BGR 384x216"]
 
@@ -346,7 +346,7 @@ def test_a_master_that_dies_and_returns(ros1):
             assert told(reported, "no publisher") == []
         until(lambda: len(told(reported, "/image: no publisher for 5 s")) == 2)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: len(told(reported, "/image: pictures come again")) == 2)
+            until(lambda: len(told(reported, "/image: pictures are arriving again")) == 2)
             with watching(plans[0]) as front:
                 goes_on(front)
         assert children_named(os.getpid(), SCRIPT) == [node]
@@ -393,7 +393,7 @@ def test_a_publisher_that_dies_without_a_word(ros1):
         publisher.process.wait(20)
         until(lambda: "front: /front/image: its publisher cannot be reached for 5 s" in reported)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: told(reported, "front: /front/image: pictures come again, after "))
+            until(lambda: told(reported, "front: /front/image: pictures are arriving again, after "))
             with watching(plans[0]) as front:
                 goes_on(front)
 
@@ -404,7 +404,7 @@ def test_a_master_that_any_machine_can_reach_is_refused(ros1):
     status, lines = refused(ros1)
     assert (status, lines[-1]) == (
         1,
-        f"the ROS node does not start: the ROS master at {ros1.master.uri} admits any node of the network: "
+        f"the ROS node does not start: the ROS master at {ros1.master.uri} admits any node on the network: "
         "start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true",
     )
 
@@ -414,7 +414,7 @@ def test_a_name_that_is_taken_is_refused(ros1):
     with publishing(ros1, front={}), subscribing(ros1) as (_, _, reported):
         until(lambda: told(reported, "pictures are"))
         status, lines = refused(ros1)
-        why = "the ROS node does not start: a node of the name /tod_runner runs already, at http://127.0.0.1:"
+        why = "the ROS node does not start: a node named /tod_runner is already running at http://127.0.0.1:"
         assert (status, lines[-1][: len(why)]) == (1, why)
         assert lines[-1].endswith(": give another ros.node")
         assert told(reported, "the ROS node") == []
@@ -428,7 +428,7 @@ def test_a_node_that_is_ended_over_ros_is_started_again(ros1):
     ):
         with suppress(OSError, HTTPException):  # it may end before it answers
             ServerProxy(ros1.master.call("lookupNode", "/tod_runner")).shutdown("/test", "as rosnode kill does")
-        why = "another node of the same name has come, or it was ended over ROS"
+        why = "another node of the same name has started, or it was shut down over ROS"
         until(lambda: f"the ROS node ended: {why}; starting it again" in reported)
         until(lambda: told(reported, "the ROS node works again"))
         goes_on(both[0])
@@ -506,7 +506,7 @@ def losses(ros, large=True):
         until(lambda: len(publisher.sent) - before >= 14)
         os.kill(node, signal.SIGCONT)
         line = until(lambda: told(reported, "pictures were lost"))[0]
-        until(lambda: told(reported, "no pictures are lost any more"))
+        until(lambda: told(reported, "no more pictures are lost"))
     assert max(late for every in late_s.values() for late in every) < 2
     return map(int, re.search(r": (\d+) of .* lost, (\d+) between .*, (\d+) since", line).groups())
 
@@ -546,7 +546,7 @@ def test_a_vehicle_without_the_library_does_not_start(ros):
 def test_nodes_of_other_machines_are_not_found_unless_they_prove_who_they_are(ros2):
     status, (line,) = refused(ros2, "ros.discovery=subnet")
     assert status == 2
-    assert line.startswith("command line: ros.discovery: subnet: admits any node of the network: set up SROS 2 ")
+    assert line.startswith("command line: ros.discovery: subnet: admits any node on the network: set up SROS 2 ")
 
 
 def test_a_camera_without_a_topic(ros):
