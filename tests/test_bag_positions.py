@@ -1,4 +1,4 @@
-"""Positions from bags: as a track, and in place of those that a drive has logged."""
+"""Positions from bags: as a track, and as a replacement for those in a drive's log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STORE = typestore("mcap")
 
 
 def gps(path, *topics, first_s=-2.0, count=60, status=0):
-    """Positions twice a second, northwards; they begin before the drive."""
+    """Positions twice a second, heading north, from before the drive."""
     times = [BEGAN_NS + round((first_s + n / 2) * 1e9) for n in range(count)]
     fixes = [(ns + 7, fix(STORE, ns, 48.0 + n / 10_000, 11.5, status)) for n, ns in enumerate(times)]
     return write_bag(path, "mcap", dict.fromkeys(topics, fixes))
@@ -100,7 +100,7 @@ def test_a_replay_has_the_positions_of_a_bag(tmp_path, tod, drive):
     assert [line["t"] for line in lines if line["event"] != "position_reported"] == others
 
 
-def test_what_is_wrong_with_positions_is_reported(tmp_path, tod, drive):
+def test_problems_of_positions_are_reported(tmp_path, tod, drive):
     late, blind = gps(tmp_path / "late", "/gps", first_s=500), gps(tmp_path / "blind", "/gps", status=-1)
     for words, problem in (
         (["topic=/gps"], "command line: positions: must be given with topic: the bag that has it"),

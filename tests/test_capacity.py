@@ -39,7 +39,7 @@ def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() ->
 
 
 def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None:
-    """Frames wait from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has room."""
+    """Frames queue from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has spare capacity."""
 
     def change(side: str, lines: Lines) -> Lines:
         for line in lines:
@@ -75,7 +75,7 @@ def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> 
     assert '"source": "pqos"' in replayed.out
 
 
-def test_drives_that_cannot_give_a_map_are_reported(tod: Command, tmp_path: Path) -> None:
+def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> None:
     def roomy(side: str, lines: Lines) -> Lines:
         for line in lines:
             for camera in line["cameras"].values() if line.get("log") == "sample" else ():

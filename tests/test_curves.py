@@ -105,7 +105,7 @@ def test_a_smaller_tolerance_keeps_no_fewer_factors():
     assert sizes[0] < sizes[-1]
 
 
-def test_points_that_miss_their_target_take_no_part():
+def test_points_that_miss_their_target_are_excluded():
     points = grid([Fraction(1, 2), Fraction(1)])
     honest = draw_curves(points, SCORE)
     # At full size the encoder cannot go below 300 kbit/s, and scores well for it.
@@ -129,7 +129,7 @@ def test_points_that_all_miss_their_target_are_refused():
         draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
 
 
-def test_confidence_holds_the_crossing_and_grows_with_the_noise():
+def test_the_confidence_interval_contains_the_crossing_and_grows_with_noise():
     widths = []
     for noise in (0.0, 0.002):
         points = grid([Fraction(1, 2), Fraction(1)], noise=noise)
@@ -148,7 +148,7 @@ def test_the_same_points_give_the_same_confidence():
     assert crossings(points, ladder, "mssim", 1) == crossings(points, ladder, "mssim", 1)
 
 
-def test_b_full_is_where_the_quality_is_reached_for_good():
+def test_b_full_is_where_the_quality_stays_reached():
     curves = draw_curves(grid(), SCORE)
     ladder, _ = best_ladder(curves, 5e-4, 1.25)
     kbps = reaches(curves, ladder, 0.97)
@@ -201,7 +201,7 @@ def test_a_choice_warns_of_its_limits():
     assert "the curves never cross between 50 and 4000 kbit/s: factor 0.5 is the best" in one.warnings
 
 
-def test_lower_is_better_turns_everything_round():
+def test_lower_is_better_reverses_everything():
     points = [replace(p, scores={"brisque": tuple(100 * (1 - s) for s in p.scores["mssim"])}) for p in grid()]
     turned = choose(points, ChoiceCriteria("brisque", -1, 0.05, 1.25, 5.0, None, Fraction(25)))
     straight = choose(grid(), CRITERIA)

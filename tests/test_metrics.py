@@ -383,7 +383,7 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
         ("a:path=/b", "vmaf_model: 'a:path=/b': must be the name of a model, such as vmaf_v0.6.1"),
     ],
 )
-def test_vmaf_model_that_is_none(vmaf: Metric, model: str, message: str) -> None:
+def test_vmaf_without_the_model(vmaf: Metric, model: str, message: str) -> None:
     with pytest.raises(UserError) as raised:
         find_metric("vmaf", vmaf_model=model)
     assert str(raised.value) == message
@@ -503,7 +503,7 @@ def test_brisque_scores_the_picture_alone(files: Callable[[Path], tuple[Path, Pa
 
 
 @pytest.mark.parametrize("rho, cut", [("-3000", 100), ("3000", 0)])
-def test_brisque_is_cut(tmp_path: Path, rho: str, cut: float) -> None:
+def test_brisque_is_clipped(tmp_path: Path, rho: str, cut: float) -> None:
     model, ranges = libsvm_files(tmp_path)
     model.write_text(model.read_text().replace("-30.5", rho))
     assert score(find_metric("brisque", brisque_model=model, brisque_range=ranges), noise(0), noise(1)) == cut

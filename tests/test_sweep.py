@@ -93,7 +93,7 @@ def test_replay_reads_a_file(tod: Command) -> None:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
-    """And -m is one where nothing sweeps."""
+    """-m is also a flag, of verbs that do not sweep."""
     if verb in SWEEPING:
         words = (verb, "modes=paper,safe", *(["input=/dev/null"] if verb == "replay" else []))
         assert "which print, replay and demo run with -m; write [a,b,c]" in tod(*words).err
@@ -105,7 +105,7 @@ def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
 
 
 def test_every_flag_of_hydra_has_an_answer(tod: Command) -> None:
-    """One line and status 2, behind a verb and alone; --help and --version are ours, -m is that of three verbs."""
+    """One line and status 2, with and without a verb; --help and --version are supported, and -m by three verbs."""
     known = {flag for action in get_args_parser()._actions for flag in action.option_strings}
     answered = {flag for flags in HYDRA_FLAGS for flag in flags}
     assert known - {"--help", "-h", "--version", "-m"} == answered

@@ -1,4 +1,4 @@
-"""Tables named in settings: what is read, and each mistake with its exact message."""
+"""Tables named in settings: what is read, and each error with its exact message."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_map_yaml_mistakes(tmp_path: Path, text: str, found: str, rule: str) -> 
 
 
 @pytest.mark.parametrize("second", ["0.5", "nan"])
-def test_time_does_not_fall(tmp_path: Path, second: str) -> None:
+def test_time_does_not_decrease(tmp_path: Path, second: str) -> None:
     path = written(tmp_path, f"t_s,kbps\n1,5\n{second},6\n")
     with pytest.raises(ModelError) as raised:
         read_table(path, (TIME, RATE))
@@ -136,7 +136,7 @@ def test_number_refuses(value: object) -> None:
     assert number({"radius_m": 0}, "radius_m") == 0
 
 
-def test_mistake_at_the_end_of_a_big_file_is_found_soon(tmp_path: Path) -> None:
+def test_an_error_at_the_end_of_a_big_file_is_found_quickly(tmp_path: Path) -> None:
     path = written(tmp_path, "lon,lat,kbps\n" + "11.5,48.25,3000\n" * 200_000 + "11.5,48.25,x\n")
     start = time.process_time()
     with pytest.raises(ModelError, match=":200002: kbps 'x': must be a number"):

@@ -83,7 +83,7 @@ def test_scattered_laps_give_no_jumps() -> None:
 
 
 def test_crossing_roads_are_driven_along() -> None:
-    """A cross has four ends: only going back along a road reaches all of them without a jump."""
+    """A crossing has four ends: only driving back along a road reaches all of them without a jump."""
     line = np.arange(-100, 101, 5.0)
     cross = places(np.append(line, 0 * line), np.append(0 * line, line))
     points = np.random.default_rng(2).permutation(cross)
@@ -101,7 +101,7 @@ def test_road_that_does_not_close() -> None:
     assert back.at(120).heading_deg == pytest.approx(270, abs=0.1)
 
 
-def test_order_is_found_at_once() -> None:
+def test_the_order_is_found_quickly() -> None:
     """Limits are in processor time."""
     random = np.random.default_rng(0)
     for points in (places(*random.uniform(0, 1000, (2, 3000))), random.permutation(oval(1_000_000, 2000, 9, 1.5))):

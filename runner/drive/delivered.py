@@ -27,9 +27,9 @@ from runner.core.model import Camera
 from runner.drive.captures import (
     SAME_NS,
     SECOND_NS,
-    VideoFile,
     ReadVideo,
     UnitTimes,
+    VideoFile,
     arrivals,
     files,
     matched,

@@ -198,7 +198,7 @@ class Authority:
         return {}
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
-        """Replace a holder's directory atomically."""
+        """Replace a holder's directory as a whole."""
         new, old, final = (
             self.directory / f"{dot}{name}{end}" for dot, end in ((".", ".new"), (".", ".old"), ("", ""))
         )

@@ -99,7 +99,7 @@ class ClockComparison:
         return self._set_at >= begin
 
     def held(self, begin: float, end: float) -> bool:
-        """Whether no clock was set between two times, by the same clock; then `difference` is valid for times read then."""
+        """Whether no clock was set between two times, by the same clock; then `difference` is valid in between."""
         return not self.was_set_since(begin) and end <= self._asked
 
     @property

@@ -50,7 +50,7 @@ def conf(tmp_path: Path) -> Path:
 
 
 def frames(line: str, limit: int = 10_000) -> list[tuple[int, str]]:
-    """Time in ns and digest of each frame that a pipeline makes."""
+    """Time in ns and digest of each frame that a pipeline produces."""
     from runner.gst import Gst
 
     pipeline = Gst.parse_launch(f"{line} ! appsink name=frames sync=false max-buffers=4")
@@ -260,7 +260,7 @@ def test_nothing_is_overwritten(tmp_path):
     assert all((tmp_path / name).read_text() == "mine" for name in names)
 
 
-def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
+def test_a_name_taken_during_the_recording_is_not_overwritten(tmp_path):
     recordings.claim_files(tmp_path, ["rear"])["rear"].write_text("new")
     (tmp_path / "rear.mkv").write_text("old")
     with pytest.raises(RunError, match=r"rear.mkv was created in the meantime; the recording is .*/\.rear\.mkv\.part"):

@@ -274,7 +274,9 @@ class Ros1InputTopic(InputTopic):
         self._publishers: list[str] = []  # names of nodes, as last reported by the master
         message = getattr(import_module(f"{package}.msg"), type_name)
         size = 1 if kind in NEWEST else None
-        self._subscriber = rospy.Subscriber(ros1_name(name), message, self.on_message, queue_size=size, tcp_nodelay=True)
+        self._subscriber = rospy.Subscriber(
+            ros1_name(name), message, self.on_message, queue_size=size, tcp_nodelay=True
+        )
 
     def update(self, known: Registrations) -> None:
         """To be called every POLL_S with the master's registrations."""
@@ -330,7 +332,8 @@ class Ros1Outputs:
         from std_msgs.msg import String
 
         self._publishers = {
-            topic: rospy.Publisher(ros1_name(topic), String, queue_size=10, latch=latch) for topic, latch in latched.items()
+            topic: rospy.Publisher(ros1_name(topic), String, queue_size=10, latch=latch)
+            for topic, latch in latched.items()
         }
 
     def publish(self, order: dict[str, Any]) -> None:
