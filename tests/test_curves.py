@@ -125,7 +125,7 @@ def test_a_factor_with_no_use_for_more_bitrate_stays_as_good():
 
 
 def test_points_that_all_miss_their_target_are_refused():
-    with pytest.raises(ValueError, match="no encoding holds its target bitrate"):
+    with pytest.raises(ValueError, match="no encoding meets its target bitrate"):
         draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
 
 

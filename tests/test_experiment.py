@@ -189,5 +189,5 @@ def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:
 def test_the_demo_does_not_write_among_other_files(tod: Command, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     result = tod("demo", "source=test", f"output={tmp_path}")
-    rule = "must be a new or an empty directory, holds thesis.tex"
+    rule = "must be a new or empty directory, but contains thesis.tex"
     assert (result.status, result.err) == (2, f"command line: output: '{tmp_path}': {rule}\n")

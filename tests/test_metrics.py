@@ -548,8 +548,8 @@ def test_brisque_without_files(tmp_path: Path) -> None:
     regression = "the regression as libsvm's text or OpenCV's brisque_model_live.yml"
     of_features = "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"
     for given_files, message in (
-        ((None, ranges), f"brisque_model: brisque needs a file of yours, {regression}"),
-        ((model, None), f"brisque_range: brisque needs a file of yours, {of_features}"),
+        ((None, ranges), f"brisque_model: brisque needs a file that you provide,  {regression}"),
+        ((model, None), f"brisque_range: brisque needs a file that you provide,  {of_features}"),
         ((missing, ranges), f"{missing}: no such file or directory"),
         ((model, binary), f"{binary}: is not text"),
     ):

@@ -84,7 +84,7 @@ def test_all_files_of_a_user_are_checked_together(tod: Command, conf: UserConf) 
             "~/camera/x.yaml: would be ignored: no such group as camera/, did you mean cameras?",
             "~/cameras/foo.yml: would be ignored: Hydra reads foo.yaml",
             "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
-            "~/cameras/front/x.yaml: would be ignored: files stand in cameras/ itself, not in folders below",
+            "~/cameras/front/x.yaml: would be ignored: files must be directly in cameras/, not in subfolders",
             f"~/graph/a,b.yaml: {name}",
             f"~/graph/true.yaml: {name}",
             "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",

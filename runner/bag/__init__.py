@@ -144,8 +144,8 @@ class Bag:
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Messages of a topic, with the times at which they were recorded, ns since 1970."""
         with _readable("topic", self.names(topic)):
-            wanted = [connection for connection in self._reader.connections if connection.topic == topic]
-            for connection, ns, data in self._reader.messages(wanted):
+            connections = [connection for connection in self._reader.connections if connection.topic == topic]
+            for connection, ns, data in self._reader.messages(connections):
                 yield ns, self._reader.deserialize(data, connection.msgtype)
 
 

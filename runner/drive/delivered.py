@@ -246,12 +246,12 @@ def _scenes(
     clip: Path | None,
 ) -> dict[int, Luma]:
     """The scene at each moment."""
-    wanted = set(moments)
-    if not wanted:
+    times = set(moments)
+    if not times:
         return {}
     if clip is None:
         size = (camera.width, camera.height)
-        return {ns: picture for ns, picture in videos.pictures(sent, size) if ns in wanted}
+        return {ns: picture for ns, picture in videos.pictures(sent, size) if ns in times}
     crop = camera.in_source
     width, height = camera.source_size
     window = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
@@ -259,7 +259,7 @@ def _scenes(
     numbers = {
         ns: _nearest(clipped, _thumbnail(picture))
         for ns, picture in videos.pictures(sent, (camera.width, camera.height))
-        if ns in wanted
+        if ns in times
     }
     needed = set(numbers.values())  # a whole clip would not fit into memory
     scenes = {n: p[window] for n, (_, p) in enumerate(videos.decode(clip, width, height)) if n in needed}

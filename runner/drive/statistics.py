@@ -267,7 +267,7 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     frozen = ", ".join(f"{name} {_percentage(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
     if frozen:
-        rule = "a frozen picture counts as its last frame, whatever moves meanwhile: an upper bound"
+        rule = "a frozen picture counts as its last frame, whatever moves in the scene: an upper bound"
         yield f"estimated quality: {rule}; frozen {frozen} of the time"
     unseen = [name for name, camera in cameras.items() if camera.delivered and not camera.delivered.clip]
     if unseen:

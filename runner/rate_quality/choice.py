@@ -138,7 +138,7 @@ def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[i
     largest = round(float(curves.kbps[-1]))
     best = criteria.sign * float(curves.best[-1])
     warning = (
-        f"b_full: {criteria.metric} {criteria.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is taken"
+        f"b_full: {criteria.metric} {criteria.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is used"
     )
     return largest, [warning]
 
@@ -176,11 +176,11 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria:
         where = f"worst for {_shown(worst[0].scaling)} from {pair} kbit/s, by {score(worst[0]) - score(worst[1]):.2g}"
         yield f"more bitrate looks worse in {len(fallen)} place{'' if len(fallen) == 1 else 's'}; {where}"
     for factor in curves.quality:
-        over = [point for point in points if point.scaling == factor and not point.holds]
+        over = [point for point in points if point.scaling == factor and not point.meets_target]
         if over:
             top = max(over, key=lambda point: point.target_kbps)
-            comes = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
-            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it reaches {comes}; excluded there"
+            actual = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
+            yield f"{_shown(factor)} exceeds {len(over)} of its targets: it reaches {actual}; excluded there"
 
 
 def _shown(factor: Fraction) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 GRID = 400  # bitrates at which curves are compared, log-spaced
-HOLDS = 1.1  # largest ratio of actual to target bitrate at which an encoding meets its target
+MAX_OVERSHOOT = 1.1  # largest ratio of actual to target bitrate at which an encoding meets its target
 SATURATED = 0.8  # below this ratio the encoder cannot use more bitrate
 RESAMPLED = 200  # bootstrap samples for the confidence of a crossing
 BLOCKS = 8  # time blocks that are resampled
@@ -40,8 +40,8 @@ class Point:
     scores: Mapping[str, tuple[float, ...]]
 
     @property
-    def holds(self) -> bool:
-        return self.actual_kbps <= HOLDS * self.target_kbps
+    def meets_target(self) -> bool:
+        return self.actual_kbps <= MAX_OVERSHOOT * self.target_kbps
 
     @property
     def saturated(self) -> bool:
@@ -56,7 +56,7 @@ class Curves:
     """Quality of each factor over bitrate.
 
     kbps     grid, log-spaced
-    quality  by factor, on the grid; -inf where the factor does not hold its target or was not measured
+    quality  by factor, on the grid; -inf where the factor exceeds its target or was not measured
     """
 
     kbps: Values
@@ -108,17 +108,17 @@ def mean_score(metric: str, sign: int = 1) -> Score:
 def draw_curves(points: Iterable[Point], score: Score) -> Curves:
     """Curves through the points: piecewise cubic in log bitrate, monotone where the points are (PCHIP).
 
-    raises  ValueError if no point holds its target
+    raises  ValueError if no point meets its target
     """
-    held: dict[Fraction, list[Point]] = {}
+    valid: dict[Fraction, list[Point]] = {}
     for point in sorted(points, key=lambda p: (p.scaling, p.target_kbps)):
-        if point.holds:
-            held.setdefault(point.scaling, []).append(point)
-    targets = [point.target_kbps for group in held.values() for point in group]
+        if point.meets_target:
+            valid.setdefault(point.scaling, []).append(point)
+    targets = [point.target_kbps for group in valid.values() for point in group]
     if not targets:
-        raise ValueError("no encoding holds its target bitrate")
+        raise ValueError("no encoding meets its target bitrate")
     kbps = np.geomspace(min(targets), max(targets), GRID)
-    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in held.items()})
+    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in valid.items()})
 
 
 def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:

@@ -55,7 +55,7 @@ def _draw_curves(axes: Axes, measured: Measured, curves: Curves) -> dict[Fractio
         shown = np.where(np.isfinite(quality), measured.sign * quality, np.nan)
         label = f"s = {plain(factor)}" if kept else None
         axes.plot(curves.kbps, shown, color=colour, lw=1.6 if kept else 0.9, label=label, zorder=3 if kept else 2)
-        own = [point for point in measured.points if point.scaling == factor and point.holds]
+        own = [point for point in measured.points if point.scaling == factor and point.meets_target]
         means = [float(np.mean(point.scores[measured.metric])) for point in own]
         axes.plot([p.target_kbps for p in own], means, ".", ms=5 if kept else 3, color=colour, zorder=3 if kept else 2)
     dropped = [f"{plain(factor)}" for factor in curves.quality if factor not in colours]

@@ -20,9 +20,9 @@ T = TypeVar("T")
 SCHEDULER_S = 10  # timeout for the answer of a Dask scheduler
 
 
-def parallel_tasks(wanted: int | None) -> int:
+def parallel_tasks(requested: int | None) -> int:
     """How many tasks run in parallel on this machine; each has many threads of its own."""
-    return wanted or max(1, (os.cpu_count() or 1) // 2)
+    return requested or max(1, (os.cpu_count() or 1) // 2)
 
 
 @contextmanager

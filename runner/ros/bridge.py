@@ -103,7 +103,7 @@ class Bridge:
         now = time.monotonic()
         for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
             if self._pending.pop(identity, None) is not None:
-                self._answer(identity, "timed out", f"the vehicle has not answered within {self._answer_s:g} s")
+                self._answer(identity, "timed out", f"the vehicle did not answer within {self._answer_s:g} s")
 
     # --- from the vehicle, in the link's thread -----------------------------------------------------------------------
 

@@ -136,7 +136,7 @@ class NodeProcess:
         self._thread.start()
         if not self._tried.wait(START_S):
             self.close()
-            raise RunError(f"the ROS node does not start within {START_S:g} s")
+            raise RunError(f"the ROS node did not start within {START_S:g} s")
         if self._fault:
             self.close()
             raise RunError(f"the ROS node does not start: {self._fault}")

@@ -60,7 +60,7 @@ def _only_renderer(cache: Path, progress: Progress) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            progress("waiting for another run that renders", 0.0)
+            progress("waiting for another run to finish rendering", 0.0)
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 

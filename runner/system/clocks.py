@@ -70,7 +70,7 @@ class ClockComparison:
 
     def __init__(self) -> None:
         self._set_at = float("-inf")  # when a clock was found to have been set
-        self._asked = float("-inf")
+        self._last_sent = float("-inf")
         self._intervals: deque[_Interval] = deque()
         self._set_s: tuple[float, float] | None = None
 
@@ -92,7 +92,7 @@ class ClockComparison:
             self._set_at = at
         if moved < STEP_S:  # otherwise it may have moved in the middle of this exchange
             self._intervals.append(interval)
-            self._asked = max(self._asked, at - (exchange.returned - exchange.sent))
+            self._last_sent = max(self._last_sent, at - (exchange.returned - exchange.sent))
 
     def was_set_since(self, begin: float) -> bool:
         """Whether a clock is known to have been set after a time, by the same clock."""
@@ -100,17 +100,17 @@ class ClockComparison:
 
     def held(self, begin: float, end: float) -> bool:
         """Whether no clock was set between two times, by the same clock; then `difference` is valid in between."""
-        return not self.was_set_since(begin) and end <= self._asked
+        return not self.was_set_since(begin) and end <= self._last_sent
 
     @property
     def was_set(self) -> bool:
         """Whether a clock was set after the newest exchange that counts."""
-        return self._set_at > self._asked
+        return self._set_at > self._last_sent
 
     @property
-    def asked(self) -> float:
+    def last_sent(self) -> float:
         """When the newest exchange that counts was sent, by the same clock."""
-        return self._asked
+        return self._last_sent
 
     def difference(self, now: float) -> ClockDifference | None:
         """The difference at a time, by the same clock; None if nothing was exchanged for KEPT_S."""

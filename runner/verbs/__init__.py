@@ -127,10 +127,10 @@ HYDRA_FLAGS = {
     ("--package", "-p"): "print format=yaml shows the whole configuration",
     ("--info", "-i"): "print format=yaml shows which files were composed; validate all=true checks all of them",
     ("--config-dir", "-cd", "--config-path", "-cp"): "conf=DIR names a directory of your own",
-    ("--config-name", "-cn"): "conf=DIR may hold a config.yaml of your own",
+    ("--config-name", "-cn"): "conf=DIR may contain a config.yaml of your own",
     ("--run", "-r"): "a verb runs without a flag",
     ("--shell-completion", "-sc"): "tod-runner completion bash or zsh prints the script",
-    ("--hydra-help",): "docs/configuration.md says what of Hydra is supported",
+    ("--hydra-help",): "docs/configuration.md lists what is supported of Hydra",
     ("--experimental-rerun",): "replay input=DRIVE repeats a drive with its own configuration",
 }
 

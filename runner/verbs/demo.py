@@ -162,7 +162,8 @@ def _check_empty(key: str, directory: Path) -> None:
     except OSError as error:
         raise UserError("command line", key, repr(str(directory)), (error.strerror or str(error)).lower()) from None
     if found:
-        rule = f"must be a new or an empty directory, holds {', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
+        names = f"{', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
+        rule = f"must be a new or empty directory, but contains {names}"
         raise UserError("command line", key, repr(str(directory)), rule)
 
 

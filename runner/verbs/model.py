@@ -127,7 +127,7 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
         if len(clips) == 1:
             found[name] = clips[0]
         else:
-            rule = f"{len(clips)} files are named {name}.*, must be one"
+            rule = f"{len(clips)} files are named {name}.*, must be exactly one"
             problems.append(Problem("command line", "sequence", repr(str(given)), rule))
     if problems:
         raise ConfigError(problems)
@@ -140,10 +140,10 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
     problems = []
     for name in names:
         camera = vehicle.cameras[name]
-        wanted = camera.mount.get("topic", camera.source.settings.get("topic"))
+        named = camera.mount.get("topic", camera.source.settings.get("topic"))
         try:
             with Bag(path) as bag:
-                topic = bag.find(PICTURES, None if wanted is None else str(wanted), "pictures")
+                topic = bag.find(PICTURES, None if named is None else str(named), "pictures")
             found[name] = BagTopic(str(path), topic)
         except ModelError as error:
             at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
@@ -159,11 +159,11 @@ def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Fo
 
     from runner.plans import compile_plans, render_missing
 
-    wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
+    measured = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
     with progress_bar() as progress:
-        render_missing(wanted, progress)
+        render_missing(measured, progress)
     found: dict[str, Footage] = {}
-    for plan in compile_plans(wanted):
+    for plan in compile_plans(measured):
         if plan.bag:
             found[plan.camera.name] = plan.bag
             continue

@@ -223,7 +223,7 @@ def _check_sources(vehicle: Vehicle) -> None:
         c.name for c in vehicle.cameras.values() if c.source.stand_in and not (c.source.render or c.source.plays_bags)
     ]
     if pushed:
-        rule = "its frames are pushed by a Python program, which `record` is not; choose another source"
+        rule = "its frames must be pushed by a Python program; choose another source"
         raise UserError("command line", "source", ", ".join(pushed), rule)
 
 

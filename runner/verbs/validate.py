@@ -212,7 +212,7 @@ def _misplaced(group: str, relative: Path) -> str | None:
     """Why Hydra would not find a file; None if it would."""
     first = relative.parts[0]
     if group and group not in FOLDERS:
-        nested = f"files stand in {first}/ itself, not in folders below" if first in FOLDERS else ""
+        nested = f"files must be directly in {first}/, not in subfolders" if first in FOLDERS else ""
         return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
     if group == LAYOUT:
         return _misplaced_layout(relative)

@@ -391,7 +391,7 @@ def test_a_publisher_that_is_killed(ros1):
         until(lambda: len(matching(reported, ": pictures are ")) == 2)
         publisher.process.kill()
         publisher.process.wait(20)
-        until(lambda: "front: /front/image: its publisher cannot be reached for 5 s" in reported)
+        until(lambda: "front: /front/image: its publisher has been unreachable for 5 s" in reported)
         with publishing(ros1, front={}, rear={}):
             until(lambda: matching(reported, "front: /front/image: pictures are arriving again, after "))
             with watching(plans[0]) as front:

@@ -141,7 +141,7 @@ def test_a_request_that_the_vehicle_does_not_answer_times_out(ros, lines):
         reply = operator.ask(id="two", event="mode_selected", mode="single")
         vehicle.send_signal(signal.SIGCONT)
         assert (reply["id"], reply["result"]) == ("two", "timed out")
-        assert reply["reason"] == "the vehicle has not answered within 3 s"
+        assert reply["reason"] == "the vehicle did not answer within 3 s"
 
 
 def test_a_killed_node_is_restarted_with_its_latched_texts(ros, lines):

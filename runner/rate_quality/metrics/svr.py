@@ -113,7 +113,7 @@ def _libsvm_kernels(path: Path, text: str, features: int) -> Kernels:
     rho, gamma = (_number(path, name, settings.get(name, "")) for name in ("rho", "gamma"))
     rows = [line.split() for line in body.splitlines() if line.strip()]
     total = int(_number(path, "total_sv", settings.get("total_sv", "")))
-    _expect(path, "SV", len(rows), f"must have {total} lines, as total_sv says", len(rows) == total > 0)
+    _expect(path, "SV", len(rows), f"must have {total} lines, as total_sv states", len(rows) == total > 0)
     vectors = np.zeros((total, features))
     alpha = np.zeros(total)
     for i, (weight, *cells) in enumerate(rows):
@@ -205,7 +205,7 @@ def _document(path: Path, text: str) -> dict[str, Any]:
         document = yaml.load(text.partition("\n")[2], _OpenCvLoader)
     except yaml.YAMLError:
         raise UserError(str(path), "", None, "is not what OpenCV writes") from None
-    _expect(path, "", text[:20], "holds nothing", isinstance(document, dict) and bool(document))
+    _expect(path, "", text[:20], "is empty", isinstance(document, dict) and bool(document))
     return dict(document)
 
 

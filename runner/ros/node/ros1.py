@@ -193,9 +193,9 @@ class Ros1PictureTopic(PictureTopic):
         if known and publishers:
             self._check_type(known.types.get(name, ""))
         if self._is_connected():
-            self._worker.add(self.check_arrivals, "its publisher sends no picture")
+            self._worker.add(self.check_arrivals, "its publisher has sent no picture")
         elif known:  # otherwise it is reported that the master does not answer
-            self._worker.add(self.check_arrivals, "its publisher cannot be reached" if publishers else "no publisher")
+            self._worker.add(self.check_arrivals, "its publisher has been unreachable" if publishers else "no publisher")
 
     def _check_type(self, kind: str) -> None:
         if kind in (IMAGE, COMPRESSED):

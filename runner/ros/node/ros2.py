@@ -44,7 +44,7 @@ class Ros2PictureTopic(PictureTopic):
             self._subscribe(kind, self._profile([p for p in publishers if p.topic_type == kind]))
         elif kinds:
             self.fail(f"has messages of type {', '.join(kinds)}, must be {IMAGE} or {COMPRESSED}")
-        self.check_arrivals("its publisher sends no picture" if publishers else "no publisher")
+        self.check_arrivals("its publisher has sent no picture" if publishers else "no publisher")
 
     def _profile(self, publishers: list[Any]) -> QoSProfile:
         """The requested profile; where nothing is requested, what all publishers offer."""
