@@ -515,7 +515,7 @@ def test_brisque_is_clipped(tmp_path: Path, rho: str, cut: float) -> None:
         ("libsvm model", "epsilon_svr", "c_svc", "svm_type: 'c_svc': must be epsilon_svr"),
         ("libsvm model", "rbf", "linear", "kernel_type: 'linear': must be rbf"),
         ("libsvm model", "gamma 0.05\n", "", "gamma: '': must be a finite number"),
-        ("libsvm model", "total_sv 2", "total_sv 3", "SV: 2: must have 3 lines, as total_sv says"),
+        ("libsvm model", "total_sv 2", "total_sv 3", "SV: 2: must have 3 lines, as total_sv states"),
         ("libsvm model", "3:0.75", "37:0.75", "SV 2: '37': must be the number of a feature, 1 to 36"),
         ("libsvm model", "3:0.75", "3:x", "SV 2: 'x': must be a finite number"),
         ("libsvm range", "x\n", "", "[]: must have a line x before the ranges of features"),
@@ -548,8 +548,8 @@ def test_brisque_without_files(tmp_path: Path) -> None:
     regression = "the regression as libsvm's text or OpenCV's brisque_model_live.yml"
     of_features = "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"
     for given_files, message in (
-        ((None, ranges), f"brisque_model: brisque needs a file that you provide,  {regression}"),
-        ((model, None), f"brisque_range: brisque needs a file that you provide,  {of_features}"),
+        ((None, ranges), f"brisque_model: brisque needs a file that you provide, {regression}"),
+        ((model, None), f"brisque_range: brisque needs a file that you provide, {of_features}"),
         ((missing, ranges), f"{missing}: no such file or directory"),
         ((model, binary), f"{binary}: is not text"),
     ):

@@ -280,7 +280,7 @@ def test_a_name_taken_during_the_recording_is_not_overwritten(tmp_path):
         (
             ["output=/tmp/x", "source=appsrc"],
             2,
-            "command line: source: rear: its frames are pushed by a Python program",
+            "command line: source: rear: its frames must be pushed by a Python program",
         ),
     ],
 )

@@ -40,7 +40,7 @@ def metric(model: Path | None, ranges: Path | None) -> Metric:
         ("brisque_range", ranges, "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"),
     ):
         if path is None:
-            raise UserError("", key, None, f"brisque needs a file that you provide,  {what}")
+            raise UserError("", key, None, f"brisque needs a file that you provide, {what}")
     assert model is not None and ranges is not None
     regression = load(model, ranges, FEATURES)
     return Metric(

@@ -50,7 +50,7 @@ class Port:
             os.close(memory)
 
     def orders(self) -> Iterator[tuple[dict[str, Any], int]]:
-        """Texts and pictures to publish, and answers, until the other side wait_closed the connection or ends.
+        """Texts and pictures to publish, and answers, until the other side closes the connection or ends.
 
         yields  an order, and the memory of its picture, which the caller must close; -1: none
         """

@@ -380,7 +380,7 @@ def stamped(message: Any, order: dict[str, Any]) -> Any:
 
 
 def run(port: Port, task: dict[str, Any]) -> None:
-    """Be the node until the other side of the port wait_closed it.
+    """Be the node until the other side of the port closes it.
 
     raises  NodeError
     """
