@@ -1,10 +1,10 @@
 """usage: python ros_publisher.py WIDTH HEIGHT BITS
 
 Run by a Python that has rclpy or rospy. Each line on standard input is a JSON object for one topic; a later one for the
-same topic changes it. Without further keys it has numbered pictures, as `numbered.numbered`, with right stamps.
+same topic changes it. Without further keys it has numbered pictures, as `numbered.numbered`, with correct stamps.
 
     topic      its name
-    fps        pictures a second; 0: none any more, and no publisher
+    fps        pictures a second; 0: no pictures and no publisher
     encoding   bgr8
     half       true: pictures of half the size
     late_s     by how much stamps are behind the clock; null: no stamps
@@ -48,7 +48,7 @@ class Camera:
             self.fill(message)
         else:
             self.draw(message)
-        with suppress(RuntimeError):  # a reliable subscriber that the machine has not run for 0.1 s
+        with suppress(RuntimeError):  # a reliable subscriber that has not run for 0.1 s
             self.publisher.publish(message)
             if self.number >= 0:
                 print(json.dumps([settings["topic"], self.number, stamp]), flush=True)
@@ -87,7 +87,7 @@ def main() -> None:
             orders.append(json.loads(line))
         ended.set()
 
-    def obey() -> None:
+    def handle_orders() -> None:
         while orders:
             settings = orders.pop(0)
             before = cameras.pop(settings["topic"], None)
@@ -96,7 +96,7 @@ def main() -> None:
             if settings["fps"]:
                 cameras[settings["topic"]] = Camera(node, **settings)
 
-    node.every(0.02, obey)
+    node.every(0.02, handle_orders)
     threading.Thread(target=read, daemon=True).start()
     node.run(ended)
 

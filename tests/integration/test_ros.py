@@ -243,7 +243,7 @@ def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
         until(lambda: matching(reported, "/front/image: no publisher for 5 s"))
         until(lambda: matching(reported, "front: source: no frame for 1 s"))
         publisher.publish("/front/image")
-        until(lambda: matching(reported, "/front/image: pictures are arriving again, after "))
+        until(lambda: matching(reported, "/front/image: pictures arrive again, after "))
         goes_on(front)
     lines = [line.removeprefix("front: /front/image: ") for line in reported if "/front/image" in line]
     assert [re.sub(r"[0-9.]+ s", "N s", line) for line in calm(lines)] == [
@@ -254,7 +254,7 @@ def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
         "pictures are BGR 384x216; they were BGR 192x108",
         "stamps are correct again",
         "no publisher for N s",
-        "pictures are arriving again, after N s",
+        "pictures arrive again, after N s",
     ]
     assert calm(matching(reported, "/rear/image")) == ["rear: /rear/image: pictures are BGR 384x216"]
 
@@ -330,23 +330,23 @@ def test_both_versions_one_after_the_other(tmp_path):
 
 def test_a_master_that_dies_and_returns(ros1):
     """Pictures continue without it; the next one brings topics of publishers that register there."""
-    absent, there = (f"the ROS master at {ros1.master.uri} {what}" for what in ("does not answer", "answers"))
+    down, up = (f"the ROS master at {ros1.master.uri} {what}" for what in ("does not answer", "answers"))
     with subscribing(ros1) as (_, plans, reported):
         with publishing(ros1, front={}, rear={}), watched(plans, reported) as (front, rear):
             (node,) = children_named(os.getpid(), SCRIPT)
             for times in (1, 2):
                 ros1.master.kill()
-                until(lambda times=times: len(matching(reported, absent)) == times)
+                until(lambda times=times: len(matching(reported, down)) == times)
                 goes_on(front)
                 goes_on(rear)
                 ros1.master.start()
-                until(lambda times=times: len(matching(reported, there)) == times)
+                until(lambda times=times: len(matching(reported, up)) == times)
             known = until(lambda: {"/front/image", "/rear/image"} <= subscribed(ros1) and subscribed(ros1))
             assert "/clock" not in known
             assert matching(reported, "no publisher") == []
         until(lambda: len(matching(reported, "/image: no publisher for 5 s")) == 2)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: len(matching(reported, "/image: pictures are arriving again")) == 2)
+            until(lambda: len(matching(reported, "/image: pictures arrive again")) == 2)
             with watching(plans[0]) as front:
                 goes_on(front)
         assert children_named(os.getpid(), SCRIPT) == [node]
@@ -393,7 +393,7 @@ def test_a_publisher_that_is_killed(ros1):
         publisher.process.wait(20)
         until(lambda: "front: /front/image: its publisher has been unreachable for 5 s" in reported)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: matching(reported, "front: /front/image: pictures are arriving again, after "))
+            until(lambda: matching(reported, "front: /front/image: pictures arrive again, after "))
             with watching(plans[0]) as front:
                 goes_on(front)
 

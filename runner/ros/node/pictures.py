@@ -97,7 +97,7 @@ class PictureTopic:
         if self._faults:
             silent_s = time.monotonic() - self._last_arrival
             self._faults.clear()
-            self._port.report(f"pictures are arriving again, after {silent_s:.0f} s", self.name)
+            self._port.report(f"pictures arrive again, after {silent_s:.0f} s", self.name)
         self._last_arrival = time.monotonic()
         data, age = memoryview(message.data), now - stamp if stamp else None
         self._port.send_picture(data, topic=self.name, size=len(data), at=at, age=age, **properties_of(message))

@@ -195,7 +195,9 @@ class Ros1PictureTopic(PictureTopic):
         if self._is_connected():
             self._worker.add(self.check_arrivals, "its publisher has sent no picture")
         elif known:  # otherwise it is reported that the master does not answer
-            self._worker.add(self.check_arrivals, "its publisher has been unreachable" if publishers else "no publisher")
+            self._worker.add(
+                self.check_arrivals, "its publisher has been unreachable" if publishers else "no publisher"
+            )
 
     def _check_type(self, kind: str) -> None:
         if kind in (IMAGE, COMPRESSED):
