@@ -19,13 +19,13 @@ from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import (
     Point,
     best_ladder,
-    climb,
+    bitrate_for_quality,
+    build_ladder,
     cross,
     crossings,
     draw_curves,
-    falls,
     mean_score,
-    reaches,
+    quality_drops,
 )
 
 RATES = [round(x) for x in np.geomspace(50, 4000, 20)]
@@ -133,7 +133,7 @@ def test_the_confidence_interval_contains_the_crossing_and_grows_with_noise():
     widths = []
     for noise in (0.0, 0.002):
         points = grid([Fraction(1, 2), Fraction(1)], noise=noise)
-        ladder = climb(draw_curves(points, SCORE), [Fraction(1, 2), Fraction(1)])
+        ladder = build_ladder(draw_curves(points, SCORE), [Fraction(1, 2), Fraction(1)])
         (crossing,) = crossings(points, ladder, "mssim", 1)
         assert crossing.low <= crossing.kbps <= crossing.high
         widths.append(crossing.high - crossing.low)
@@ -151,15 +151,15 @@ def test_the_same_points_give_the_same_confidence():
 def test_b_full_is_where_the_quality_stays_reached():
     curves = draw_curves(grid(), SCORE)
     ladder, _ = best_ladder(curves, 5e-4, 1.25)
-    kbps = reaches(curves, ladder, 0.97)
+    kbps = bitrate_for_quality(curves, ladder, 0.97)
     assert np.interp(np.log(kbps), np.log(curves.kbps), curves.best) == pytest.approx(0.97, abs=2e-3)
-    assert reaches(curves, ladder, 1.1) is None
+    assert bitrate_for_quality(curves, ladder, 1.1) is None
 
 
 def test_falling_curves_are_found():
     points = grid([Fraction(1)])
     points[10] = point(Fraction(1), points[10].target_kbps, hard=4)
-    assert [(a.target_kbps, b.target_kbps) for a, b in falls(points, SCORE, 1e-3)] == [(RATES[9], RATES[10])]
+    assert [(a.target_kbps, b.target_kbps) for a, b in quality_drops(points, SCORE, 1e-3)] == [(RATES[9], RATES[10])]
 
 
 # --- the choice -------------------------------------------------------------------------------------------------------
@@ -237,7 +237,7 @@ def test_the_adaptive_plan_chooses_as_the_full_one_with_a_third_of_the_encodings
     assert len(points) <= len(EIGHTHS) * len(RATES) // 3
     full = draw_curves(grid(hard=hard), SCORE)
     chosen, _ = best_ladder(draw_curves(points, SCORE), 5e-4, 1.25)
-    judged = climb(full, chosen.scaling)  # its factors on the curves of the full plan
+    judged = build_ladder(full, chosen.scaling)  # its factors on the curves of the full plan
     assert judged is not None
     assert judged.regret_max < 1e-3
     for mine, theirs in zip(chosen.bounds, judged.bounds, strict=True):

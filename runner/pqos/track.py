@@ -1,4 +1,4 @@
-"""Positions for a drive without a GPS: along the points of a bandwidth map, or along a recorded track."""
+"""Positions for a drive without GPS: along the points of a bandwidth map, or along a recorded track."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ from runner.rate_quality.curves import (
     Ladder,
     Point,
     best_ladder,
-    climb,
+    bitrate_for_quality,
+    build_ladder,
     crossings,
     draw_curves,
-    falls,
     mean_score,
-    reaches,
+    quality_drops,
 )
 
 FEW_FRAMES = 40  # with fewer scored frames a mean is uncertain
@@ -132,7 +132,7 @@ def cores_needed(points: Iterable[Point], fps: Fraction) -> dict[Fraction, float
 
 def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[int, list[str]]:
     """The bitrate at which the quality is good enough; the largest measured one if it never is."""
-    reached = reaches(curves, ladder, criteria.sign * criteria.good)
+    reached = bitrate_for_quality(curves, ladder, criteria.sign * criteria.good)
     if reached is not None:
         return ceil(reached), []
     largest = round(float(curves.kbps[-1]))
@@ -146,7 +146,7 @@ def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[i
 def _below(curves: Curves, ladder: Ladder, b_full: int) -> Ladder:
     """Without the factors that no bitrate below b_full would choose."""
     used = [bound for bound in ladder.bounds if round(bound) < b_full]
-    return climb(curves, ladder.scaling[: len(used) + 1]) or ladder
+    return build_ladder(curves, ladder.scaling[: len(used) + 1]) or ladder
 
 
 def _why_dropped(factor: Fraction, curves: Curves, b_full: int) -> str:
@@ -169,7 +169,7 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria:
     if ladder.regret_max > criteria.tolerance:
         warning = f"{ladder.regret_max:.2g} of {criteria.metric}, more than the {criteria.tolerance:g} allowed"
         yield f"no choice of factors whose ranges are wide enough loses less than {warning}"
-    fallen = falls(points, score, criteria.tolerance)
+    fallen = quality_drops(points, score, criteria.tolerance)
     if fallen:
         worst = max(fallen, key=lambda pair: score(pair[0]) - score(pair[1]))
         pair = " to ".join(str(point.target_kbps) for point in worst)

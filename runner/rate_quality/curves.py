@@ -166,7 +166,7 @@ def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Lad
 
     If no set meets both, the one that loses least is returned.
     """
-    ladders = [ladder for chosen in _choices(curves) if (ladder := climb(curves, chosen)) is not None]
+    ladders = [ladder for chosen in _choices(curves) if (ladder := build_ladder(curves, chosen)) is not None]
     wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
     by_size: dict[int, Ladder] = {}
     for ladder in sorted(wide, key=lambda one: (one.regret_max, one.regret_mean)):
@@ -183,13 +183,13 @@ def _choices(curves: Curves) -> Iterator[tuple[Fraction, ...]]:
         yield from combinations(winners, size)
 
 
-def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
+def build_ladder(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
     """The ladder of these factors; None if one of them would have no range."""
     bounds = [cross(curves, lower, upper) for lower, upper in pairwise(scaling)]
     found = [bound for bound in bounds if bound is not None]
     if len(found) < len(bounds) or any(a >= b for a, b in pairwise(found)):
         return None
-    quality = along(curves, scaling, found)
+    quality = ladder_quality(curves, scaling, found)
     best = curves.best
     regret = (best - quality)[np.isfinite(best)]
     # The first range reaches down to 0 and the last has no end: only those in between can be narrow.
@@ -197,8 +197,8 @@ def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
     return Ladder(tuple(scaling), tuple(found), float(regret.max()), float(regret.mean()), width)
 
 
-def along(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
-    """Quality on the grid when each factor is used in its range."""
+def ladder_quality(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
+    """Quality on the grid if each factor is used in its range."""
     taken = np.searchsorted(bounds, curves.kbps, side="right")
     return np.asarray(np.choose(taken, [curves.quality[factor] for factor in scaling]))
 
@@ -235,16 +235,16 @@ def _resampled(frames: int) -> Iterator[Values]:
         yield weights / weights.sum()
 
 
-def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
+def bitrate_for_quality(curves: Curves, ladder: Ladder, quality: float) -> float | None:
     """The smallest bitrate from which a ladder keeps a quality; None if there is none."""
-    below = np.flatnonzero(along(curves, ladder.scaling, ladder.bounds) < quality)
+    below = np.flatnonzero(ladder_quality(curves, ladder.scaling, ladder.bounds) < quality)
     if not below.size:
         return float(curves.kbps[0])
     first = int(below[-1]) + 1
     return float(curves.kbps[first]) if first < len(curves.kbps) else None
 
 
-def falls(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
+def quality_drops(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
     """Pairs of neighbouring points of a factor where the higher bitrate looks worse."""
     found = []
     ordered = sorted(points, key=lambda p: (p.scaling, p.target_kbps))

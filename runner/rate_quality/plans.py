@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from runner.lanes import Lane
-from runner.rate_quality.curves import Curves, Ladder, Point, Score, along, best_ladder, draw_curves
+from runner.rate_quality.curves import Curves, Ladder, Point, Score, best_ladder, draw_curves, ladder_quality
 
 FIRST_RATES = 4  # of the adaptive plan, for each factor
 CLOSE = 1.05  # a crossing is known once both factors were encoded within this ratio of it
@@ -52,7 +52,7 @@ def _crossings(ladder: Ladder) -> list[Lane]:
 
 def _near_best(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
     """Dropped factors that are nearly as good, where they come closest, with the factor kept there."""
-    kept = along(curves, ladder.scaling, ladder.bounds)
+    kept = ladder_quality(curves, ladder.scaling, ladder.bounds)
     near: list[tuple[float, list[Lane]]] = []
     for factor, quality in curves.quality.items():
         gain = np.where(np.isfinite(kept) & np.isfinite(quality), quality - kept, -np.inf)

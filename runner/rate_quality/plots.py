@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from runner.core.model import plain
 from runner.rate_quality.artefact import Measured
-from runner.rate_quality.curves import Curves, along, draw_curves, mean_score
+from runner.rate_quality.curves import Curves, draw_curves, ladder_quality, mean_score
 from runner.system.files import write_whole
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def _draw_curves(axes: Axes, measured: Measured, curves: Curves) -> dict[Fractio
 def _draw_ladder(axes: Axes, measured: Measured, curves: Curves, colours: dict[Fraction, str]) -> None:
     """The ranges of the factors, the crossings with their confidence, and b_full."""
     choice = measured.choice
-    taken = measured.sign * along(curves, choice.scaling, choice.ladder.bounds)
+    taken = measured.sign * ladder_quality(curves, choice.scaling, choice.ladder.bounds)
     axes.plot(curves.kbps, taken, color="black", lw=5, alpha=0.14, solid_capstyle="butt", zorder=1)
     for crossing in choice.crossings:
         axes.axvspan(crossing.low, crossing.high, color=colours[crossing.upper], alpha=0.13, lw=0, zorder=0)

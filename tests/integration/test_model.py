@@ -22,7 +22,7 @@ from runner.__main__ import main
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.rate_quality.artefact import read_model
-from runner.rate_quality.curves import Point, along, draw_curves, mean_score
+from runner.rate_quality.curves import Point, draw_curves, ladder_quality, mean_score
 from runner.rate_quality.metrics import find_metric
 
 pytestmark = pytest.mark.gst
@@ -310,7 +310,7 @@ def lost(full: dict, other: dict) -> float:
     ]
     curves = draw_curves(points, mean_score("mssim"))
     best, mine = (
-        along(curves, [Fraction(factor) for factor in m["scaling"]], [c["kbps"] for c in m["crossings"]])
+        ladder_quality(curves, [Fraction(factor) for factor in m["scaling"]], [c["kbps"] for c in m["crossings"]])
         for m in (full, other)
     )
     return float(np.max((best - mine)[curves.kbps < full["b_full_kbps"]]))
