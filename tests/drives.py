@@ -1,4 +1,4 @@
-"""Drives as the two sides would have logged them: the real core decides, noise stands in for encoder and network."""
+"""Drives as the two sides would log them: the real core decides, noise simulates encoder and network."""
 
 from __future__ import annotations
 

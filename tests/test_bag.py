@@ -1,4 +1,4 @@
-"""Bags without ROS: what is read of them, and what is said about those that are wrong."""
+"""Bags without ROS: what is read from them, and messages about invalid ones."""
 
 from __future__ import annotations
 
@@ -139,8 +139,8 @@ def test_sizes_of_compressed_pictures(tmp_path, frames):
 @pytest.mark.parametrize("kind", KINDS)
 def test_positions_are_those_with_a_fix(tmp_path, kind):
     store = typestore(kind)
-    told = [(48.1, 11.5, 0), (48.2, 11.6, -1), (float("nan"), 11.6, 0), (48.3, 11.7, 2)]
-    messages = [(BEGAN_NS + n, fix(store, BEGAN_NS + n, *one)) for n, one in enumerate(told)]
+    fixes = [(48.1, 11.5, 0), (48.2, 11.6, -1), (float("nan"), 11.6, 0), (48.3, 11.7, 2)]
+    messages = [(BEGAN_NS + n, fix(store, BEGAN_NS + n, *one)) for n, one in enumerate(fixes)]
     with Bag(write_bag(tmp_path / "b", kind, {"/gps": messages})) as opened:
         topic = opened.find(POSITIONS, None, "positions")
         assert list(opened.positions(topic)) == [(BEGAN_NS, 48.1, 11.5), (BEGAN_NS + 3, 48.3, 11.7)]
@@ -154,7 +154,7 @@ def words(bag, **topics):
 
 
 @pytest.mark.parametrize("verb", ["print", "validate"])
-def test_what_is_wrong_with_a_bag_is_reported(tod, bag, verb, tmp_path):
+def test_problems_of_a_bag_are_reported(tod, bag, verb, tmp_path):
     given = words(bag, front="/a/image_raw", rear="/a/image", mast="/b/image_raw")
     assert tod(verb, *given).problems == [
         f"command line: cameras.rear.topic: {bag}: /a/image: no such topic with pictures, did you mean /a/image_raw?"

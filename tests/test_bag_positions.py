@@ -1,4 +1,4 @@
-"""Positions from bags: as a track, and in place of those that a drive has logged."""
+"""Positions from bags: as a track, and as a replacement for those in a drive's log."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from runner.drive.positions import reader
 from runner.drive.series import series
 from runner.errors import UserError
 from runner.pqos import build_track
-from runner.pqos.track import of_bag
+from runner.pqos.track import track_of_bag
 
 BEGAN_NS = round(EPOCH * 1e9)
 STORE = typestore("mcap")
 
 
 def gps(path, *topics, first_s=-2.0, count=60, status=0):
-    """Positions twice a second, northwards; they begin before the drive."""
+    """Positions twice a second, heading north, from before the drive."""
     times = [BEGAN_NS + round((first_s + n / 2) * 1e9) for n in range(count)]
     fixes = [(ns + 7, fix(STORE, ns, 48.0 + n / 10_000, 11.5, status)) for n, ns in enumerate(times)]
     return write_bag(path, "mcap", dict.fromkeys(topics, fixes))
@@ -38,7 +38,7 @@ def drive(tmp_path_factory):
 
 
 def test_a_bag_is_a_track(tmp_path):
-    track = of_bag(gps(tmp_path / "b", "/gps"), None, loop=False)
+    track = track_of_bag(gps(tmp_path / "b", "/gps"), None, loop=False)
     assert track.duration_s == pytest.approx(29.5)
     place = track.at(0.25)
     assert (place.lat, place.lon) == pytest.approx((48.00005, 11.5))
@@ -60,7 +60,7 @@ def test_a_bag_is_named_as_a_track(tmp_path, tod):
 
 def test_a_bag_with_one_place_is_no_track(tmp_path):
     with pytest.raises(ModelError, match="must have at least two positions with a fix, at different times"):
-        of_bag(gps(tmp_path / "b", "/gps", count=1), None, loop=False)
+        track_of_bag(gps(tmp_path / "b", "/gps", count=1), None, loop=False)
 
 
 @pytest.mark.parametrize("sides", [("vehicle", "operator"), ("operator",)])
@@ -100,7 +100,7 @@ def test_a_replay_has_the_positions_of_a_bag(tmp_path, tod, drive):
     assert [line["t"] for line in lines if line["event"] != "position_reported"] == others
 
 
-def test_what_is_wrong_with_positions_is_reported(tmp_path, tod, drive):
+def test_problems_of_positions_are_reported(tmp_path, tod, drive):
     late, blind = gps(tmp_path / "late", "/gps", first_s=500), gps(tmp_path / "blind", "/gps", status=-1)
     for words, problem in (
         (["topic=/gps"], "command line: positions: must be given with topic: the bag that has it"),

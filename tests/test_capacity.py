@@ -39,7 +39,7 @@ def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() ->
 
 
 def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None:
-    """Frames wait from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has room."""
+    """Frames queue from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has spare capacity."""
 
     def change(side: str, lines: Lines) -> Lines:
         for line in lines:
@@ -75,7 +75,7 @@ def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> 
     assert '"source": "pqos"' in replayed.out
 
 
-def test_drives_that_cannot_give_a_map_are_reported(tod: Command, tmp_path: Path) -> None:
+def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> None:
     def roomy(side: str, lines: Lines) -> Lines:
         for line in lines:
             for camera in line["cameras"].values() if line.get("log") == "sample" else ():
@@ -86,7 +86,7 @@ def test_drives_that_cannot_give_a_map_are_reported(tod: Command, tmp_path: Path
     output = f"output={tmp_path / 'map.csv'}"
     for words, status, expected in (
         ((output,), 2, "command line: must name a drive: a directory that log= wrote"),
-        ((str(good),), 2, "command line: output: must be given, the map's file"),
+        ((str(good),), 2, "command line: output: must be given: the map's file"),
         ((str(good), output, "percentile=101"), 2, "command line: percentile: 101: must be at most 100"),
         ((str(good), output, "cell_m=0"), 2, "command line: cell_m: 0: must be at least 1"),
         ((str(tmp_path / "no"), output), 2, f"{tmp_path / 'no'}: no such directory"),

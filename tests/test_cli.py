@@ -54,7 +54,7 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
         (["report", "drive", "output="], "command line: output: '': must not be empty"),
     ],
 )
-def test_words_that_are_no_command(tod: Command, words: list[str], expected: str) -> None:
+def test_invalid_commands(tod: Command, words: list[str], expected: str) -> None:
     assert tod(*words) == (2, "", f"{expected}\n")
 
 
@@ -165,7 +165,7 @@ def test_doctor_and_validate_report_which_part_of_gstreamer_does_not_load(
         ([], ["paho", "rich", "aiohttp", "plotly", "numba"]),
     ],
 )
-def test_doctor_looks_at_what_a_verb_needs(tod: Command, words: list[str], modules: list[str]) -> None:
+def test_doctor_checks_what_a_verb_needs(tod: Command, words: list[str], modules: list[str]) -> None:
     result = tod("doctor", *words)
     assert result.err == ""
     named = [line.split("Python module ")[1].partition(":")[0] for line in result.out.splitlines() if "module" in line]
@@ -175,7 +175,7 @@ def test_doctor_looks_at_what_a_verb_needs(tod: Command, words: list[str], modul
 @pytest.mark.parametrize(
     "words, expected", [(["vehcle"], "unknown verb, did you mean vehicle?"), (["a", "b"], "one verb")]
 )
-def test_doctor_takes_a_verb(tod: Command, words: list[str], expected: str) -> None:
+def test_doctor_accepts_a_verb(tod: Command, words: list[str], expected: str) -> None:
     result = tod("doctor", *words)
     assert (result.status, result.out) == (2, "") and expected in result.err
 
@@ -241,7 +241,7 @@ def test_ctrl_c_ends_with_130() -> None:
 
 
 def test_the_table_of_exit_statuses_has_every_verb(tod: Command) -> None:
-    """And every status of `main`; wrong words end every verb with 2."""
+    """The table also has every status of `main`; invalid words end every verb with 2."""
     page = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
     section = page.partition("## Exit statuses")[2].partition("\n## ")[0]
     first = [row.split(" | ")[0].removeprefix("| ") for row in section.splitlines() if row.startswith("| ")]

@@ -20,7 +20,7 @@ Delays = Callable[[], tuple[float, float]]  # s, there and back
 def compared(
     seconds: float, delays: Delays, ahead: Callable[[float], float]
 ) -> Iterator[tuple[float, ClockDifference, float]]:
-    """At each exchange of a simulated link: time, what is known of the difference, and the truth, s."""
+    """At each exchange of a simulated link: time, the estimated difference, and the true one, s."""
     clocks = ClockComparison()
     for number in count():
         t = number * EVERY_S
@@ -35,7 +35,7 @@ def compared(
 
 
 def mobile(seed: int) -> Delays:
-    """30 ms and more there, 20 ms and more back."""
+    """30 ms and more in one direction, 20 ms and more in the other."""
     chance = random.Random(seed)
     return lambda: (0.03 + chance.expovariate(100), 0.02 + chance.expovariate(100))
 
@@ -66,12 +66,12 @@ def test_a_skew_of_50_ppm_moves_the_difference_by_less_than_1_ms_from_the_truth(
     assert max(abs(known.ahead_s - truth) for known, truth in settled) < 0.001
 
 
-def test_a_clock_that_is_set_is_followed_at_the_next_exchange() -> None:
+def test_a_set_clock_is_followed_at_the_next_exchange() -> None:
     found = list(compared(20, mobile(3), lambda t: 0.0 if t < 10 else -3600.0))
     assert all(abs(known.ahead_s - truth) <= known.bound_s for _, known, truth in found)
 
 
-def test_a_step_smaller_than_the_round_trip_is_followed_if_the_machine_tells_of_it() -> None:
+def test_a_reported_step_smaller_than_the_round_trip_is_followed() -> None:
     clocks = ClockComparison()
     for number in range(100):
         t, ahead = number * EVERY_S, 0.0 if number < 50 else 0.058
@@ -115,7 +115,7 @@ def test_synchronised_kernels_bound_the_difference_too(errors_s: float | None, b
     assert abs(known.ahead_s) <= known.bound_s + 1e-9
 
 
-def test_kernels_that_contradict_the_messages_are_not_believed() -> None:
+def test_kernels_that_contradict_the_messages_are_not_trusted() -> None:
     clocks = ClockComparison()
     clocks.add(0.0, Exchange(10.0, 13.71, 13.71, 10.02, errors_s=0.001))
     known = clocks.difference(0.0)
@@ -124,15 +124,15 @@ def test_kernels_that_contradict_the_messages_are_not_believed() -> None:
 
 
 @pytest.mark.parametrize(("answered", "returned"), [(100.03, 99.0), (5000.0, 100.06)])
-def test_an_answer_after_it_arrived_is_refused(answered: float, returned: float) -> None:
-    """This machine's clock was set back meanwhile, or the other states a wrong time."""
+def test_an_answer_sent_after_its_arrival_is_refused(answered: float, returned: float) -> None:
+    """This machine's clock was set back in the meantime, or the other states a wrong time."""
     clocks = ClockComparison()
     with pytest.raises(ValueError, match="answered after the answer arrived"):
         clocks.add(0.0, Exchange(100.0, 100.03, answered, returned))
     assert clocks.difference(0.0) is None
 
 
-def test_an_answer_before_the_question_is_refused() -> None:
+def test_an_answer_sent_before_its_request_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^answered 0\.5 s before it was received$"):
         ClockComparison().add(0.0, Exchange(0.0, 1.0, 0.5, 2.0))
 

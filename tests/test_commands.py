@@ -1,4 +1,4 @@
-"""Commands are the difference between the decision and what was commanded before."""
+"""Commands are the difference between the decision and earlier commands."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_first_everything_then_nothing_then_what_differs() -> None:
     assert difference(changed, commanded) == [Command("front", "bitrate", 1)]
 
 
-def test_what_was_commanded_before_is_left_as_it_was() -> None:
+def test_earlier_commands_are_left_unchanged() -> None:
     commanded = after({}, difference(DECISION, {}))
     later = after(commanded, [Command("front", "bitrate", 1)])
     assert commanded["front"]["bitrate"] == FRONT.kbps

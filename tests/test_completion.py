@@ -1,4 +1,4 @@
-"""Completion of words in bash and zsh: what is offered, in real shells, and that it loads nothing that takes long."""
+"""Completion in bash and zsh: what is offered, in real shells, and that it loads nothing slow."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def van(conf: UserConf) -> UserConf:
         ("fly ", []),
     ],
 )
-def test_what_is_offered(line: str, expected: list[str]) -> None:
+def test_offered_completions(line: str, expected: list[str]) -> None:
     *before, last = line.split(" ")
     assert candidates(before, last) == expected
 
@@ -114,7 +114,7 @@ STARTS = {
 
 
 def completed(shell: str, lines: list[str], place: Path) -> list[str]:
-    """Each line as the shell leaves it after TAB: it is echoed in place of being run."""
+    """Each line as the shell completes it after TAB: it is echoed instead of run."""
     command, setup = STARTS[shell]
     environment = {"PATH": f"{PROGRAM.parent}:{os.environ['PATH']}", "TERM": "dumb", "HOME": str(place), "PS1": ""}
     child, terminal = pty.fork()
@@ -133,7 +133,7 @@ def completed(shell: str, lines: list[str], place: Path) -> list[str]:
 
 
 def _answer(terminal: int, typed: str, last: str) -> str:
-    """What the terminal shows until a word ends it."""
+    """The terminal's output up to a given word."""
     os.write(terminal, typed.encode())
     output, until = "", time.monotonic() + 60
     while last not in output:
@@ -161,7 +161,7 @@ def test_in_a_real_shell(shell: str, van: UserConf) -> None:
 
 
 def test_an_error_is_silent(van: UserConf) -> None:
-    """In the shell: a file that cannot be read, and a line that ends within quotes."""
+    """In the shell: a file that cannot be read, and a line with unbalanced quotes."""
     van.write("vehicle/van.yaml", "cameras: [")
     lines = [f"tod-runner print {shlex.quote(van.word)} vehicle=van cameras.", "tod-runner print 'a b"]
     script = "\n".join(
@@ -183,7 +183,7 @@ def test_an_error_is_silent(van: UserConf) -> None:
 
 
 @pytest.mark.slow
-def test_a_tab_takes_little(van: UserConf) -> None:
+def test_a_tab_is_cheap(van: UserConf) -> None:
     """Processor time, 0.1 s where it was measured; and nothing is composed, even for names of cameras."""
     line = f"tod-runner print {shlex.quote(van.word)} vehicle=van cameras."
     before = resource.getrusage(resource.RUSAGE_CHILDREN)

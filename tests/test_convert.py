@@ -1,4 +1,4 @@
-"""The paper's own camera list as a vehicle: what is written is valid, and what is wrong is named."""
+"""The paper's own camera list as a vehicle: the files are valid, and errors are reported."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_parameters_of_a_node_of_ros_2(convert, listed):
     assert convert(*SIZE).status == 0
 
 
-def test_files_that_exist_are_kept_unless_asked(convert, tmp_path):
+def test_existing_files_are_kept_unless_overwritten(convert, tmp_path):
     assert convert(*SIZE).status == 0
     before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.yaml")}
     assert "sensors-camera.yaml" in {path.name for path in before}
@@ -113,10 +113,10 @@ NEEDED = "sizes and frame rates must be given: bag=BAG with pictures of each cam
             (*SIZE, "vehicle=a b"),
             "vehicle: 'a b': must be letters, digits, _ and -, and no number, true, false or null",
         ),
-        ((*SIZE, "mode=single"), "mode=single: a conversion has no configuration; see --help"),
+        ((*SIZE, "mode=single"), "mode=single: convert reads no configuration; see --help"),
     ],
 )
-def test_words_that_are_no_conversion(convert, words, problem):
+def test_invalid_conversions(convert, words, problem):
     result = convert(*words)
     assert (result.status, result.out, result.err) == (2, "", f"command line: {problem}\n")
 
@@ -161,7 +161,7 @@ def test_names_that_yaml_would_read_as_something_else(convert, listed, tod, tmp_
     assert tod("print", "vehicle=off", f"conf={tmp_path / 'out'}", "source=test").status == 0
 
 
-def test_a_list_that_is_none(convert, listed):
+def test_files_that_are_not_a_camera_list(convert, listed):
     listed.write_text("camera_image_name: x\n")
     assert convert(*SIZE).problems == [f"{listed}: lists no camera: camera0, camera1, ... with a vehicle_name"]
     listed.write_text("[1, 2")

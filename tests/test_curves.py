@@ -19,13 +19,13 @@ from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import (
     Point,
     best_ladder,
-    climb,
+    bitrate_for_quality,
+    build_ladder,
     cross,
     crossings,
     draw_curves,
-    falls,
     mean_score,
-    reaches,
+    quality_drops,
 )
 
 RATES = [round(x) for x in np.geomspace(50, 4000, 20)]
@@ -105,7 +105,7 @@ def test_a_smaller_tolerance_keeps_no_fewer_factors():
     assert sizes[0] < sizes[-1]
 
 
-def test_points_that_miss_their_target_take_no_part():
+def test_points_that_miss_their_target_are_excluded():
     points = grid([Fraction(1, 2), Fraction(1)])
     honest = draw_curves(points, SCORE)
     # At full size the encoder cannot go below 300 kbit/s, and scores well for it.
@@ -125,15 +125,15 @@ def test_a_factor_with_no_use_for_more_bitrate_stays_as_good():
 
 
 def test_points_that_all_miss_their_target_are_refused():
-    with pytest.raises(ValueError, match="no encoding holds its target bitrate"):
+    with pytest.raises(ValueError, match="no encoding meets its target bitrate"):
         draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
 
 
-def test_confidence_holds_the_crossing_and_grows_with_the_noise():
+def test_the_confidence_interval_contains_the_crossing_and_grows_with_noise():
     widths = []
     for noise in (0.0, 0.002):
         points = grid([Fraction(1, 2), Fraction(1)], noise=noise)
-        ladder = climb(draw_curves(points, SCORE), [Fraction(1, 2), Fraction(1)])
+        ladder = build_ladder(draw_curves(points, SCORE), [Fraction(1, 2), Fraction(1)])
         (crossing,) = crossings(points, ladder, "mssim", 1)
         assert crossing.low <= crossing.kbps <= crossing.high
         widths.append(crossing.high - crossing.low)
@@ -148,18 +148,18 @@ def test_the_same_points_give_the_same_confidence():
     assert crossings(points, ladder, "mssim", 1) == crossings(points, ladder, "mssim", 1)
 
 
-def test_b_full_is_where_the_quality_is_reached_for_good():
+def test_b_full_is_where_the_quality_stays_reached():
     curves = draw_curves(grid(), SCORE)
     ladder, _ = best_ladder(curves, 5e-4, 1.25)
-    kbps = reaches(curves, ladder, 0.97)
+    kbps = bitrate_for_quality(curves, ladder, 0.97)
     assert np.interp(np.log(kbps), np.log(curves.kbps), curves.best) == pytest.approx(0.97, abs=2e-3)
-    assert reaches(curves, ladder, 1.1) is None
+    assert bitrate_for_quality(curves, ladder, 1.1) is None
 
 
 def test_falling_curves_are_found():
     points = grid([Fraction(1)])
     points[10] = point(Fraction(1), points[10].target_kbps, hard=4)
-    assert [(a.target_kbps, b.target_kbps) for a, b in falls(points, SCORE, 1e-3)] == [(RATES[9], RATES[10])]
+    assert [(a.target_kbps, b.target_kbps) for a, b in quality_drops(points, SCORE, 1e-3)] == [(RATES[9], RATES[10])]
 
 
 # --- the choice -------------------------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def test_a_choice_warns_of_its_limits():
     assert "the curves never cross between 50 and 4000 kbit/s: factor 0.5 is the best" in one.warnings
 
 
-def test_lower_is_better_turns_everything_round():
+def test_lower_is_better_reverses_everything():
     points = [replace(p, scores={"brisque": tuple(100 * (1 - s) for s in p.scores["mssim"])}) for p in grid()]
     turned = choose(points, ChoiceCriteria("brisque", -1, 0.05, 1.25, 5.0, None, Fraction(25)))
     straight = choose(grid(), CRITERIA)
@@ -237,7 +237,7 @@ def test_the_adaptive_plan_chooses_as_the_full_one_with_a_third_of_the_encodings
     assert len(points) <= len(EIGHTHS) * len(RATES) // 3
     full = draw_curves(grid(hard=hard), SCORE)
     chosen, _ = best_ladder(draw_curves(points, SCORE), 5e-4, 1.25)
-    judged = climb(full, chosen.scaling)  # its factors on the curves of the full plan
+    judged = build_ladder(full, chosen.scaling)  # its factors on the curves of the full plan
     assert judged is not None
     assert judged.regret_max < 1e-3
     for mine, theirs in zip(chosen.bounds, judged.bounds, strict=True):

@@ -1,11 +1,11 @@
-"""Which picture was on show at a moment, and which picture of a clip it shows."""
+"""Which picture was displayed at a moment, and which picture of a clip it shows."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, FilmedFile, UnitTimes, arrivals, matched
-from runner.drive.delivered import _nearest, _thumbnail, due
+from runner.drive.captures import SAME_NS, UnitTimes, VideoFile, arrivals, matched
+from runner.drive.delivered import _nearest, _thumbnail, displayed_units
 from runner.h264.access_unit import coded_picture
 
 MS = 1_000_000
@@ -17,49 +17,49 @@ def units(*times: tuple[int, int]) -> list[UnitTimes]:
     return [UnitTimes(at * MS, (at + delay) * MS) for at, delay in times]
 
 
-def test_a_picture_that_came_in_time_stands_for_its_moment() -> None:
-    came = units((0, 30), (100, 30), (200, 30))
-    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 1, 2]
+def test_a_picture_that_arrived_in_time_is_displayed_at_its_moment() -> None:
+    log = units((0, 30), (100, 30), (200, 30))
+    assert displayed_units([0, 100 * MS, 200 * MS], log, DEADLINE) == [0, 1, 2]
 
 
 def test_times_of_both_sides_may_differ_by_less_than_half_a_frame() -> None:
-    came = units((0, 30), (100, 30))
-    assert due([100 * MS - SAME_NS // 2], came, DEADLINE) == [1]
-    assert due([100 * MS - SAME_NS], came, DEADLINE) == [0]
+    log = units((0, 30), (100, 30))
+    assert displayed_units([100 * MS - SAME_NS // 2], log, DEADLINE) == [1]
+    assert displayed_units([100 * MS - SAME_NS], log, DEADLINE) == [0]
 
 
-def test_a_late_picture_leaves_the_older_one_on_show() -> None:
-    came = units((0, 30), (100, 301), (200, 300))
-    assert due([0, 100 * MS, 200 * MS], came, DEADLINE) == [0, 0, 2]
+def test_a_late_picture_leaves_the_older_one_displayed() -> None:
+    log = units((0, 30), (100, 301), (200, 300))
+    assert displayed_units([0, 100 * MS, 200 * MS], log, DEADLINE) == [0, 0, 2]
 
 
-def test_while_nothing_comes_the_last_picture_stands() -> None:
-    came = units((0, 30), (1000, 30))
-    assert due([500 * MS, 900 * MS, 1000 * MS], came, DEADLINE) == [0, 0, 1]
+def test_without_new_pictures_the_last_one_stays_displayed() -> None:
+    log = units((0, 30), (1000, 30))
+    assert displayed_units([500 * MS, 900 * MS, 1000 * MS], log, DEADLINE) == [0, 0, 1]
 
 
-def test_before_the_first_picture_nothing_stands() -> None:
-    assert due([-1000 * MS, 0], units((0, 400)), DEADLINE) == [-1, -1]
+def test_before_the_first_picture_nothing_is_displayed() -> None:
+    assert displayed_units([-1000 * MS, 0], units((0, 400)), DEADLINE) == [-1, -1]
 
 
 @given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 1000)), max_size=30), st.integers(0, 6000))
-def test_what_stands_was_captured_by_then_and_had_arrived(times: list[tuple[int, int]], at: int) -> None:
-    came = sorted(units(*times))
-    (number,) = due([at * MS], came, DEADLINE)
-    fits = [n for n, u in enumerate(came) if u.captured <= at * MS + SAME_NS // 2 and u.arrived <= at * MS + DEADLINE]
+def test_the_displayed_picture_was_captured_by_then_and_had_arrived(times: list[tuple[int, int]], at: int) -> None:
+    log = sorted(units(*times))
+    (number,) = displayed_units([at * MS], log, DEADLINE)
+    fits = [n for n, u in enumerate(log) if u.captured <= at * MS + SAME_NS // 2 and u.arrived <= at * MS + DEADLINE]
     assert number == (fits[-1] if fits else -1)
 
 
-def test_a_picture_was_captured_when_one_alike_was_sent() -> None:
-    """Whatever the file says; one picture was damaged."""
+def test_capture_times_are_those_of_identical_sent_pictures() -> None:
+    """Whatever times the file states; one picture was damaged."""
     sent = {b"a": [0], b"b": [66 * MS, 6600 * MS], b"c": [133 * MS], b"e": [266 * MS]}
     filed = [ns * MS + 85 * MS for ns in (0, 66, 133, 200)] + [266 * MS + 10 * MS]
     assert list(matched(sent, [b"a", b"b", b"c", b"?", b"e"], filed)) == [ns * MS for ns in (0, 66, 133, 200, 266)]
     assert list(matched({}, [b"a"], [5 * MS])) == [5 * MS]
 
 
-def test_arrivals_are_found_though_the_clocks_seem_to_differ() -> None:
-    """By 85 ms at first and less and less; the log lacks two pictures, one of them the first."""
+def test_arrivals_are_found_despite_an_apparent_clock_difference() -> None:
+    """By 85 ms at first, then less and less; two pictures, one of them the first, are missing from the log."""
     captured = [100 * n * MS for n in range(30)]
     ahead = [max(0, 85 - 5 * n) * MS for n in range(30)]
     log = [UnitTimes(captured[n] + ahead[n], captured[n] + 200 * MS) for n in range(30) if n not in (0, 12)]
@@ -70,8 +70,8 @@ def test_arrivals_are_found_though_the_clocks_seem_to_differ() -> None:
 
 
 def test_times_of_a_file_are_those_of_its_last_shift() -> None:
-    """In ms: the clock ran on through a pause of 5 s after the frame at 200, then a receiver was 30 behind."""
-    file = FilmedFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
+    """In ms: a pause of 5 s after the frame at 200, during which the clock ran on; then a receiver was 30 behind."""
+    file = VideoFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
     assert [file.captured(after * MS) // MS for after in (0, 200, 300, 400, 500, 900)] == [
         1000,
         1200,
@@ -83,12 +83,12 @@ def test_times_of_a_file_are_those_of_its_last_shift() -> None:
     assert file.captured(300 * MS - 5000) == 6300 * MS - 5000, "the file counts in 1/90000 s"
 
 
-def test_parameter_sets_and_start_codes_do_not_tell_pictures_apart() -> None:
+def test_parameter_sets_and_start_codes_do_not_distinguish_pictures() -> None:
     slices = b"\x41\x9a\x01", b"\x01\x9b\x02"
     sent = b"\0\0\0\1\x67\x42\0\0\0\1\x68\xce\0\0\1" + slices[0] + b"\0\0\1" + slices[1]
-    came = b"\0\0\0\1" + slices[0] + b"\0\0\0\1" + slices[1] + b"\0"
-    assert coded_picture(sent, "h264") == coded_picture(came, "h264") != b""
-    assert coded_picture(sent.replace(b"\x9b", b"\x9c"), "h264") != coded_picture(came, "h264")
+    arrived = b"\0\0\0\1" + slices[0] + b"\0\0\0\1" + slices[1] + b"\0"
+    assert coded_picture(sent, "h264") == coded_picture(arrived, "h264") != b""
+    assert coded_picture(sent.replace(b"\x9b", b"\x9c"), "h264") != coded_picture(arrived, "h264")
     assert coded_picture(b"\0\0\1\x67\x42", "h264") == b""
 
 

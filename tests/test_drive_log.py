@@ -1,4 +1,4 @@
-"""What a side logs of a drive and what is read back: whole lines whatever happens, clear messages about errors."""
+"""The log of a side, and reading it back: complete lines whatever happens, clear messages about errors."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
 
 
 def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
-    """Nothing is lost meanwhile: the lines are queued."""
+    """Nothing is lost while the disk is full: the lines are queued."""
     code = (
         "import resource, sys, time; from pathlib import Path; from runner.drive.log import Log\n"
         "messages = []; log = Log(Path(sys.argv[1]), 'vehicle', {}, {}, messages.append); log.begin()\n"
@@ -150,7 +150,7 @@ def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(
     assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: {dropped} lines were dropped, since the disk was too slow"]
 
 
-def test_a_disk_that_hangs_for_good_does_not_keep_the_process_alive(
+def test_a_disk_that_hangs_forever_does_not_keep_the_process_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("runner.drive.log.CLOSE_S", 0.1)
@@ -166,7 +166,7 @@ def test_a_disk_that_hangs_for_good_does_not_keep_the_process_alive(
     os.close(read_end)  # the thread of the log ends
 
 
-def test_lines_of_many_threads_stay_whole(tmp_path: Path) -> None:
+def test_lines_of_many_threads_are_not_mixed(tmp_path: Path) -> None:
     log = begun(tmp_path)
 
     def write(name: str) -> None:
@@ -190,7 +190,7 @@ def test_an_unwritable_directory_is_reported_before_the_drive(tmp_path: Path) ->
     with pytest.raises(UserError, match=r"command line: log: '.*/file': (file exists|not a directory)"):
         begun(tmp_path / "file")
     begun(tmp_path / "drive").close()
-    with pytest.raises(UserError, match=r"holds a drive already \(drive.jsonl\), choose another directory"):
+    with pytest.raises(UserError, match=r"already contains a drive \(drive.jsonl\), choose another directory"):
         Log(tmp_path / "drive", "vehicle", {}, {}, print)
 
 
@@ -206,7 +206,7 @@ def test_a_log_that_never_begins_leaves_no_file(tmp_path: Path) -> None:
 
 
 def test_the_callback_for_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None:
-    """As the operator's station does: it notes the message in the log that has just ended."""
+    """As the operator's station does: it writes the message to the log that reported it."""
     code = (
         "import resource, sys; from pathlib import Path; from runner.drive.log import Log\n"
         "log = Log(Path(sys.argv[1]), 'operator', {}, {}, lambda what: log.note(what))\n"
@@ -218,8 +218,8 @@ def test_the_callback_for_a_full_disk_may_write_to_the_log(tmp_path: Path) -> No
     assert done.stdout == "done\n", done.stderr
 
 
-def test_half_a_surrogate_pair_is_written(tmp_path: Path) -> None:
-    """A request may name any camera; its refusal is logged, too."""
+def test_a_lone_surrogate_is_written(tmp_path: Path) -> None:
+    """A request may name any camera, and its refusal is logged."""
     log = begun(tmp_path)
     event = CameraSwitched(t=0.1, camera="\ud800", on=False)
     log.event(event)

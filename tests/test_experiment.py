@@ -1,4 +1,4 @@
-"""Experiments and limited links as configuration: their choices, their mistakes, the rate of the link."""
+"""Experiments and limited links as configuration: their choices, their errors, the rate of the link."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_requests_are_in_the_order_of_their_times() -> None:
     ]
 
 
-def test_a_request_that_is_no_event_is_a_problem(tod: Command) -> None:
+def test_a_request_that_is_not_an_event_is_a_problem(tod: Command) -> None:
     wrong = PAUSE.replace("rear_center, on: false", "rear_center")
     result = tod("validate", "experiment=driving_test", f"+experiment.requests=[{wrong}]")
     assert result.status == 2
@@ -63,7 +63,7 @@ def test_a_request_that_is_no_event_is_a_problem(tod: Command) -> None:
     assert "raer_center: unknown camera, did you mean rear_center?" in result.err
 
 
-def test_the_command_line_has_the_last_word() -> None:
+def test_the_command_line_takes_precedence() -> None:
     chosen = compose(["experiment=driving_test"]).document
     assert chosen["modes"] == compose(["modes=paper"]).document["modes"]
     assert chosen["pqos"]["file"] == "maps/driving_test.csv"
@@ -189,5 +189,5 @@ def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:
 def test_the_demo_does_not_write_among_other_files(tod: Command, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     result = tod("demo", "source=test", f"output={tmp_path}")
-    rule = "must be a new or an empty directory, holds thesis.tex"
+    rule = "must be a new or empty directory, but contains thesis.tex"
     assert (result.status, result.err) == (2, f"command line: output: '{tmp_path}': {rule}\n")

@@ -1,4 +1,4 @@
-"""`init`: a directory to start from, that is valid at once, and whose files an editor checks."""
+"""`init`: a directory to start from that is valid unchanged, and whose files an editor checks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from helpers import Command, process
 
 from runner.configuration.editors import FOLDER
 from runner.resources import directory
-from runner.verbs.init import STARTING
+from runner.verbs.init import TEMPLATES
 
 CHECKOUT = directory("schemas").parent
 SERVER = CHECKOUT / "node_modules" / ".bin" / "yaml-language-server"
@@ -36,8 +36,8 @@ def files(place: Path) -> dict[str, str]:
     return {str(path.relative_to(place)): path.read_text() for path in place.rglob("*") if path.is_file()}
 
 
-def test_the_directory_is_valid_at_once(tod: Command, fleet: Path) -> None:
-    assert set(files(fleet)) == {*STARTING, f"{FOLDER}/VERSION", *(f"{FOLDER}/{name}" for name in SCHEMAS)}
+def test_the_new_directory_is_valid(tod: Command, fleet: Path) -> None:
+    assert set(files(fleet)) == {*TEMPLATES, f"{FOLDER}/VERSION", *(f"{FOLDER}/{name}" for name in SCHEMAS)}
     assert tod("validate", f"conf={fleet}").err == ""
     status, out, err = tod("print", f"conf={fleet}", "vehicle=my_vehicle", "modes=my_modes", "source=v4l2")
     assert (status, err) == (0, "")
@@ -73,7 +73,7 @@ def test_nothing_is_overwritten_and_every_problem_is_named(tod: Command, tmp_pat
     assert tod("init", str(tmp_path)) == (
         2,
         "",
-        f"{tmp_path}/cameras/my_camera.yaml: exists, and init overwrites nothing\n"
+        f"{tmp_path}/cameras/my_camera.yaml: already exists; init overwrites nothing\n"
         f"{tmp_path}/modes: must be a directory\n"
         f"{tmp_path}/{FOLDER}: must be a directory\n"
         "3 problems, nothing was written\n",
@@ -89,7 +89,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, there: bool) -> None:
         (place / "mine").write_text("mine\n")
 
     def small_files() -> None:
-        """A limit that the small files keep and a schema exceeds."""
+        """A file size limit that only the schemas exceed."""
         resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
 
     result = process("init", str(place), preexec_fn=small_files, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
@@ -109,7 +109,7 @@ def test_one_directory_is_named(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_validate_tells_that_the_editor_knows_another_version(tod: Command, fleet: Path) -> None:
+def test_validate_warns_of_schemas_of_another_version(tod: Command, fleet: Path) -> None:
     (fleet / FOLDER / "VERSION").write_text("0.0.1\n")
     status, out, err = tod("validate", f"conf={fleet}")
     assert status == 0 and out.startswith("valid: 3 files")

@@ -1,4 +1,4 @@
-"""Keys: what each holder gets, what nobody else may read, and what rotating and revoking change."""
+"""Keys: the files of each holder, their protection, and the effects of rotating and revoking."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def certificate(authority, name):
 
 
 def verified(authority, name, *options):
-    """Output of OpenSSL, which knows nothing of this project."""
+    """Output of OpenSSL, as an independent implementation."""
     directory = authority.directory
     words = ["-CAfile", directory / "authority/ca.crt", *options, directory / name / "own.crt"]
     ended = subprocess.run(["openssl", "verify", *words], capture_output=True, text=True, check=False)
@@ -62,7 +62,7 @@ def test_a_certificate_states_name_role_hosts_and_term(authority):
     assert "certificate has expired" in verified(authority, "car", "-attime", late)
 
 
-def test_nobody_else_may_read_what_is_secret(authority):
+def test_secrets_are_readable_by_their_owner_only(authority):
     for path in authority.directory.rglob("*"):
         mode = stat.S_IMODE(path.stat().st_mode)
         if path.is_file() and path.name not in ("ca.crt", "own.crt", "own.json", "crl.pem", ".lock"):
@@ -70,7 +70,7 @@ def test_nobody_else_may_read_what_is_secret(authority):
     assert stat.S_IMODE(authority.directory.stat().st_mode) == 0o700
 
 
-def test_each_holder_gets_what_its_role_needs(authority):
+def test_each_holder_has_the_files_of_its_role(authority):
     common = {"ca.crt", "own.crt", "own.key", "own.secret", "own.json", "crl.pem"}
     extra = {
         "car": {"people.json", "srt.passphrase"},
@@ -104,7 +104,7 @@ def test_issuing_again_changes_nothing(authority):
     assert certificate(authority, "car").serial_number != before
 
 
-def test_what_a_killed_run_left_out_is_made_by_the_next_one(authority):
+def test_the_next_run_completes_what_a_killed_run_left_out(authority):
     killed = Issued("bob", Role.WATCHER, "ab", (), NOW + timedelta(days=1))
     authority._write_issued([*authority._issued(), killed])
     authority.issue("eve", Role.WATCHER, [])
@@ -115,7 +115,7 @@ def test_what_a_killed_run_left_out_is_made_by_the_next_one(authority):
 
 
 @pytest.mark.parametrize("action", ["rotate", "revoke"])
-def test_all_others_learn_what_is_accepted_no_more(authority, action):
+def test_all_others_learn_what_was_revoked(authority, action):
     before, secret = certificate(authority, "a-watcher").serial_number, (authority.directory / "a-watcher/own.secret")
     old = secret.read_bytes()
     getattr(authority, action)("a-watcher")
@@ -132,7 +132,7 @@ def test_all_others_learn_what_is_accepted_no_more(authority, action):
         assert "a-watcher" not in passwords
 
 
-def test_problems_of_a_directory_are_named_at_once(authority):
+def test_all_problems_of_a_directory_are_reported_together(authority):
     car = authority.directory / "car"
     (car / "own.key").unlink()
     (car / "own.secret").chmod(0o644)
@@ -169,12 +169,12 @@ def test_one_command_makes_what_a_vehicle_and_an_operator_need(tmp_path, capsys)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "command line: output: must be given, the directory of all keys"),
+        ((), "command line: output: must be given: the directory for all keys"),
         (("output={}", "vehicle=a b"), "command line: vehicle: 'a b': must be 1 to 64 letters, digits, _ and -"),
         (("output={}", "vehicle=broker"), "command line: vehicle: 'broker': must be 1 to 64 letters"),
         (("output={}", "host=10.0.0.2"), "command line: host: 10.0.0.2: must come with the name of a vehicle"),
         (("output={}", "revoke=x"), "command line: revoke: 'x': must be one of (none yet)"),
-        (("output={}", "modes=paper"), "command line: modes=paper: keys need no configuration"),
+        (("output={}", "modes=paper"), "command line: modes=paper: keys reads no configuration"),
     ],
 )
 def test_mistakes_are_named(tmp_path, capsys, words, message):
@@ -182,10 +182,10 @@ def test_mistakes_are_named(tmp_path, capsys, words, message):
     assert capsys.readouterr().err.startswith(message)
 
 
-def test_a_directory_with_other_files_is_left_alone(tmp_path, capsys):
+def test_a_directory_with_other_files_is_not_touched(tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["keys", f"output={tmp_path}", *FIRST]) == 2
-    assert "it holds other files" in capsys.readouterr().err
+    assert "it contains other files" in capsys.readouterr().err
     assert os.listdir(tmp_path) == ["mine.txt"]
 
 
@@ -212,18 +212,18 @@ ALLOWED = {
 
 @pytest.mark.parametrize("role", [*Role, None])
 @pytest.mark.parametrize("event", EVENTS)
-def test_what_a_role_may_request(role, event):
+def test_requests_that_roles_may_make(role, event):
     assert (denial(role, event) is None) == (event in ALLOWED[role])
 
 
-def test_a_denial_names_who_may():
+def test_a_denial_names_the_permitted_roles():
     assert set(MAY_REQUEST) == set(Role)
     assert denial(Role.WATCHER, "total_set") == "a watcher may not request total_set; only controller may"
     assert denial(Role.WATCHER, "clock_advanced").endswith("nobody may: the vehicle makes it itself")
     assert denial(None, "total_set") == "this operator is not among those that the vehicle's keys name"
 
 
-def test_keys_load_nothing_that_drives():
+def test_keys_loads_no_driving_code():
     code = (
         "import sys; import runner.verbs.keys; print([m for m in ('gi', 'hydra', 'numpy', 'paho') if m in sys.modules])"
     )

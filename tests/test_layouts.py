@@ -167,5 +167,5 @@ vehicles:
         "~/layout/empty.yaml: null: must be a mapping",
         "~/layout/eve.yaml: line 2: expected the node content, but found '<stream end>'",
         "~/layout/mallory.yaml: vehicels: unknown key, did you mean vehicles?",
-        "~/layout/x/y.yaml: would be ignored: files stand in layout/ itself, not in folders below",
+        "~/layout/x/y.yaml: would be ignored: files must be directly in layout/, not in subfolders",
     ]

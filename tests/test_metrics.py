@@ -339,10 +339,10 @@ def test_vmaf_without_scores(fake: Callable[[str], str]) -> None:
 
 
 def test_vmaf_gives_up_on_a_process_that_hangs(fake: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vmaf_module, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(vmaf_module, "TIMEOUT_S", 0.2)
     exe = fake("exec sleep 60")
     meter: Any = vmaf_module.VmafMeter(vmaf_module.Tool(exe, ""), VMAF_MODEL, (1280, 720), FPS, 1)
-    with pytest.raises(RunError, match=r"^ffmpeg has taken no picture for 0\.2 s$"):
+    with pytest.raises(RunError, match=r"^ffmpeg has accepted no picture for 0\.2 s$"):
         for number in range(20):
             meter.add(number, noise(0, 720, 1280), noise(0, 720, 1280))
     assert meter.close() == {} and meter._process.returncode is not None
@@ -383,7 +383,7 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
         ("a:path=/b", "vmaf_model: 'a:path=/b': must be the name of a model, such as vmaf_v0.6.1"),
     ],
 )
-def test_vmaf_model_that_is_none(vmaf: Metric, model: str, message: str) -> None:
+def test_vmaf_without_the_model(vmaf: Metric, model: str, message: str) -> None:
     with pytest.raises(UserError) as raised:
         find_metric("vmaf", vmaf_model=model)
     assert str(raised.value) == message
@@ -503,7 +503,7 @@ def test_brisque_scores_the_picture_alone(files: Callable[[Path], tuple[Path, Pa
 
 
 @pytest.mark.parametrize("rho, cut", [("-3000", 100), ("3000", 0)])
-def test_brisque_is_cut(tmp_path: Path, rho: str, cut: float) -> None:
+def test_brisque_is_clipped(tmp_path: Path, rho: str, cut: float) -> None:
     model, ranges = libsvm_files(tmp_path)
     model.write_text(model.read_text().replace("-30.5", rho))
     assert score(find_metric("brisque", brisque_model=model, brisque_range=ranges), noise(0), noise(1)) == cut
@@ -515,7 +515,7 @@ def test_brisque_is_cut(tmp_path: Path, rho: str, cut: float) -> None:
         ("libsvm model", "epsilon_svr", "c_svc", "svm_type: 'c_svc': must be epsilon_svr"),
         ("libsvm model", "rbf", "linear", "kernel_type: 'linear': must be rbf"),
         ("libsvm model", "gamma 0.05\n", "", "gamma: '': must be a finite number"),
-        ("libsvm model", "total_sv 2", "total_sv 3", "SV: 2: must have 3 lines, as total_sv says"),
+        ("libsvm model", "total_sv 2", "total_sv 3", "SV: 2: must have 3 lines, as total_sv states"),
         ("libsvm model", "3:0.75", "37:0.75", "SV 2: '37': must be the number of a feature, 1 to 36"),
         ("libsvm model", "3:0.75", "3:x", "SV 2: 'x': must be a finite number"),
         ("libsvm range", "x\n", "", "[]: must have a line x before the ranges of features"),
@@ -548,8 +548,8 @@ def test_brisque_without_files(tmp_path: Path) -> None:
     regression = "the regression as libsvm's text or OpenCV's brisque_model_live.yml"
     of_features = "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"
     for given_files, message in (
-        ((None, ranges), f"brisque_model: brisque needs a file of yours, {regression}"),
-        ((model, None), f"brisque_range: brisque needs a file of yours, {of_features}"),
+        ((None, ranges), f"brisque_model: brisque needs a file that you provide, {regression}"),
+        ((model, None), f"brisque_range: brisque needs a file that you provide, {of_features}"),
         ((missing, ranges), f"{missing}: no such file or directory"),
         ((model, binary), f"{binary}: is not text"),
     ):

@@ -111,17 +111,17 @@ def test_map_over_degrees_keeps_its_radius() -> None:
 
 @pytest.mark.parametrize("lat, lon", [(90, 0), (-90, 180), (0, 180), (0, -180), (48, 11)])
 @pytest.mark.parametrize("speed", [0, 1e308])
-def test_no_place_crashes(lat: float, lon: float, speed: float) -> None:
+def test_no_position_crashes(lat: float, lon: float, speed: float) -> None:
     pqos = make_map([(0, 0, 5000)], look_ahead_s=5)
     assert kbps(pqos, PositionReported(t=0, lat=lat, lon=lon, speed_mps=speed, heading_deg=45)) in (700, 5000)
 
 
-def test_antimeridian_is_no_long_way() -> None:
+def test_the_antimeridian_is_not_a_detour() -> None:
     assert offset(0, 179.9999, 0, -179.9999)[0] == pytest.approx(22.26, abs=0.01)
 
 
 @pytest.mark.parametrize("extent_m", [600, 100_000])
-def test_a_million_points_are_looked_up_at_once(extent_m: float) -> None:
+def test_a_million_points_are_looked_up_quickly(extent_m: float) -> None:
     """Limits are in processor time; bench/pqos_map.py measures."""
     random = np.random.default_rng(1)
     lat, lon = 48 + random.uniform(0, extent_m, (2, 1_000_000)) / 111_000
@@ -308,7 +308,8 @@ def test_one_row_is_no_trace(tmp_path: Path) -> None:
     path.write_text("t_s,kbps\n0,5000\n")
     with pytest.raises(ModelError) as raised:
         build_pqos(TRACE, [tmp_path])
-    assert str(raised.value) == f"file: {path}: must have at least two rows, else the duration of a rate is unknown"
+    rule = "must have at least two rows, otherwise the duration of a rate is unknown"
+    assert str(raised.value) == f"file: {path}: {rule}"
 
 
 # --- the packaged configuration and its schema ------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def test_every_line_is_one_command_of_words(tod: Command, graph: str, source: st
 
 @pytest.fixture
 def clip(conf: UserConf) -> str:
-    """A path with everything in it that a shell or Hydra would interpret."""
+    """A path that contains everything a shell or Hydra would interpret."""
     name = 'it\'s a "clip" with $HOME, {braces}, a=b & ü.mp4'
     conf.write(name, b"")
     return str(conf.path / name)
@@ -229,7 +229,7 @@ cameras:
 
 
 def test_yaml_does_not_guess_where_the_order_of_files_is_unusual(tod: Command, conf: UserConf) -> None:
-    """A vehicle that lets the kind of camera win: the value, not the usual order, tells the file."""
+    """A vehicle that lets the kind of camera win: the value, not the usual order, determines the file."""
     text = "# @package _global_\ndefaults: [_self_, {/cameras@cameras.a: compact_480p}]\nname: van\n"
     conf.write("vehicle/van.yaml", f"{text}cameras: {{a: {{fps: 99, weight: 2}}}}\n")
     out = tod("print", conf.word, "vehicle=van", "source=test", "format=yaml").out
@@ -247,6 +247,6 @@ def test_yaml_writes_text_as_omegaconf_reads_it(text: str) -> None:
 
 def test_yaml_is_of_a_valid_configuration_and_decides_nothing(tod: Command) -> None:
     assert tod("print", "format=yaml", "total_kbps=3").err == (
-        "command line: total_kbps: decides nothing with format=yaml\n"
+        "command line: total_kbps: has no effect with format=yaml\n"
     )
     assert tod("print", "format=yaml", "fps_max=0").problems == ["command line: fps_max: 0: must be above 0"]

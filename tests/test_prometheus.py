@@ -1,4 +1,4 @@
-"""Figures for Prometheus: every record's, under valid names, and health."""
+"""Metrics for Prometheus: those of every record, under valid names, and health."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAMERA = CameraTelemetry(applied={}, frames=10, bytes=2000, encode_ms=4.0)
 TELEMETRY = Telemetry(1.0, None, None, {"front": CAMERA, "rear": CAMERA}, refused=3)
 
 
-def asked(port: int, path: str) -> tuple[int, str]:
+def fetch(port: int, path: str) -> tuple[int, str]:
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=5) as answer:
             return answer.status, answer.read().decode()
@@ -36,21 +36,21 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
     try:
         figures.take(TELEMETRY)
         figures.show_online(True)
-        status, text = asked(port, "/metrics")
+        status, text = fetch(port, "/metrics")
         assert status == 200
         assert 'tod_camera_encoded_frames_total{camera="front",vehicle="car"} 10.0' in text
         assert 'tod_camera_encode_seconds{camera="rear",vehicle="car"} 0.004' in text
         assert 'tod_refused_requests_total{vehicle="car"} 3.0' in text
         assert 'tod_vehicle_online{vehicle="car"} 1.0' in text
         assert "tod_predicted_kbps{" not in text  # unknown
-        assert asked(port, "/health") == (200, "ok\n")
+        assert fetch(port, "/health") == (200, "ok\n")
         problems.append("the control loop hangs in a rule")
-        assert asked(port, "/health") == (503, "the control loop hangs in a rule\n")
-        assert asked(port, "/") == (404, "expected /metrics or /health\n")
+        assert fetch(port, "/health") == (503, "the control loop hangs in a rule\n")
+        assert fetch(port, "/") == (404, "expected /metrics or /health\n")
     finally:
         figures.close()
     with pytest.raises(urllib.error.URLError):
-        asked(port, "/health")
+        fetch(port, "/health")
 
 
 def test_without_a_port_nothing_is_served_and_nothing_is_loaded() -> None:
@@ -73,8 +73,8 @@ def test_a_port_in_use_is_named() -> None:
 
 
 def test_every_figure_has_a_valid_name_of_its_own() -> None:
-    from runner.metrics.prometheus import FIGURES
+    from runner.metrics.prometheus import METRICS
 
-    names: list[Any] = [figure.name for parts in FIGURES.values() for part in parts for figure in part]
+    names: list[Any] = [metric.name for parts in METRICS.values() for part in parts for metric in part]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"[a-z][a-z_]*", name) for name in names)

@@ -1,4 +1,4 @@
-"""Events in, decisions out: the JSON lines, where a run ends, replaced predictions, drive logs."""
+"""Events in, decisions out: the JSON lines, the end of a run, replaced predictions, drive logs."""
 
 from __future__ import annotations
 
@@ -145,7 +145,9 @@ def test_standard_input_and_output() -> None:
         ('{"t": 1, "event": "clock_advanced", "log": "x"}', "log: unknown key; expected one of t, event"),
     ],
 )
-def test_a_line_that_is_no_event_ends_the_run(tod: Command, events_file: Path, bad: str, expected: str | None) -> None:
+def test_a_line_that_is_not_an_event_ends_the_run(
+    tod: Command, events_file: Path, bad: str, expected: str | None
+) -> None:
     with events_file.open("a") as file:
         file.write(f'{{"log": "note", "t": 0, "text": ""}}\n{bad}\n{lines([predicted(9, 1)])}')
     events_file.write_text(events_file.read_text().replace('"t": 1,', '"t": 0.5,', 1))
@@ -200,7 +202,7 @@ def test_a_device_stays_a_device(tod: Command, events_file: Path) -> None:
     assert not Path("/dev/null").is_file()
 
 
-def test_each_answer_comes_before_the_next_event_is_asked_for() -> None:
+def test_each_answer_is_written_before_the_next_event_is_read() -> None:
     command = [sys.executable, "-m", "runner", "replay", *PAPER]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdin and running.stdout
@@ -216,7 +218,7 @@ def test_each_answer_comes_before_the_next_event_is_asked_for() -> None:
 
 
 class Doubled:
-    """Predicts ten kbit/s per second at every event, its own kind of event included."""
+    """Predicts ten kbit/s per second at every event, including predictions."""
 
     warnings: tuple[str, ...] = ()
 
@@ -298,8 +300,8 @@ def story(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_drive_replays_to_the_decisions_that_it_holds(tod: Command, drive: Path, story: Path) -> None:
-    """With the configuration of the drive, without naming it again, wherever it is read from."""
+def test_a_drive_replays_to_its_own_decisions(tod: Command, drive: Path, story: Path) -> None:
+    """With the configuration of the drive, which need not be named again, from any kind of input."""
     again = tod("replay", f"input={drive}")
     assert again.out == tod("replay", *PAPER, "cameras.front_left.weight=3", f"input={story}").out
     assert again.out == tod("replay", f"input={drive / 'drive.jsonl'}").out
@@ -313,7 +315,7 @@ def test_a_drive_replays_to_the_decisions_that_it_holds(tod: Command, drive: Pat
     assert decisions[-1]["cause"] == "weights_set weights {'front_right': 2}"
 
 
-def test_a_drive_is_its_own_answer_when_it_is_replayed_into_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_a_drive_replayed_into_a_drive_is_identical(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert tod("replay", f"input={drive}", f"log={tmp_path / 'again'}").status == 0
     assert (tmp_path / "again" / "drive.jsonl").read_text() == (drive / "drive.jsonl").read_text()
 
@@ -361,7 +363,7 @@ def test_a_configuration_that_is_no_longer_valid_is_reported_for_the_drive(tod: 
     assert result.err.splitlines()[0] == f"{path}: line 1: config: fps_mox: unknown key, did you mean fps_max?"
 
 
-def test_a_drive_that_was_cut_off_is_replayed_to_its_last_whole_line(tod: Command, drive: Path) -> None:
+def test_a_truncated_drive_is_replayed_to_its_last_complete_line(tod: Command, drive: Path) -> None:
     path, whole = drive / "drive.jsonl", tod("replay", f"input={drive}").out
     text = path.read_text().splitlines(keepends=True)
     at = next(number for number, line in enumerate(text) if "weights_set" in line and "event" in line)
@@ -372,7 +374,7 @@ def test_a_drive_that_was_cut_off_is_replayed_to_its_last_whole_line(tod: Comman
     assert result.err == f"{path}: line {at + 1} is cut off and was left out\n"
 
 
-def test_files_that_are_no_drive_are_reported(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_a_drive_are_reported(tod: Command, drive: Path, tmp_path: Path) -> None:
     path = drive / "drive.jsonl"
     first, *_ = path.read_text().splitlines(keepends=True)
 
@@ -448,7 +450,7 @@ def test_a_drive_is_never_overwritten(tod: Command, drive: Path, story: Path) ->
     before = (drive / "drive.jsonl").read_bytes()
     result = tod("replay", f"input={story}", f"log={drive}")
     assert result.status == 2
-    rule = "holds a drive already (drive.jsonl), choose another directory"
+    rule = "already contains a drive (drive.jsonl), choose another directory"
     assert result.err == f"command line: log: '{drive}': {rule}\n"
     assert (drive / "drive.jsonl").read_bytes() == before
 

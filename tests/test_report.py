@@ -1,4 +1,4 @@
-"""The verb `report`: its files, one drive or several, sides that are missing, and every mistake with its message."""
+"""The verb `report`: its files, one drive or several, missing sides, and every error with its message."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the page and report.json: figures for print take most of a report's time."""
+    """Make only the page and report.json: the figures for print take most of the time."""
     monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)
 
 
@@ -56,9 +56,9 @@ def defined(path: Path) -> dict[str, Figure]:
 
 def drawn(figure: Figure) -> Any:
     """A figure as drawn for print."""
-    from runner.drive.print import drawn
+    from runner.drive.print import draw_sheet
 
-    return drawn(figure)
+    return draw_sheet(figure)
 
 
 def document(output: Path) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def document(output: Path) -> dict[str, Any]:
 
 
 def check_figures(output: Path, names: list[str]) -> None:
-    """Each exists, as a PNG of a column's width that is not blank, and as a PDF; no half-written file exists."""
+    """Check that each exists as a non-blank PNG of column width and as a PDF, and that no partial file exists."""
     expected = {f"{name}.{form}" for name in names for form in ("png", "pdf")} | {"index.html", "report.json"}
     assert {path.name for path in output.iterdir()} == expected
     for name in names:
@@ -219,7 +219,7 @@ def test_sides_that_are_missing(tod: Command, tmp_path: Path, sides: list[str], 
     content = document(tmp_path / "out")
     assert content["drives"][0]["link"] is None
     if "operator" not in sides:
-        left_out = "latency: left out, no latency was logged: that takes an operator's log"
+        left_out = "latency: left out, no latency was logged: an operator's log is needed"
         assert left_out in content["left_out"]
         assert left_out in out
 
@@ -292,7 +292,7 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("congested, scale", [(0.0, "linear"), (3.0, "log")])
-def test_the_axis_of_latencies_holds_them_all(tmp_path: Path, congested: float, scale: str) -> None:
+def test_the_latency_axis_covers_all_values(tmp_path: Path, congested: float, scale: str) -> None:
     path = write_drive(tmp_path / "drive", seconds=20, congested=congested)
     axes = drawn(defined(path)["latency"]).axes[0]
     shown = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
@@ -349,7 +349,7 @@ def test_one_camera_is_called_by_its_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("unprinted")
-def test_a_note_stands_once_and_figures_above_versions(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_notes_appear_once_and_figures_above_versions(tod: Command, drive: Path, tmp_path: Path) -> None:
     other = write_drive(tmp_path / "other", seconds=5)
     assert tod("report", str(drive), str(other), f"output={tmp_path / 'out'}").status == 0
     page = (tmp_path / "out" / "index.html").read_text()
@@ -375,18 +375,18 @@ def test_colours_are_those_of_the_operators_page() -> None:
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
 
-def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_invalid_words(tod: Command, drive: Path, tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     out = f"output={tmp_path / 'out'}"
     wrong = [
-        ([out], "command line: DRIVE: must be given: a directory that log= was given to"),
-        ([str(drive)], "command line: output: must be given: the directory that the report is written to"),
+        ([out], "command line: DRIVE: must be given: a directory that log= wrote"),
+        ([str(drive)], "command line: output: must be given: the directory to write the report to"),
         (["/nowhere", out], "/nowhere: no such directory"),
-        ([str(drive), f"output={file}"], f"command line: output: '{file}': must be a directory, {file} is a file"),
+        ([str(drive), f"output={file}"], f"command line: output: '{file}': must be a directory, but {file} is a file"),
         (
             [str(drive), f"output={file}/deep"],
-            f"command line: output: '{file}/deep': must be a directory, {file} is a file",
+            f"command line: output: '{file}/deep': must be a directory, but {file} is a file",
         ),
         ([str(drive), out, "models=/nowhere"], "command line: models: '/nowhere': no such directory"),
         (
@@ -402,7 +402,7 @@ def test_words_that_are_wrong(tod: Command, drive: Path, tmp_path: Path) -> None
     assert not (tmp_path / "out").exists()
 
 
-def test_a_model_that_is_none(tod: Command, drive: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_a_model(tod: Command, drive: Path, tmp_path: Path) -> None:
     (tmp_path / "front_left.model.json").write_text("{")
     status, _, err = tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={tmp_path}")
     assert status == 2

@@ -1,4 +1,4 @@
-"""What is made of the pictures of a topic of ROS, without ROS: what is passed on, and what is reported."""
+"""Pictures of a ROS topic, without ROS: which are passed on, and what is reported."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ RAW = {"encoding": "bgr8", "width": 1920, "height": 1080, "step": 5760, "big": F
 
 
 class Topic:
-    """A camera's topic that gets pictures at times in s."""
+    """A camera's topic that receives pictures at given times, s."""
 
     def __init__(self):
         camera = configuration([*WORDS, *TOPICS]).vehicle().cameras["front"]
-        self.told = []
-        self._stream = CameraStream(camera, lambda name, what: self.told.append(f"{name}: {what}"))
+        self.reports = []
+        self._stream = CameraStream(camera, lambda name, what: self.reports.append(f"{name}: {what}"))
         self._memory = os.memfd_create("picture")
 
     def get(self, at, age=0.0, **form):
@@ -37,38 +37,38 @@ class Topic:
         picture = self._stream.add(message, self._memory)
         return picture and picture.captured / SECOND_NS
 
-    def take_told(self):
-        told, self.told[:] = [line.removeprefix("front: /front: ") for line in self.told], []
-        return told
+    def take_reports(self):
+        reports, self.reports[:] = [line.removeprefix("front: /front: ") for line in self.reports], []
+        return reports
 
 
 def test_capture_times_are_those_of_stamps_unless_a_clock_is_wrong():
     topic = Topic()
     assert topic.get(10, 0.25) == 9.75
-    topic.take_told()
+    topic.take_reports()
     assert topic.get(10.1, 1.0) is None  # earlier than the one before
-    assert topic.take_told() == ["a picture is not later than the one before: such pictures are left out"]
+    assert topic.take_reports() == ["a picture is not later than the one before: such pictures are left out"]
     assert topic.get(11, -0.02) == 11  # never from the future
-    assert topic.take_told() == []
+    assert topic.take_reports() == []
     for at, age in ((11.1, 1.01), (11.2, -0.021), (11.3, None)):
         assert topic.get(at, age) == at
-    assert topic.take_told() == ["a stamp is 1.01 s old: the latency of these pictures is unknown"]
+    assert topic.take_reports() == ["a stamp is 1.01 s old: the latency of these pictures is unknown"]
     assert topic.get(11.5, 0.1) == 11.4
-    assert topic.take_told() == ["stamps are right again"]
+    assert topic.take_reports() == ["stamps are correct again"]
     topic.get(11.6, None)
-    assert topic.take_told() == ["pictures have no stamp: their latency is unknown"]
+    assert topic.take_reports() == ["pictures have no stamp: their latency is unknown"]
     topic.get(11.7)
     topic.get(11.8, -3600)
-    assert topic.take_told()[1:] == ["a stamp is 3600.00 s in the future: the latency of these pictures is unknown"]
+    assert topic.take_reports()[1:] == ["a stamp is 3600.00 s in the future: the latency of these pictures is unknown"]
 
 
-def test_each_size_and_format_is_told_once():
+def test_each_size_and_format_is_reported_once():
     topic = Topic()
     topic.get(1), topic.get(1.1)
-    assert topic.take_told() == ["pictures are BGR 1920x1080"]
+    assert topic.take_reports() == ["pictures are BGR 1920x1080"]
     small = {**RAW, "encoding": "mono8", "width": 100, "height": 50, "step": 100}
     topic.get(1.2, **small), topic.get(1.3, **small)
-    assert topic.take_told() == [
+    assert topic.take_reports() == [
         "pictures are GRAY8 100x50, scaled up to the camera's 1280x960; they were BGR 1920x1080"
     ]
 
@@ -85,36 +85,36 @@ def test_each_size_and_format_is_told_once():
 def test_pictures_that_cannot_be_shown_are_left_out(wrong, rule):
     topic = Topic()
     topic.get(1)
-    topic.take_told()
+    topic.take_reports()
     assert [topic.get(at, **{**RAW, **wrong}) for at in (2, 3)] == [None, None]
     assert topic.get(4) == 4
     assert topic.get(5, **{**RAW, **wrong}) is None
-    first, again = topic.take_told()
+    first, again = topic.take_reports()
     assert first == again
     assert first.startswith(rule)
     assert first.endswith(": such pictures are left out")
 
 
-def test_compressed_pictures_are_what_their_bytes_say():
+def test_bytes_determine_the_type_of_compressed_pictures():
     topic = Topic()
     os.write(topic._memory, b"GIF89a")
     assert topic.get(1, size=6, stated="jpeg") is None
-    assert topic.take_told() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are left out"]
+    assert topic.take_reports() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are left out"]
     os.pwrite(topic._memory, b"\x89PNG\r\n\x1a\n" + bytes(8) + (1280).to_bytes(4) + (960).to_bytes(4), 0)
     assert topic.get(2, size=24, stated="jpeg") == 2
-    assert topic.take_told() == ["pictures are png 1280x960"]
+    assert topic.take_reports() == ["pictures are png 1280x960"]
 
 
-def test_a_rate_below_the_cameras_is_told_once():
+def test_a_rate_below_the_cameras_is_reported_once():
     topic = Topic()
     for number in range(200):
         topic.get(1 + number / 10)
-    assert topic.take_told() == ["pictures are BGR 1920x1080"]
+    assert topic.take_reports() == ["pictures are BGR 1920x1080"]
     for number in range(100):
         topic.get(30 + number / 5)
     for number in range(200):
         topic.get(60 + number / 10)
-    slow, again = topic.take_told()
+    slow, again = topic.take_reports()
     assert slow.endswith(" pictures a second, the camera's fps is 10")
     assert again == "10.0 pictures a second, the camera's fps is 10"
 
@@ -141,7 +141,7 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
     check_discovery(settings, insecure=False)
     open_to_all = replace(settings, discovery="subnet")
     check_discovery(open_to_all, insecure=True)
-    with pytest.raises(UserError, match=r"ros.discovery: subnet: admits any node of the network: set up SROS 2"):
+    with pytest.raises(UserError, match=r"ros.discovery: subnet: admits any node on the network: set up SROS 2"):
         check_discovery(open_to_all, insecure=False)
     monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
     with pytest.raises(UserError):
@@ -153,8 +153,8 @@ def test_nodes_of_other_machines_need_keys(monkeypatch):
 @pytest.mark.parametrize(
     "uri, rule",
     [
-        ("http://10.0.0.1:11311", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
-        ("http://robot:11311/", "admits any node of the network, and ROS 1 has no keys: must be of this machine, or"),
+        ("http://10.0.0.1:11311", "admits any node on the network, and ROS 1 has no keys: must be on this machine, or"),
+        ("http://robot:11311/", "admits any node on the network, and ROS 1 has no keys: must be on this machine, or"),
         ("10.0.0.1:11311", "must be http://HOST:PORT"),
         ("http://localhost", "must be http://HOST:PORT"),
         ("http://localhost:master", "must be http://HOST:PORT"),
@@ -175,7 +175,7 @@ def test_a_master_of_another_machine_needs_insecure(monkeypatch, uri, rule):
         check_discovery(settings, insecure=True)
 
 
-def test_version_1_refuses_keys_of_ros_2_all_at_once():
+def test_version_1_refuses_all_keys_of_ros_2_together():
     words = ["ros.qos={/front: {depth: 1}}", "ros.discovery=subnet", "ros.use_sim_time=true"]
     assert configuration([*WORDS, *TOPICS, *words]).vehicle().ros.interpreter == ".venv-ros2/bin/python"
     assert configuration([*WORDS, *TOPICS, "ros.version=1"]).vehicle().ros.interpreter == "/usr/bin/python3"
@@ -193,45 +193,46 @@ def test_version_1_refuses_keys_of_ros_2_all_at_once():
 
 @pytest.mark.parametrize(
     "version, library, remedy",
-    [(2, "rclpy", "`make ros2` makes .venv-ros2"), (1, "rospy", "`make ros1` installs it")],
+    [(2, "rclpy", "`make ros2` creates .venv-ros2"), (1, "rospy", "`make ros1` installs it")],
 )
-def test_doctor_names_what_makes_the_environment(tod, version, library, remedy):
+def test_doctor_names_how_to_install_the_environment(tod, version, library, remedy):
     done = tod("doctor", "ros", f"ros.version={version}", "ros.python=no/python")
     assert done.status == 1
     why = f"[Errno 2] No such file or directory: 'no/python'; {remedy}, see docs/ros.md"
     assert f"MISSING {library} for ros.python no/python: {why}" in done.out.splitlines()
 
 
-def test_names_are_as_rospy_has_them():
+def test_names_are_translated_for_rospy():
     remap = {"~/state": "/robot/state", "/front": "image", "front": "~/image"}
     assert ros1.remappings(remap) == ["~state:=/robot/state", "/front:=image", "front:=~image"]
 
 
-def losses(monkeypatch, numbers, *, untransported=0, late=0, publisher=b"a", counted=None):
-    """What is told after COUNT_S about pictures with these numbers."""
+def losses(monkeypatch, numbers, *, lost_in_transport=0, late=0, publisher=b"a", counted=None):
+    """The report after COUNT_S on pictures with these numbers."""
     counted = counted or pictures.PictureCount()
     for number in numbers:
         counted.add(publisher, number)
-    counted.untransported, counted.late = untransported, late
+    counted.lost_in_transport, counted.late = lost_in_transport, late
     later = pictures.time.monotonic() + pictures.COUNT_S
     monkeypatch.setattr(pictures.time, "monotonic", lambda: later)
-    return counted.take_news()
+    return counted.update()
 
 
 def test_lost_pictures_are_reported_with_the_place_where_they_were_lost(monkeypatch):
-    counted, told = pictures.PictureCount(), "pictures were lost"
+    counted, lost = pictures.PictureCount(), "pictures were lost"
     assert losses(monkeypatch, range(7, 107), counted=counted) == ""
     assert losses(monkeypatch, range(112, 208), counted=counted) == ""  # 5 of 101, not more than one in twenty
     where = "3 between publisher and node, 3 since the node ran late; docs/ros.md states what helps"
-    assert losses(monkeypatch, range(212, 311), untransported=3, late=2, counted=counted) == f"6 of 103 {told}, {where}"
-    assert losses(monkeypatch, [320], counted=counted) == ""  # told already
-    assert losses(monkeypatch, [1, 2], publisher=b"b", counted=counted) == "no pictures are lost any more"
-    assert counted.take_news() == ""
+    found = losses(monkeypatch, range(212, 311), lost_in_transport=3, late=2, counted=counted)
+    assert found == f"6 of 103 {lost}, {where}"
+    assert losses(monkeypatch, [320], counted=counted) == ""  # already reported
+    assert losses(monkeypatch, [1, 2], publisher=b"b", counted=counted) == "no more pictures are lost"
+    assert counted.update() == ""
 
 
 def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_knows(monkeypatch):
     counted = pictures.PictureCount()
     for _ in range(9):
         counted.add(None, None)
-    told = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
-    assert losses(monkeypatch, [], untransported=1, counted=counted).startswith(told)
+    lost = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
+    assert losses(monkeypatch, [], lost_in_transport=1, counted=counted).startswith(lost)

@@ -1,4 +1,4 @@
-"""Operator inputs as topics and services, without ROS: what each requests."""
+"""Operator inputs as topics and services, without ROS: the event that each requests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WHOLE = {"x": 0, "y": 0, "width": 1280, "height": 720}
         ("~/camera/mast/switch", {"value": False}, {"event": "camera_switched", "camera": "mast", "on": False}),
     ],
 )
-def test_what_each_requests(name, values, event):
+def test_events_that_inputs_request(name, values, event):
     found = (TOPICS | SERVICES)[name].event(values)
     assert found == event
     assert parse(json.loads(json.dumps({"t": 0, **found}))).t == 0

@@ -1,4 +1,4 @@
-"""The ROS package with the launch files: what it starts is understood, and it installs all of its files."""
+"""The ROS package with the launch files: its command lines are valid, and it installs all of its files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def commands(file):
 
 
 @pytest.mark.parametrize("file", LAUNCH, ids=lambda file: file.name)
-def test_what_a_launch_file_starts_is_understood(file):
+def test_command_lines_of_launch_files_are_valid(file):
     started = commands(file)
     assert [line[0] for line in started] == ["tod-runner", "tod-runner"]
     names = set()

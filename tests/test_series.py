@@ -1,4 +1,4 @@
-"""A drive on one time axis: joined clocks, counters that restart, values held until the next, panels."""
+"""A drive on one time axis: aligned clocks, counters that restart, step functions, panels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def line(*points: tuple[float, float]) -> TimeSeries:
     return TimeSeries(t, y)
 
 
-def test_values_hold_until_the_next() -> None:
+def test_values_are_in_force_until_the_next() -> None:
     steps = line((1, 10), (3, 20), (3, 30))
     np.testing.assert_array_equal(held(steps, np.array([0.0, 1.0, 2.9, 3.0, 9.0])), [NAN, 10, 10, 30, 30])
     np.testing.assert_array_equal(held(line(), np.array([0.0, 1.0])), [NAN, NAN])
@@ -45,7 +45,7 @@ def test_spans_share_a_stretch_of_time() -> None:
     np.testing.assert_allclose(spans(np.array([0.0, 2.0, 6.0]), 1, 8), [1, 4, 2])
 
 
-def test_a_counter_that_begins_again_runs_on() -> None:
+def test_a_counter_that_restarts_continues() -> None:
     np.testing.assert_array_equal(counted(np.array([5.0, 9.0, 2.0, 4.0, 0.0, 1.0])), [5, 9, 11, 13, 13, 14])
     assert counted(np.empty(0)).size == 0
 
@@ -114,7 +114,7 @@ def test_the_operator_alone(tmp_path: Path) -> None:
     assert drive.reasons
 
 
-def test_when_a_camera_was_to_be_sent(tmp_path: Path) -> None:
+def test_spans_in_which_a_camera_should_send(tmp_path: Path) -> None:
     off = CameraSwitched(t=5.0, camera="rear_center", on=False)
     on = CameraSwitched(t=9.0, camera="rear_center", on=True)
     drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20, events=(off, on))))
@@ -217,7 +217,7 @@ def test_a_drive_that_cannot_be_reported(tmp_path: Path) -> None:
     assert problem("nowhere") == "nowhere: no such directory"
 
 
-def test_a_drive_that_was_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
+def test_a_truncated_drive_is_read_up_to_there(tmp_path: Path) -> None:
     path = write_drive(tmp_path / "drive", seconds=5, ended=False)
     log = path / "drive.jsonl"
     log.write_text(log.read_text()[:-20])

@@ -71,13 +71,13 @@ def test_a_freeze_is_part_of_later_means() -> None:
     assert freezes(arrived, [(0.0, float(arrived[-1]))]) == [(pytest.approx(1.0), pytest.approx(6.0))]
 
 
-def test_nothing_is_judged_by_less_than_five_gaps() -> None:
+def test_no_freeze_is_judged_by_fewer_than_five_gaps() -> None:
     assert freezes(arrivals(*[0.025] * 4, 1.0, 0.025), [(0.0, 1.125)]) == []
     assert len(freezes(arrivals(*[0.025] * 5, 1.0, 0.025), [(0.0, 1.15)])) == 1
     assert freezes(np.empty(0), [(0.0, 1.9)]) == []
 
 
-def test_a_stream_that_never_comes_or_stops_before_it_can_be_judged_freezes() -> None:
+def test_a_stream_that_never_starts_or_stops_early_freezes() -> None:
     assert freezes(np.empty(0), [(0.0, 50.0), (60.0, 100.0)]) == [Freeze(0.0, 50.0), Freeze(60.0, 40.0)]
     assert freezes(arrivals(0.025, 0.025), [(0.0, 10.0)])[-1].seconds == pytest.approx(9.95, abs=0.1)
 
@@ -220,7 +220,7 @@ def test_a_frozen_picture_keeps_its_quality_and_its_share_of_the_time_is_reporte
 
 
 def test_a_frozen_share_counts_the_quality_before_it_and_not_the_mean() -> None:
-    """Poor pictures, then none, then good ones: meanwhile the last poor one was on screen."""
+    """Poor pictures, then none, then good ones: during the gap the last poor one was on screen."""
     series = interrupted(10, 20)
     assert series.received is not None
     rates = np.where(series.received.t <= 10.5, series.received.kbps / 4, series.received.kbps)

@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from runner.configuration.overrides import MOST_RUNS, sweep
 from runner.drive.log import FILES
-from runner.verbs import HYDRAS_FLAGS, VERBS
+from runner.verbs import HYDRA_FLAGS, VERBS
 
 SMALL = ("source=test", "vehicle=delivery_robot")
 SWEEPING = [name for name, verb in VERBS.items() if verb.sweeps]
@@ -93,7 +93,7 @@ def test_replay_reads_a_file(tod: Command) -> None:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
-    """And -m is one where nothing sweeps."""
+    """-m is also a flag, of verbs that do not sweep."""
     if verb in SWEEPING:
         words = (verb, "modes=paper,safe", *(["input=/dev/null"] if verb == "replay" else []))
         assert "which print, replay and demo run with -m; write [a,b,c]" in tod(*words).err
@@ -105,11 +105,11 @@ def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
 
 
 def test_every_flag_of_hydra_has_an_answer(tod: Command) -> None:
-    """One line and status 2, behind a verb and alone; --help and --version are ours, -m is that of three verbs."""
+    """One line and status 2, with and without a verb; --help and --version are supported, and -m by three verbs."""
     known = {flag for action in get_args_parser()._actions for flag in action.option_strings}
-    answered = {flag for flags in HYDRAS_FLAGS for flag in flags}
+    answered = {flag for flags in HYDRA_FLAGS for flag in flags}
     assert known - {"--help", "-h", "--version", "-m"} == answered
-    for flags, instead in HYDRAS_FLAGS.items():
+    for flags, instead in HYDRA_FLAGS.items():
         for flag in flags:
             expected = (2, "", f"command line: {flag}: flags are not supported; {instead}\n")
             assert tod("demo", flag, "job") == tod(flag) == expected
@@ -118,5 +118,5 @@ def test_every_flag_of_hydra_has_an_answer(tod: Command) -> None:
 
 def test_the_flags_are_documented() -> None:
     page = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
-    for flags, instead in HYDRAS_FLAGS.items():
+    for flags, instead in HYDRA_FLAGS.items():
         assert f"| {', '.join(f'`{flag}`' for flag in flags)} | {instead} |" in page

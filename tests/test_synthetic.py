@@ -136,7 +136,7 @@ def test_numba_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.gst
-def test_interrupt_ends_the_workers_and_keeps_no_half_clip(world: Path, tmp_path: Path) -> None:
+def test_an_interrupt_ends_the_workers_and_leaves_no_partial_clip(world: Path, tmp_path: Path) -> None:
     import multiprocessing
 
     def interrupt(what: str, share: float) -> None:

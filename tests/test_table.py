@@ -1,4 +1,4 @@
-"""Tables named in settings: what is read, and each mistake with its exact message."""
+"""Tables named in settings: what is read, and each error with its exact message."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ KBPS = "must be a finite number of kbit/s, 0 or more"
         ("lon,lat,kbps\n48.2,-122.4,9\n", ":2: lat -122.4", "must lie in [-90, 90] degrees; are lon and lat swapped?"),
         ("lon,lat,kbps\n1,nan,9\n", ":2: lat nan", "must lie in [-90, 90] degrees; are lon and lat swapped?"),
         ("lon,lat,kbps\n181,2,9\n", ":2: lon 181", "must lie in [-180, 180] degrees"),
-        ("lon,lat,kbps\n1_0,2,9\n", "", "must hold plain decimal numbers only"),
+        ("lon,lat,kbps\n1_0,2,9\n", "", "must contain only plain decimal numbers"),
         ("lon,lat,kbps\n1,2,\udcff\n", ":2: kbps '\ufffd'", "must be a number"),
     ],
 )
@@ -83,7 +83,7 @@ SIZE = "must have 3 cols (lon, lat, kbps) and rows x cols numbers"
 @pytest.mark.parametrize(
     "text, found, rule",
     [
-        ("rows: 1\n", "", "must hold a matrix: rows, cols: 3 and data: [lon, lat, kbps, ...]"),
+        ("rows: 1\n", "", "must contain a matrix: rows, cols: 3 and data: [lon, lat, kbps, ...]"),
         (MATRIX.format(rows=2, cols=3, data="1, 2, 3"), ": rows 2, cols 3, 3 numbers in data", SIZE),
         (MATRIX.format(rows=1, cols=4, data="1, 2, 3, 4"), ": rows 1, cols 4, 4 numbers in data", SIZE),
         ("data: [1, 2, 3]\n", ": rows 0, cols 0, 3 numbers in data", SIZE),
@@ -101,7 +101,7 @@ def test_map_yaml_mistakes(tmp_path: Path, text: str, found: str, rule: str) -> 
 
 
 @pytest.mark.parametrize("second", ["0.5", "nan"])
-def test_time_does_not_fall(tmp_path: Path, second: str) -> None:
+def test_time_does_not_decrease(tmp_path: Path, second: str) -> None:
     path = written(tmp_path, f"t_s,kbps\n1,5\n{second},6\n")
     with pytest.raises(ModelError) as raised:
         read_table(path, (TIME, RATE))
@@ -136,7 +136,7 @@ def test_number_refuses(value: object) -> None:
     assert number({"radius_m": 0}, "radius_m") == 0
 
 
-def test_mistake_at_the_end_of_a_big_file_is_found_soon(tmp_path: Path) -> None:
+def test_an_error_at_the_end_of_a_big_file_is_found_quickly(tmp_path: Path) -> None:
     path = written(tmp_path, "lon,lat,kbps\n" + "11.5,48.25,3000\n" * 200_000 + "11.5,48.25,x\n")
     start = time.process_time()
     with pytest.raises(ModelError, match=":200002: kbps 'x': must be a number"):

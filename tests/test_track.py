@@ -21,7 +21,7 @@ from runner.pqos import build_pqos, build_track
 from runner.pqos.bandwidth_map import EARTH_M, offset
 from runner.pqos.route import route
 from runner.pqos.table import read_map
-from runner.pqos.track import Track, drive
+from runner.pqos.track import Track, track_on_map
 
 CONF = ROOT / "conf"
 ROUTE = {"kind": "route", "speed_mps": 8, "loop": True}
@@ -83,7 +83,7 @@ def test_scattered_laps_give_no_jumps() -> None:
 
 
 def test_crossing_roads_are_driven_along() -> None:
-    """A cross has four ends: only going back along a road reaches all of them without a jump."""
+    """A crossing has four ends: only driving back along a road reaches all of them without a jump."""
     line = np.arange(-100, 101, 5.0)
     cross = places(np.append(line, 0 * line), np.append(0 * line, line))
     points = np.random.default_rng(2).permutation(cross)
@@ -95,13 +95,13 @@ def test_road_that_does_not_close() -> None:
     points = places(np.arange(0, 1000, 5.0), np.zeros(200))
     order = route(points)
     assert order[0] == 0 and order[-1] == 199
-    there, back = drive(points, 10, loop=False), drive(points, 10, loop=True)
+    there, back = track_on_map(points, 10, loop=False), track_on_map(points, 10, loop=True)
     assert there.duration_s == pytest.approx(99.5) and back.duration_s == pytest.approx(199)
     assert distance(back.at(99.5 + 20), back.at(99.5 - 20)) == pytest.approx(0, abs=0.01)
     assert back.at(120).heading_deg == pytest.approx(270, abs=0.1)
 
 
-def test_order_is_found_at_once() -> None:
+def test_the_order_is_found_quickly() -> None:
     """Limits are in processor time."""
     random = np.random.default_rng(0)
     for points in (places(*random.uniform(0, 1000, (2, 3000))), random.permutation(oval(1_000_000, 2000, 9, 1.5))):
@@ -119,7 +119,7 @@ def test_one_place_is_no_route() -> None:
 def test_road_with_a_standstill_in_the_middle() -> None:
     """A recorder at standstill wrote many equal points: time must still increase."""
     x = np.concatenate([np.arange(0, 200, 3.0), np.full(50, 200.0), np.arange(200, 0, -3.0)])
-    track = drive(places(x, 0 * x), 8, loop=True)
+    track = track_on_map(places(x, 0 * x), 8, loop=True)
     assert all(math.isfinite(track.at(t / 10).lon) for t in range(600))
 
 

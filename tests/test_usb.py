@@ -1,4 +1,4 @@
-"""The bandwidth that cameras need of their USB buses, by a copy of what sysfs states."""
+"""The bandwidth that cameras need on their USB buses, from a copy of sysfs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every file and every combination; all problems of a user's files at once."""
+"""Every file and every combination; all problems of a user's files together."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_what_is_packaged_is_valid() -> None:
         ["+experiment=driving_test"],
     ],
 )
-def test_a_choice_meets_nothing_that_nobody_chose(words: list[str]) -> None:
+def test_a_choice_is_not_combined_with_unchosen_files(words: list[str]) -> None:
     result = process("validate", *words)
     assert (result.status, result.err) == (0, "")
     files = sum(map(count, (".", *GROUPS)))
@@ -69,7 +69,7 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
     return [line.replace(str(conf.path), "~") for line in tod("validate", conf.word, *words).problems]
 
 
-def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> None:
+def test_all_files_of_a_user_are_checked_together(tod: Command, conf: UserConf) -> None:
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
     conf.write("cameras/front/x.yaml", "a: 1\n").write("camera/x.yaml", "a: 1\n").write("cameras.yaml", "a: 1\n")
     conf.write("cameras/foo.yml", "a: 1\n").write("graph/a,b.yaml", "a: 1\n").write("graph/true.yaml", "a: 1\n")
@@ -84,7 +84,7 @@ def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> 
             "~/camera/x.yaml: would be ignored: no such group as camera/, did you mean cameras?",
             "~/cameras/foo.yml: would be ignored: Hydra reads foo.yaml",
             "~/cameras/top_view.yaml: fsp: unknown key, did you mean fps?",
-            "~/cameras/front/x.yaml: would be ignored: files stand in cameras/ itself, not in folders below",
+            "~/cameras/front/x.yaml: would be ignored: files must be directly in cameras/, not in subfolders",
             f"~/graph/a,b.yaml: {name}",
             f"~/graph/true.yaml: {name}",
             "~/modes/y.yaml: line 2: expected the node content, but found '<stream end>'",
@@ -95,7 +95,7 @@ def test_a_users_files_are_checked_all_at_once(tod: Command, conf: UserConf) -> 
 
 
 @pytest.mark.slow
-def test_what_a_file_alone_does_not_show(tod: Command, conf: UserConf) -> None:
+def test_problems_that_only_composition_shows(tod: Command, conf: UserConf) -> None:
     conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
     assert sorted(problems(tod, conf, *one("modes")), reverse=True) == [
@@ -185,7 +185,7 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
         ("element: matroskamux, properties: {timecodescale: 1000}", "element: h264parse", "elements: could not link"),
     ],
 )
-def test_ways_to_record_are_checked_though_none_is_chosen(
+def test_recording_files_are_checked_although_none_is_chosen(
     tod: Command, conf: UserConf, old: str, new: str, expected: str
 ) -> None:
     conf.change("recording/ffv1.yaml", {old: new})
@@ -193,7 +193,7 @@ def test_ways_to_record_are_checked_though_none_is_chosen(
     assert found.startswith(f"~/recording/ffv1.yaml: {expected}")
 
 
-def test_a_way_of_measuring_models_is_checked(tod: Command, conf: UserConf) -> None:
+def test_a_study_is_checked(tod: Command, conf: UserConf) -> None:
     conf.change("study/paper.yaml", {"[50, 63,": "[63, 50,"})
     (problem,) = problems(tod, conf, *one("study"))
     assert problem.startswith("~/study/paper.yaml: bitrates_kbps: [63, 50, ")
@@ -222,7 +222,7 @@ def composed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     return words
 
 
-def test_files_that_keep_to_themselves_are_composed_and_read_once(
+def test_independent_files_are_composed_and_read_once(
     tod: Command, composed: list[tuple[str, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[object] = []
@@ -258,7 +258,7 @@ def test_assembled_documents_equal_those_that_hydra_composes() -> None:
         ("config.yaml", (CONF / "config.yaml").read_text().replace("port: 8554", "port: '${graph.first_port}'")),
     ],
 )
-def test_files_that_reach_into_other_groups_are_not_assembled(conf: UserConf, name: str, text: str) -> None:
+def test_files_that_refer_to_other_groups_are_not_assembled(conf: UserConf, name: str, text: str) -> None:
     conf.write(name, text)
     group, _, file = name.removesuffix(".yaml").rpartition("/")
     choices = {group: file} if group else {"modes": "paper"}
@@ -266,7 +266,7 @@ def test_files_that_reach_into_other_groups_are_not_assembled(conf: UserConf, na
 
 
 @pytest.mark.slow
-def test_a_reference_to_another_group_meets_each_file_of_it(tod: Command, conf: UserConf) -> None:
+def test_a_reference_to_another_group_is_combined_with_each_of_its_files(tod: Command, conf: UserConf) -> None:
     conf.write("pqos/mine.yaml", "defaults: [constant, _self_]\nkbps: ${graph.mtu_bytes}\n")
     one_of_each = [f"{group}={name}" for group, name in ONE.items() if group not in ("pqos", "graph")]
     plain = tod("validate", "all=true", *one_of_each)

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, and MCAP, without ROS: topics, pictures, positions. No GStreamer."""
+"""ROS 1 and ROS 2 bags, and MCAP, read without ROS: topics, pictures, positions. No GStreamer."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ PICTURES: dict[str, Callable[[Any], Picture]] = {  # by type of message, also of
 }
 POSITIONS = ("sensor_msgs/msg/NavSatFix",)
 NO_FIX = -1  # STATUS_NO_FIX of sensor_msgs/NavSatStatus
-SURVEYED = 100  # pictures from whose times a rate is taken
-ROUND = 0.01  # share by which a measured rate may differ from the whole number that is meant
+SURVEYED = 100  # pictures from whose times a rate is estimated
+ROUND = 0.01  # a measured rate this close to a whole number, as a share, is rounded to it
 
 
 class Fix(NamedTuple):
@@ -46,7 +46,7 @@ class Fix(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PictureForm:
-    """What the pictures of a topic are like.
+    """Format, size and rate of the pictures of a topic.
 
     format         as in `Picture`
     width, height  px
@@ -68,8 +68,8 @@ class Bag:
     """An open bag.
 
     path    a ROS 1 bag, the directory of a ROS 2 bag, or one of its files: MCAP or SQLite
-    topics  type of message by topic, of topics that have messages
-    raises  ModelError with the key `bag`, here, or `topic`, while reading: file, topic and the rule that is broken
+    topics  message type by topic, for topics that have messages
+    raises  ModelError with the key `bag` on opening, or `topic` while reading: file, topic and the broken rule
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ class Bag:
         self.path = path
         _check_path(path)
         with _readable("bag", str(path)):
-            # Bags of older versions of ROS 2 do not define their messages.
+            # Bags of older ROS 2 versions do not contain the definitions of their messages.
             self._reader: AnyReader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
             self.topics = {c.topic: c.msgtype for c in self._reader.connections if c.msgcount}
@@ -97,7 +97,7 @@ class Bag:
     def find(self, kinds: Collection[str], topic: str | None, what: str) -> str:
         """The topic with messages of these types: the given one, otherwise the only one.
 
-        what    its content, for messages
+        what    its content, for error messages
         raises  ModelError
         """
         known = self.of(kinds)
@@ -110,7 +110,7 @@ class Bag:
         return topic or known[0]
 
     def pictures(self, topic: str) -> Iterator[Picture]:
-        """The pictures of a topic, in the order in which they were recorded."""
+        """The pictures of a topic, in recording order."""
         read = PICTURES[self.topics[topic]]
         for ns, message in self._messages(topic):
             try:
@@ -120,7 +120,7 @@ class Bag:
             yield picture if picture.ns else picture.at(ns)
 
     def positions(self, topic: str) -> Iterator[Fix]:
-        """The positions of a topic, in the order of the recording, but those without a fix."""
+        """The positions of a topic, in recording order, except those without a fix."""
         for logged, message in self._messages(topic):
             fix = Fix(stamp_ns(message) or logged, message.latitude, message.longitude)
             if message.status.status != NO_FIX and math.isfinite(fix.lat) and math.isfinite(fix.lon):
@@ -138,19 +138,19 @@ class Bag:
         return PictureForm(first[0].format, first[0].width, first[0].height, _rate(SECOND_NS / median(steps)))
 
     def names(self, topic: str) -> str:
-        """File and topic, for messages."""
+        """File and topic, for error messages."""
         return f"{self.path}: {topic}"
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Messages of a topic, with the times at which they were recorded, ns since 1970."""
         with _readable("topic", self.names(topic)):
-            wanted = [connection for connection in self._reader.connections if connection.topic == topic]
-            for connection, ns, data in self._reader.messages(wanted):
+            connections = [connection for connection in self._reader.connections if connection.topic == topic]
+            for connection, ns, data in self._reader.messages(connections):
                 yield ns, self._reader.deserialize(data, connection.msgtype)
 
 
 def check_topic(path: Path, topic: str | None) -> None:
-    """Check that a topic of a bag has pictures of a kind that is known, by the first of them.
+    """Check, by its first picture, that a topic of a bag has pictures of a supported kind.
 
     raises  ModelError with the key `bag` or `topic`
     """
@@ -173,7 +173,7 @@ def _check_path(path: Path) -> None:
 
 @contextmanager
 def _readable(key: str, found: str) -> Iterator[None]:
-    """Damaged files: the library's parsers raise whatever they stumble over."""
+    """Convert errors of damaged files: the library's parsers raise many kinds of exceptions."""
     try:
         yield
     except (ImportError, ModelError):
@@ -187,7 +187,7 @@ def _reason(error: Exception) -> str:
 
 
 def _rate(measured: float) -> Fraction:
-    """A rate without the jitter of the times it was taken from."""
+    """A measured rate, rounded if it is close to a whole number."""
     whole = round(measured)
     if whole and abs(measured - whole) <= ROUND * whole:
         return Fraction(whole)

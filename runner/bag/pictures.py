@@ -21,20 +21,20 @@ FORMATS = {
 }
 ALIGNED = 4  # bytes: rows begin at multiples in GStreamer
 JPEG, PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
-# Markers of JPEG (ITU-T T.81, table B.1): the frame headers, which hold the size, and those that stand alone.
+# Markers of JPEG (ITU-T T.81, table B.1): the frame headers, which contain the size, and standalone markers.
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-ALONE = {0x01, *range(0xD0, 0xD9)}
+STANDALONE = {0x01, *range(0xD0, 0xD9)}
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
     """One picture of a bag.
 
-    ns             when it was captured, ns since 1970: the stamp of its header
-    stamped        whether it had one; otherwise `ns` is when it was recorded
+    ns             capture time, ns since 1970: the stamp of its header
+    stamped        whether it had a stamp; otherwise `ns` is the time of recording
     format         GStreamer's name of a raw format, or jpeg, or png
     width, height  px
-    data           rows from the top, each padded to a multiple of four bytes; or the file
+    data           rows from the top, each padded to a multiple of four bytes; or the compressed file
     """
 
     ns: int
@@ -45,7 +45,7 @@ class Picture:
     stamped: bool = True
 
     def at(self, ns: int) -> Picture:
-        """The same, without a stamp of its own."""
+        """A copy with the time of recording, for a picture without a stamp."""
         return replace(self, ns=ns, stamped=False)
 
     @property
@@ -85,7 +85,7 @@ def image_format(encoding: str, width: int, height: int, step: int, big: bool, s
 
 
 def read_compressed(message: Any) -> Picture:
-    """A picture of a message sensor_msgs/CompressedImage: its bytes tell what it is, `format` differs by writer.
+    """A picture of a message sensor_msgs/CompressedImage. Its bytes determine the type: `format` differs by writer.
 
     raises  ValueError with the rule that it breaks
     """
@@ -96,7 +96,7 @@ def read_compressed(message: Any) -> Picture:
 def compressed_form(data: bytes, stated: str) -> tuple[str, int, int]:
     """jpeg or png, and width and height in px, by the first bytes of a compressed picture.
 
-    data    as many of them as hold its headers
+    data    enough bytes to contain its headers
     stated  its format by the message
     raises  ValueError with the rule that it breaks
     """
@@ -114,7 +114,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def _padded(data: Any, height: int, row: int) -> bytes:
-    """Rows without their padding in the message, with that of GStreamer."""
+    """Rows with GStreamer's padding in place of the message's."""
     import numpy as np
 
     rows = np.asarray(data, np.uint8).reshape(height, -1)
@@ -134,5 +134,5 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
         if marker in FRAMES:
             return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
         fill = marker == 0xFF
-        at += 1 if fill else 2 if marker in ALONE else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        at += 1 if fill else 2 if marker in STANDALONE else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     raise ValueError("a JPEG picture without frame header")

@@ -1,7 +1,7 @@
 """A bandwidth map from drives: the received rate wherever the link was the bottleneck. Pure.
 
 The received rate shows the capacity of a link only while more than that is sent; at all other times it shows how much
-was sent. A sample counts if packets were lost or frames waited during its second: its rate is then the capacity.
+was sent. A sample counts if packets were lost or frames queued during its second: its rate is then the capacity.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from runner.drive.series import FloatSeries, Positions, Series
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # over which the rates of the samples are measured
-WAITED_MS = 50.0  # above the lowest latency of the drive: the queue in front of the link was filling
+QUEUED_MS = 50.0  # above the lowest latency of the drive: the queue in front of the link was filling
 GAP_S = 2.0  # positions further apart say nothing about the time between
 
 
@@ -51,8 +51,8 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
     t, kbps = drive.actual
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
-        limited |= _lost(t, camera.t, camera.lost) | _waited(t, camera.arrival_t, camera.clocks_ms)
-    lat, lon = _at(drive.positions, t)
+        limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.clocks_ms)
+    lat, lon = _positions_at(drive.positions, t)
     known = limited & np.isfinite(kbps) & np.isfinite(lat)
     return [CapacitySample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
 
@@ -73,7 +73,7 @@ def cells(samples: Iterable[CapacitySample], percentile: float, cell_m: float) -
 
 def _cell(inside: list[CapacitySample], percentile: float) -> Cell:
     lat, lon, kbps = np.array(inside).T
-    # The lower of two neighbours: between them nothing was measured.
+    # The lower of two neighbours, since nothing was measured between them.
     return Cell(lat.mean(), lon.mean(), float(np.percentile(kbps, percentile, method="lower")), len(inside))
 
 
@@ -90,22 +90,22 @@ def _lost(at: FloatSeries, t: FloatSeries, lost: FloatSeries) -> np.ndarray[tupl
     return more
 
 
-def _waited(
+def _queued(
     at: FloatSeries, t: FloatSeries, latency_ms: FloatSeries
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Whether half of the frames that arrived in the second before each time had waited."""
-    waited = np.zeros(at.shape, dtype=bool)
+    """Whether half of the frames that arrived in the second before each time had been queued."""
+    queued = np.zeros(at.shape, dtype=bool)
     if not np.isfinite(latency_ms).any():
-        return waited
-    late = latency_ms > np.nanmin(latency_ms) + WAITED_MS
+        return queued
+    late = latency_ms > np.nanmin(latency_ms) + QUEUED_MS
     ends, begins = np.searchsorted(t, at, "right"), np.searchsorted(t, at - WINDOW_S, "right")
     count = np.append(0, np.cumsum(late))
     frames = ends - begins
-    waited[frames > 0] = (2 * (count[ends] - count[begins]) >= frames)[frames > 0]
-    return waited
+    queued[frames > 0] = (2 * (count[ends] - count[begins]) >= frames)[frames > 0]
+    return queued
 
 
-def _at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:
+def _positions_at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:
     """Degrees in the middle of the second before each time; nan if no position is near."""
     middle = t - WINDOW_S / 2
     after = np.searchsorted(positions.t, middle).clip(1, max(1, len(positions.t) - 1))

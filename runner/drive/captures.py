@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from runner.apply import Unit
 
 SECOND_NS = 1_000_000_000
-# A frame of the file and one of the log further apart than this differ; less than most cameras' frame interval.
+# A frame of the file and one of the log are different if further apart; less than most cameras' frame interval.
 SAME_NS = 20_000_000
 ROUNDING_NS = 1_000_000  # of times in the file, which count in 1/90000 s
-UNCERTAIN_NS = 150_000_000  # by how much the clocks may seem to differ at first
+UNCERTAIN_NS = 150_000_000  # error of the clock difference in the first seconds
 
 ReadVideo = Callable[[Path], Iterator["Unit"]]
 
@@ -32,11 +32,11 @@ class UnitTimes(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class FilmedFile:
+class VideoFile:
     """A video file of a drive.
 
     name   relative to the directory of the drive
-    times  (since the first frame by the file, capture time), ns: from each of these frames on both run alike
+    times  (file time since the first frame, capture time), ns: from each of these frames on, both advance equally
     """
 
     camera: str
@@ -50,21 +50,21 @@ class FilmedFile:
         return captured + after_ns - after
 
     @property
-    def lies_outside(self) -> bool:
-        """Whether it is not in the directory of its drive, which may come from anywhere."""
+    def is_outside(self) -> bool:
+        """Whether its path leads out of the drive's directory: a drive may come from anyone."""
         return Path(self.name).is_absolute() or ".." in Path(self.name).parts
 
 
-def files(side: Side) -> dict[str, list[FilmedFile]]:
+def files(side: Side) -> dict[str, list[VideoFile]]:
     """By camera, its video files, in the order of their first frames."""
     shifts: dict[str, list[tuple[int, int]]] = {}
     for shift in side.of(VideoShifted):
         shifted = (round(shift.after_s * SECOND_NS), round(shift.captured * SECOND_NS))
         shifts.setdefault(shift.file, []).append(shifted)
-    found: dict[str, list[FilmedFile]] = {}
+    found: dict[str, list[VideoFile]] = {}
     for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
         times = ((0, round(line.captured * SECOND_NS)), *sorted(shifts.get(line.file, [])))
-        found.setdefault(line.camera, []).append(FilmedFile(line.camera, line.file, times))
+        found.setdefault(line.camera, []).append(VideoFile(line.camera, line.file, times))
     return found
 
 
@@ -85,31 +85,31 @@ def _ahead_s(sample: Sample) -> float:
     return 0.0 if sample.clock_bound_ms is None else (sample.clock_ahead_ms or 0.0) / 1000
 
 
-def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], filed: Sequence[int]) -> Iterator[int]:
-    """Capture times of received pictures, by those that were sent alike, ns since 1970.
+def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], file_times: Sequence[int]) -> Iterator[int]:
+    """Capture times of received pictures, ns since 1970, from identical pictures that were sent.
 
-    A receiver's own times are off by what its jitter buffer adds and removes, up to a second after an outage. A picture
-    that was damaged, so that none was sent alike, is as far off as the one before it.
+    A receiver's own times are off by what its jitter buffer adds and removes, up to a second after an outage. A damaged
+    picture, to which no sent one is identical, gets the correction of the one before it.
 
-    sent      by coded picture, when such pictures were captured, increasing
-    pictures  coded pictures as received
-    filed     their capture times by the receiver's file
+    sent        by coded picture, capture times of such pictures, increasing
+    pictures    coded pictures as received
+    file_times  their capture times according to the receiver's file
     """
     off = 0
-    for picture, ns in zip(pictures, filed, strict=True):
-        alike = sent.get(picture)
-        if alike:
-            off = min(alike, key=lambda capture: abs(capture - ns - off)) - ns
+    for picture, ns in zip(pictures, file_times, strict=True):
+        identical = sent.get(picture)
+        if identical:
+            off = min(identical, key=lambda capture: abs(capture - ns - off)) - ns
         yield ns + off
 
 
 def arrivals(captured: Sequence[int], log: Sequence[UnitTimes]) -> list[UnitTimes]:
-    """When pictures arrived, by the log; those that it lacks are left out.
+    """When pictures arrived, according to the log; pictures not in it are left out.
 
     The log's capture times are as uncertain as the difference of the clocks, which may be more than a frame interval in
-    the first seconds; later it changes slowly, so that each picture is searched for near the match of the previous one.
+    the first seconds. After that it changes slowly, so each picture is searched for near the match of the previous one.
 
-    captured  when they were captured, ns since 1970, increasing
+    captured  capture times, ns since 1970, increasing
     """
     known, off, found = [unit.captured for unit in log], 0, []
     for ns in captured:

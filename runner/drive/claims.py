@@ -12,13 +12,13 @@ from runner.drive.checks import ClaimCheck
 from runner.drive.series import FloatSeries, Series, TimeSeries, held, spans
 
 SHORTEST_S = 5.0  # length from which a drive is checked
-STEP_S = 0.1  # at which quantities that hold are sampled
+STEP_S = 0.1  # interval at which step functions are sampled
 DIPS_S = (15.0, 55.0)  # "around 15 and 55 s"
 NEAR_S = 5.0
 SEVERAL_S = 3.0
 DEEP_KBPS = 3300.0  # below it every camera but front center takes a lower factor (Table I)
 SHALLOW_S = (70.0, 90.0)
-NOT_SO_LONG = "the drive is not so long"
+TOO_SHORT = "the drive is not so long"
 RANGE_KBPS = (3000.0, 8000.0)
 SIDES, CENTER = ("front_left", "front_right"), "front_center"
 
@@ -53,7 +53,7 @@ CLAIMS: Mapping[str, Callable[[Series], list[ClaimCheck]]] = {"driving_test": dr
 
 
 def claims(drive: Series) -> list[ClaimCheck]:
-    """The claims named by the drive's experiment; none if it names none."""
+    """The checked claims that the drive's experiment names; empty if it names none."""
     named = str((drive.config.get("experiment") or {}).get("claims"))
     return CLAIMS[named](drive) if named in CLAIMS else []
 
@@ -101,7 +101,7 @@ def _dip(drive: Series, around: float) -> ClaimCheck:
     """Lower factors for several seconds, for all cameras except front center."""
     claim = f"Around {around:.0f} s lower resolutions are selected for all cameras except front center"
     if drive.end < around + NEAR_S:
-        return ClaimCheck(claim, NOT_SO_LONG, None)
+        return ClaimCheck(claim, TOO_SHORT, None)
     low = [span for span in _below(drive, DEEP_KBPS) if abs((span.begin + span.end) / 2 - around) <= NEAR_S]
     if not low:
         return ClaimCheck(claim, f"the total stays above {DEEP_KBPS:.0f} kbit/s there", False)
@@ -116,7 +116,7 @@ def _shallow(drive: Series) -> ClaimCheck:
     begin, end = SHALLOW_S
     claim = f"Between {begin:.0f} and {end:.0f} s less is predicted, and no resolution is changed"
     if drive.end < end - 2:
-        return ClaimCheck(claim, NOT_SO_LONG, None)
+        return ClaimCheck(claim, TOO_SHORT, None)
     at = _times(Span(begin + 2, end - 2))
     inside, elsewhere = held(drive.predicted, at), held(drive.predicted, _times(Span(0, drive.end)))
     less = bool(np.nanmax(inside) < np.nanmedian(elsewhere))
@@ -147,7 +147,7 @@ def _lowest(drive: Series, name: str, span: Span) -> float:
 
 
 def _before(drive: Series, name: str, span: Span) -> float:
-    """The factor that held for most of the drive outside a span."""
+    """The factor in force for most of the drive outside a span."""
     decided = drive.cameras[name].decided
     seconds = spans(decided.t, 0, drive.end) - spans(decided.t, span.begin, span.end)
     factors = {factor: float(seconds[decided.scaling == factor].sum()) for factor in np.unique(decided.scaling)}

@@ -1,4 +1,4 @@
-"""What an export of a drive writes, whatever its format: lines of the logs and pictures, in the order of time."""
+"""The messages of an exported drive, in any format: log lines and pictures, in time order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, FilmedFile, ReadVideo, files
+from runner.drive.captures import SECOND_NS, ReadVideo, VideoFile, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
@@ -17,7 +17,7 @@ from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_
 if TYPE_CHECKING:
     from runner.apply import Unit
 
-TELL_EVERY = 500  # messages between two reports of progress
+REPORT_EVERY = 500  # messages between two reports of progress
 # Topic by kind of line.
 TOPICS = {
     "decision": "/decision",
@@ -33,12 +33,12 @@ POSITION_TOPIC, NOTE_TOPIC = "/position", "/notes"
 
 
 class ExportTarget(Protocol):
-    """Takes the messages of an export. Times are ns since 1970, never falling."""
+    """Receives the messages of an export. Times are ns since 1970, never decreasing."""
 
-    def tell(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
+    def write_line(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
         """A line of a log, with the schema definition that it satisfies."""
 
-    def fix(self, position: Position, ns: int) -> None:
+    def write_position(self, position: Position, ns: int) -> None:
         """A position of the vehicle."""
 
     def note(self, side: str, line: Note, ns: int) -> None:
@@ -70,7 +70,7 @@ def write_all(
 
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called now and then with the share done
+    progress    called every REPORT_EVERY messages with the share done
     check       called after each message
     returns     number of messages
     """
@@ -80,7 +80,7 @@ def write_all(
         message.write()
         check()
         count += 1
-        if count % TELL_EVERY == 0:
+        if count % REPORT_EVERY == 0:
             progress(min(1.0, (message.ns - first) / max(1, last - first)))
     progress(1.0)
     return count
@@ -91,7 +91,7 @@ def _streams(
 ) -> Iterator[Iterator[ExportMessage]]:
     """Messages by source, each in time order."""
     for name, side in drive.sides.items():
-        # If the vehicle did not log, the operator's log has its positions.
+        # Without a log of the vehicle, its positions are in the operator's log.
         yield _lines(name, side, target, positions="vehicle" not in drive.sides)
         for camera, filmed in files(side).items():
             yield _pictures(drive.path, VIDEO_TOPICS[name], camera, filmed, target, read_video, on_warning)
@@ -111,24 +111,24 @@ def _writers(
     """The messages of one line."""
     if isinstance(line, Event):
         event = NAMES[type(line)]
-        yield lambda: target.tell(f"/events/{event}", "event", event, event_to_json(line), ns)
+        yield lambda: target.write_line(f"/events/{event}", "event", event, event_to_json(line), ns)
         if isinstance(line, PositionReported):
-            yield lambda: target.fix(Position.of(line), ns)
+            yield lambda: target.write_position(Position.of(line), ns)
         return
     kind = KINDS[type(line)]
     if isinstance(line, Note):
         yield lambda: target.note(name, line, ns)
     elif kind in TOPICS:
-        yield lambda: target.tell(TOPICS[kind], "drive", kind, line_to_json(line), ns)
+        yield lambda: target.write_line(TOPICS[kind], "drive", kind, line_to_json(line), ns)
     if isinstance(line, Sample) and positions and (position := line.position):
-        yield lambda: target.fix(position, ns)
+        yield lambda: target.write_position(position, ns)
 
 
 def _pictures(
     directory: Path,
     topic: str,
     camera: str,
-    filmed: list[FilmedFile],
+    filmed: list[VideoFile],
     target: ExportTarget,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
@@ -137,12 +137,12 @@ def _pictures(
     topic = topic.format(camera=camera)
     last = -1
     for file in filmed:
-        if file.lies_outside:
-            on_warning(f"{file.name}: lies outside the drive and was left out")
+        if file.is_outside:
+            on_warning(f"{file.name}: is outside the drive's directory and was left out")
             continue
         try:
             for unit in read_video(directory / file.name):
-                # A rebuilt pipeline begins after the previous one has ended, but clocks may be set.
+                # Files of a camera follow each other in time, but clocks may be set back.
                 last = max(file.captured(unit.after_ns), last + 1)
                 yield ExportMessage(last, lambda u=unit, ns=last: target.picture(topic, camera, u, ns))  # type: ignore[misc]
         except RunError as error:

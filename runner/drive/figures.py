@@ -46,9 +46,9 @@ class Curve:
     colour     index of a camera in the palette, or the name of a colour of the style sheet
     dash       index of the dash pattern, which distinguishes curves without colour
     around     lowest and highest of the cameras whose mean is the curve
-    steps      each value holds until the next
+    steps      each value is in force until the next
     filled     down to 0, without a line
-    reasons    of each value, shown on hover
+    reasons    for each value, shown on hover
     """
 
     label: str
@@ -72,14 +72,14 @@ class Bars(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Rows of bars below a chart, on its axis of time; and the text shown if there are none."""
+    """Rows of bars below a chart, on its time axis; and the text shown if there are none."""
 
     bars: tuple[Bars, ...]
     none: str
 
 
 class MapTrack(NamedTuple):
-    """Positions, m, bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) along the way."""
+    """Positions, m, bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) along the track."""
 
     way: tuple[FloatSeries, FloatSeries]
     t: FloatSeries
@@ -122,7 +122,7 @@ class Figure(NamedTuple):
 
 
 def figures(drives: Drives) -> tuple[list[Figure], list[str]]:
-    """Every figure that the drives have the data for, and why others were left out."""
+    """Every figure for which the drives have data, and why others were left out."""
     made, left_out = [], []
     for name, (heading, define) in FIGURES.items():
         rows = define(drives)
@@ -218,7 +218,7 @@ def latency(drives: Drives) -> Rows | str:
     """Latency over time with freezes, and its distribution."""
     seconds = {at: per_second(drive.series) for at, drive in enumerate(drives) if latencies(drive.series)[1].size}
     if not seconds:
-        return "no latency was logged: that takes an operator's log"
+        return "no latency was logged: an operator's log is needed"
     everything = np.concatenate([np.concatenate([each.median, each.p95]) for each in seconds.values()])
     y = _spread("latency in ms", everything[np.isfinite(everything)])
     rows: Rows = []
@@ -249,7 +249,7 @@ def delivered(drives: Drives) -> Rows | str:
     """Measured quality of the pictures that the operator saw."""
     if not any(camera.delivered for drive in drives for camera in drive.cameras.values()):
         return (
-            "quality of delivered pictures was not measured: that takes log.video=true and `tod-runner quality DRIVE`"
+            "quality of delivered pictures was not measured: drive with log.video=true, then `tod-runner quality DRIVE`"
         )
 
     def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
@@ -396,7 +396,7 @@ def _over_time(
 
 
 def _steps(label: str, line: TimeSeries, series: Series, colour: int | str, **more: Any) -> Curve:
-    """A quantity whose values hold until the next, up to the end of the drive."""
+    """A step curve, extended to the end of the drive."""
     t, y = line
     if t.size and t[-1] < series.end:
         t, y = np.append(t, series.end), np.append(y, y[-1])
@@ -446,7 +446,7 @@ def _distribution(drives: Drives, known: Sequence[int]) -> Chart:
             series = drives[at].series
             curves.append(_shares(series.label, latencies(series)[1], number, dash=number, width=1.4))
     arrived = any(to_arrival(drives[at].series) for at in known)
-    everything = np.concatenate([curve.x[:-1] for curve in curves])  # the last thousandth would squeeze all others
+    everything = np.concatenate([curve.x[:-1] for curve in curves])  # the last thousandth would compress all others
     x = _spread(f"latency from capture to {'arrival' if arrived else 'decode'} in ms", everything)
     y = Axis("share of frames", 0.0, 1.01, (0.0, 0.25, 0.5, 0.75, 0.95), percent=True)
     return Chart(title, x, y, tuple(curves), drive=None, part=1, hover="%{x:.0f} ms or less: %{y:.1%} of the frames")
@@ -483,7 +483,7 @@ def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]
 
 
 def _arrows(x: FloatSeries, y: FloatSeries) -> Iterable[tuple[float, float, float]]:
-    """Arrows along the way, at even distances."""
+    """Arrows along the track, at even distances."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     for share in np.arange(1, ARROWS + 1) / (ARROWS + 1) if way[-1] > SMALLEST_TRACK_M else ():
         at = int(np.searchsorted(way, share * way[-1]))

@@ -18,7 +18,7 @@ from runner.drive.document import number, rules, when
 from runner.drive.figures import Chart, Curve, Figure, MapTrack
 from runner.drive.series import FloatSeries, Series
 from runner.drive.statistics import DriveStatistics
-from runner.drive.tables import MEANING, VERDICTS, camera_rows, drive_rows, shown
+from runner.drive.tables import LEGEND, VERDICTS, camera_rows, drive_rows, shown
 from runner.system.files import plotly_script
 
 STATIC = Path(__file__).parent / "static"
@@ -62,7 +62,7 @@ def _in_script(code: str) -> str:
 
 
 def _json(document: Any) -> str:
-    """JSON that may stand inside a script element, whatever text it contains."""
+    """JSON that is safe inside a script element, whatever text it contains."""
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
@@ -86,33 +86,34 @@ def _body(
         held = checks.get(drive.series.label)
         if held:
             rows = [(check.claim, check.outcome, VERDICTS[check.holds]) for check in held]
-            heading = f"Claims of the paper and results{_of(drive, several)}"
+            heading = f"Claims of the paper and results{_suffix(drive, several)}"
             yield _section(heading, _table("Claims", (("claim", "result", "holds"), rows)))
     yield f'<div class="figures{"" if several else " single"}">'
     yield from (_figure(figure) for figure in _shown(figures))
     yield "</div>"
     for drive in drives:
-        yield _section(f"Cameras{_of(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
-    yield f'<p class="muted">{escape(MEANING)}</p>'
-    yield from (_reasons(drive, _of(drive, several)) for drive in drives)
-    versions = _once((each, f"{side}{_of(drive, several)}") for drive in drives for side, each in _versions(drive))
+        yield _section(f"Cameras{_suffix(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
+    yield f'<p class="muted">{escape(LEGEND)}</p>'
+    yield from (_reasons(drive, _suffix(drive, several)) for drive in drives)
+    named = ((each, f"{side}{_suffix(drive, several)}") for drive in drives for side, each in _versions(drive))
+    versions = _grouped(named)
     yield _section("Versions", _list((", ".join(labels), each) for each, labels in versions.items()))
 
 
 def _shown(figures: Sequence[Figure]) -> list[Figure]:
-    """In the order of the page."""
+    """Figures in the order of the page."""
     return sorted(figures, key=lambda figure: ORDER.index(figure.name))
 
 
 def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
     """Notes of the drives, each note once."""
-    noted = _once((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
+    noted = _grouped((each, drive.series.label) for drive in drives for each in (*drive.series.warnings, *drive.notes))
     notes = [note if len(labels) == len(drives) else f"{', '.join(labels)}: {note}" for note, labels in noted.items()]
     items = "".join(f"<li>{escape(each)}</li>" for each in (*notes, *left_out))
     return f'<ul class="warnings" aria-label="Notes">{items}</ul>' if items else ""
 
 
-def _once(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def _grouped(notes: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """Each text once, with the labels of its drives."""
     found: dict[str, list[str]] = {}
     for text, label in notes:
@@ -125,7 +126,7 @@ def _list(facts: Iterable[tuple[str, str]]) -> str:
     return f"<dl>{listed}</dl>"
 
 
-def _of(drive: DriveStatistics, several: bool) -> str:
+def _suffix(drive: DriveStatistics, several: bool) -> str:
     return f": {drive.series.label}" if several else ""
 
 
@@ -134,7 +135,7 @@ def _section(heading: str, content: str) -> str:
 
 
 def _table(caption: str, table: HtmlTable, more: str = "") -> str:
-    """A table that the keyboard can scroll."""
+    """A table that can be scrolled with the keyboard."""
     headings, rows = table
     head = "".join(f'<th scope="col">{escape(each)}</th>' for each in headings)
     body = "".join(

@@ -38,7 +38,7 @@ FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
-# Records of numbers and of the rules' own texts; redacting a decision takes twenty times as long as making it.
+# Records of numbers and the rules' own texts; redacting a decision takes twenty times as long as making it.
 WITHOUT_ADDRESSES = (DecisionMade, LinkSample, ReceptionReported, Telemetry)
 RETRY_S = 1.0  # time between attempts to write to a full disk
 CLOSE_S = 5.0  # a disk that is stuck for longer does not keep the process from ending
@@ -50,8 +50,8 @@ class Log:
     directory  None: nothing is written
     config     the composed configuration; passwords in addresses are removed
     versions   of the software used, by name
-    on_report  called, from a log thread, when the file cannot be written, and when it can again
-    raises     UserError if the directory already holds a drive, or cannot be written
+    on_report  called, from the log's thread, when the file cannot be written, and when it can again
+    raises     UserError if the directory already contains a drive, or cannot be written
 
     Lines wait in a bounded queue for a thread that writes each with one system call, so that a killed process loses at
     most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them.
@@ -70,9 +70,9 @@ class Log:
         self._side, self._config, self._versions, self._on_report = side, config, versions, on_report
         self._lock = threading.Lock()
         self._began: float | None = None
-        self._past: float | None = None  # for a past drive, the time of its last line
+        self._past: float | None = None  # for a past drive, time of its last line
         self.time = 0.0  # of the start, s since 1970
-        self._early: list[Json] = []
+        self._before_begin: list[Json] = []
         self._writer: _Writer | None = None
 
     def begin(self, at: float | None = None) -> None:
@@ -87,7 +87,7 @@ class Log:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
             if self._file and at is None:
                 self._writer = _Writer(self._file, self._dropped, self._on_report)
-            for line in (line_to_json(first), *self._early):
+            for line in (line_to_json(first), *self._before_begin):
                 self._put(line)
 
     def now(self) -> float:
@@ -109,13 +109,13 @@ class Log:
         self._write(line if isinstance(record, WITHOUT_ADDRESSES) else redacted(line))
 
     def note(self, text: str) -> None:
-        """Write a note for the user, at the current time."""
+        """Write a note for the user, with the current time."""
         self.record(Note(self.now(), text))
 
     def _write(self, line: Json) -> None:
         with self._lock:
             if self._began is None:
-                self._early.append(line)
+                self._before_begin.append(line)
                 return
             if self._past is not None:
                 self._past = line["t"]
@@ -160,7 +160,7 @@ class Log:
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:
-    # Half of a surrogate pair, as a request or a file's name may contain, is written as a JSON escape.
+    # Lone surrogates, which a request or a file name may contain, are written as JSON escapes.
     return (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
 
 
@@ -228,11 +228,11 @@ class _Writer:
 
     def _run(self) -> None:
         while (data := self._queue.get()) is not None:
-            if not self._written(data):
+            if not self._write(data):
                 break
         self._file.close(keep=True)
 
-    def _written(self, data: bytes) -> bool:
+    def _write(self, data: bytes) -> bool:
         """Write a line, with retries; False if the log is closed before it is written."""
         why = self._file.append(data)
         if why is None:
@@ -250,7 +250,7 @@ def check_free(directory: Path, side: str) -> None:
     path = directory / FILES[side]
     try:
         if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
-            raise _refused(directory, f"holds a drive already ({FILES[side]}), choose another directory")
+            raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")
     except OSError as error:
         raise _refused(directory, (error.strerror or str(error)).lower()) from None
 

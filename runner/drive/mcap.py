@@ -32,7 +32,7 @@ def write_mcap(
     file        receives the bytes
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called now and then with the share done
+    progress    called every few hundred messages with the share done
     returns     number of messages
     raises      RunError if the file cannot be written
     """
@@ -51,7 +51,7 @@ def write_mcap(
 
 
 class _Out:
-    """The file as the writer sees it, which never fails: `check` raises the error where it can be handled."""
+    """The file as the writer sees it: it never fails, and `check` raises the error where it can be handled."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -87,13 +87,13 @@ class _Channels:
         self._context, self._cameras = context, list(cameras)
         self._made: dict[str, Any] = {}
 
-    def tell(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
+    def write_line(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
         """Write a line of JSON, with the schema definition that it satisfies."""
         if topic not in self._made:
             self._made[topic] = self._json_channel(topic, schema, definition)
         self._made[topic].log(json.dumps(line, ensure_ascii=False).encode(), log_time=ns)
 
-    def fix(self, position: Position, ns: int) -> None:
+    def write_position(self, position: Position, ns: int) -> None:
         from foxglove.channels import LocationFixChannel
         from foxglove.messages import LocationFix, Vector3
 
@@ -159,7 +159,7 @@ def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
 
 
 def _texts(began: Json) -> dict[str, str]:
-    """Metadata holds texts only."""
+    """Metadata, whose values must be texts."""
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in began.items()}
 
 

@@ -16,9 +16,9 @@ def find_models(
     """The available models.
 
     config     of the drive; a camera may name its model as `rate_quality.model`
-    directory  in which models are looked up by the name of their camera, or by the name in the configuration; or None
-    bases      directories in which a model named by the configuration is looked up, first match wins
-    returns    by camera; and a line about the cameras without one
+    directory  where models are looked up by the name of their camera, or by the name in the configuration; or None
+    bases      directories where a model named by the configuration is looked up, first match wins
+    returns    models by camera, and a line about the cameras without one
     raises     UserError if the directory does not exist, or a file is not a model
     """
     if directory is not None and not directory.is_dir():

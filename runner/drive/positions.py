@@ -1,4 +1,4 @@
-"""Positions of a drive from a bag that was recorded meanwhile, in place of those in its log."""
+"""Positions of a drive from a bag recorded at the same time, which replace those in its log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ARGUMENTS = ("positions", "topic")  # of the command line
 
 @dataclass(frozen=True, slots=True)
 class RecordedPositions:
-    """The positions of a bag, in the order of time.
+    """The positions of a bag, in time order.
 
     where  file and topic, for messages
     """
@@ -30,36 +30,36 @@ class RecordedPositions:
 
     @property
     def span(self) -> str:
-        return spanned(self.fixes[0].ns / SECOND_NS, self.fixes[-1].ns / SECOND_NS)
+        return time_span(self.fixes[0].ns / SECOND_NS, self.fixes[-1].ns / SECOND_NS)
 
     def since(self, began_s: float) -> Iterator[PositionReported]:
-        """As events of a drive that began then, s since 1970; those before are left out."""
+        """The positions as events of a drive that began at `began_s`, s since 1970; earlier ones are left out."""
         for fix in self.fixes:
             t = (fix.ns - round(began_s * SECOND_NS)) / SECOND_NS
             if t >= 0:
                 yield PositionReported(t=t, lat=fix.lat, lon=fix.lon)
 
-    def refuse(self, drive: str) -> UserError:
-        """The error that no position falls into a drive, which is described with its times."""
+    def no_overlap(self, drive: str) -> UserError:
+        """The error that no position falls into a drive; `drive` describes it with its times."""
         rule = f"no position falls into {drive}; both must have been recorded by the same clock"
         return UserError("command line", ARGUMENTS[0], f"{self.where}: {self.span}", rule)
 
 
-def spanned(began_s: float, ended_s: float) -> str:
+def time_span(began_s: float, ended_s: float) -> str:
     """A span of time, s since 1970, as text."""
     began, ended = (datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds") for at in (began_s, ended_s))
     return f"{began.removesuffix('+00:00')} to {ended.removesuffix('+00:00')} UTC"
 
 
 def reader(values: Mapping[str, str]) -> Callable[[Path], Drive]:
-    """What reads the drives of a command: with the positions that its arguments name, otherwise as they were logged.
+    """The function that reads a command's drives: with the positions that its arguments name, otherwise as logged.
 
     raises  UserError
     """
     if values.keys().isdisjoint(ARGUMENTS):
         return read_drive
     recorded = given_positions(values)
-    return lambda path: positioned(read_drive(path), recorded)
+    return lambda path: with_positions(read_drive(path), recorded)
 
 
 def given_positions(values: Mapping[str, str]) -> RecordedPositions:
@@ -82,7 +82,7 @@ def given_positions(values: Mapping[str, str]) -> RecordedPositions:
     return RecordedPositions(where, fixes)
 
 
-def positioned(drive: Drive, recorded: RecordedPositions) -> Drive:
+def with_positions(drive: Drive, recorded: RecordedPositions) -> Drive:
     """A drive with the positions of a bag in place of its own.
 
     raises  UserError if no position falls into it
@@ -92,7 +92,7 @@ def positioned(drive: Drive, recorded: RecordedPositions) -> Drive:
     end = max((line.t for line in side.lines), default=0.0)
     new = [event for event in recorded.since(side.began_s) if event.t <= end]
     if not new:
-        raise recorded.refuse(f"{drive.path}: {spanned(side.began_s, side.began_s + end)}")
+        raise recorded.no_overlap(f"{drive.path}: {time_span(side.began_s, side.began_s + end)}")
     kept = [line for line in side.lines if not isinstance(line, PositionReported)]
     lines = list(merge(kept, new, key=lambda line: line.t))
     return replace(drive, sides={**drive.sides, name: replace(side, lines=lines)})

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 
-mpl.use("Agg")  # no screen
+mpl.use("Agg")  # works without a display
 
 import numpy as np
 from matplotlib.colors import ListedColormap
@@ -60,15 +60,15 @@ STYLE: dict[Any, Any] = {
     "legend.columnspacing": 1.0,
     "legend.handletextpad": 0.5,
     "legend.borderaxespad": 0.0,
-    "text.parse_math": False,  # a drive's name may hold any character
+    "text.parse_math": False,  # a drive's name may contain any character
     "pdf.fonttype": 42,  # fonts as text, as journals require
     "savefig.dpi": 300,
 }
-CHART_IN, LINE_IN = 1.15, 0.115  # height of a chart without its surroundings, and of a line of text
+CHART_IN, LINE_IN = 1.15, 0.115  # height of a chart without its labels, and of a line of text
 LEGEND_IN = 0.38  # under the panel: below the numbers and label of the axis
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.2)), (0, (1.4, 0.9)), (0, (5, 1, 1.2, 1)))
-SEEN = 0.006  # of the axis: the smallest visible width of a freeze
-LETTERS = 70  # that fit into a legend line of column width
+MIN_VISIBLE = 0.006  # of the axis: the smallest visible width of a freeze
+LINE_CHARACTERS = 70  # that fit into a legend line of column width
 
 
 def write_figures(figures: Sequence[Figure], directory: Path, progress: Progress) -> None:
@@ -78,7 +78,7 @@ def write_figures(figures: Sequence[Figure], directory: Path, progress: Progress
     """
     for number, figure in enumerate(figures):
         progress("figures", number / len(figures))
-        sheet = drawn(figure)
+        sheet = draw_sheet(figure)
         for form in FORMATS:
             write_whole(directory / f"{figure.name}.{form}", _rendered(sheet, form))
             sheet.set_layout_engine("none")  # already laid out for the first format
@@ -94,7 +94,7 @@ def _rendered(sheet: Sheet, form: str) -> bytes:
 
 
 @mpl.rc_context(STYLE)
-def drawn(figure: Figure) -> Sheet:
+def draw_sheet(figure: Figure) -> Sheet:
     """Rows of charts on a sheet; those with the same x axis and legend show both once, below the last."""
     rows, columns = figure.rows, max(map(len, figure.rows))
     last = [below is None or _below(row) != _below(below) for row, below in zip_longest(rows, rows[1:])]
@@ -175,7 +175,7 @@ def _draw_curve(axes: Axes, curve: Curve) -> None:
 
 def _draw_strip(axes: Axes, strip: Strip, x: Axis) -> None:
     """A row for each camera that froze."""
-    least = SEEN * (x.high - x.low)
+    least = MIN_VISIBLE * (x.high - x.low)
     for row, bars in enumerate(strip.bars):
         shown = [(t, max(s, least)) for t, s in bars.spans]
         axes.broken_barh(shown, (row - 0.4, 0.8), color=_colour(bars.colour), lw=0)
@@ -219,7 +219,7 @@ def _draw_track(axes: Axes, track: MapTrack) -> None:
 def _across(labels: Iterable[str], columns: int) -> int:
     """Number of labels that fit side by side."""
     longest = max((len(label) for label in labels), default=1)
-    return max(1, min(4, LETTERS // columns // (min(longest, LETTERS // columns) + 5)))
+    return max(1, min(4, LINE_CHARACTERS // columns // (min(longest, LINE_CHARACTERS // columns) + 5)))
 
 
 def _lines(row: Sequence[Chart], columns: int) -> int:
@@ -230,7 +230,7 @@ def _lines(row: Sequence[Chart], columns: int) -> int:
 
 
 def _wrapped(label: str, columns: int) -> str:
-    return fill(label, LETTERS // columns - 9)
+    return fill(label, LINE_CHARACTERS // columns - 9)
 
 
 def _legend(axes: Axes, curves: Iterable[Curve], columns: int) -> None:

@@ -1,4 +1,4 @@
-"""The file that the verb `quality` leaves beside a drive's logs: quality of the pictures that the operator saw."""
+"""The file that the verb `quality` writes next to a drive's logs: quality of the pictures that the operator saw."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ DOCUMENT = "quality.json"
 
 @dataclass(frozen=True, slots=True)
 class DeliveredQuality:
-    """Of one camera.
+    """Delivered quality of one camera.
 
     t      moments, s since the vehicle's side began
-    mssim  of each: the picture on show against the scene
-    stale  share of the moments at which an older picture stood for the one due
+    mssim  at each moment, the displayed picture against the scene
+    stale  share of the moments at which an older picture was displayed
     clip   whether the scene was known; otherwise it is the stream as sent
     """
 
@@ -47,9 +47,9 @@ def to_json(found: Mapping[str, DeliveredQuality]) -> dict[str, Any]:
 
 
 def read_quality(directory: Path) -> dict[str, DeliveredQuality]:
-    """What was measured of a drive, by camera; empty if nothing was.
+    """The measured quality of a drive, by camera; empty if none was measured.
 
-    raises  UserError for a file that the verb has not written
+    raises  UserError for a file that is not as the verb writes it
     """
     path = directory / DOCUMENT
     try:

@@ -30,9 +30,9 @@ from runner.system.clocks import KEPT_S
 
 T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
-# Of a vehicle's log, the lines that are neither an event nor a reception report, nor the first.
+# Kinds of lines in a vehicle's log, except events, reception reports and the first line.
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "dropped", "ended")
-LONGEST_LINE = 1 << 24  # characters; the longest, the configuration of a drive, is a thousandth of it
+LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class Side:
 
     @cached_property
     def began_s(self) -> float:
-        """Its beginning, s since 1970 by the vehicle's clock; by its own where their difference was not measured."""
+        """Its start, s since 1970 by the vehicle's clock; by its own if the clock difference was not measured."""
         measured = [(s.t, s.clock_ahead_ms or 0.0) for s in self.of(Sample) if s.clock_bound_ms is not None]
-        # Its own `t` does not follow a clock that is set later.
+        # `t` does not follow a clock that is set later.
         ahead_ms = [ahead_ms for t, ahead_ms in measured if t - measured[0][0] <= KEPT_S]
         return self.began.time + (median(ahead_ms) / 1000 if ahead_ms else 0.0)
 
@@ -80,7 +80,7 @@ class Drive:
 def read_drive(directory: Path) -> Drive:
     """Everything in the directory of a drive.
 
-    raises  UserError with file and line of the first mistake
+    raises  UserError with file and line of the first error
     """
     where = str(directory)
     if not directory.is_dir():
@@ -130,7 +130,7 @@ def check_began(line: Json | None, name: str) -> Began:
 
 
 def text_lines(file: TextIO) -> Iterator[str]:
-    """The lines of a file; one longer than any of a drive is cut, so that a file without line ends is not loaded."""
+    """The lines of a file; overlong ones are cut, so that a file without line ends is not loaded into memory."""
     return iter(partial(file.readline, LONGEST_LINE + 1), "")
 
 
@@ -143,7 +143,7 @@ def read_lines(
 
     An incomplete last line of a drive, left by a killed process, is skipped with a warning.
 
-    raises  UserError with the number of the first line that is wrong
+    raises  UserError with the number of the first invalid line
     """
     drive = False
     for number, text in enumerate(lines, 1):
@@ -175,5 +175,5 @@ def read_line(text: str) -> tuple[Json, str | None]:
 
 
 def is_log(line: Any) -> bool:
-    """Whether a line is a record of a side, not an event."""
+    """Whether a line is a record of a side rather than an event."""
     return isinstance(line, dict) and "log" in line and "event" not in line

@@ -38,7 +38,7 @@ def write_rosbag2(
     path        of the directory, which does not exist yet
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called now and then with the share done
+    progress    called every few hundred messages with the share done
     returns     number of messages
     raises      RunError if the bag cannot be written
     """
@@ -46,7 +46,7 @@ def write_rosbag2(
 
     _check_names(cameras_of(drive))
     try:
-        # Older distributions of ROS 2 refuse newer versions of the metadata.
+        # Older ROS 2 distributions reject newer versions of the metadata.
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
             for name, side in drive.sides.items():
                 writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
@@ -65,13 +65,13 @@ class _Topics:
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._made: dict[str, Any] = {}
 
-    def tell(self, topic: str, _schema: str, _definition: str, line: Json, ns: int) -> None:
+    def write_line(self, topic: str, _schema: str, _definition: str, line: Json, ns: int) -> None:
         self._write(topic, TEXT, ns, data=json.dumps(line, ensure_ascii=False))
 
     def note(self, _side: str, line: Note, ns: int) -> None:
         self._write(NOTE_TOPIC, TEXT, ns, data=json.dumps(line_to_json(line), ensure_ascii=False))
 
-    def fix(self, position: Position, ns: int) -> None:
+    def write_position(self, position: Position, ns: int) -> None:
         types: Any = self._store.types
         self._write(
             POSITION_TOPIC,

@@ -39,7 +39,7 @@ Flags = NDArray[np.bool_]
 T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of sent video are measured over at least this long, as the operator's are
-DOWN_DEG = 20.0  # a camera that is pitched further down looks at the surroundings, not along the road
+DOWN_DEG = 20.0  # a camera pitched further down looks at the surroundings, not along the road
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
 
@@ -70,7 +70,7 @@ class DecidedSeries:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedSeries:
-    """What the operator received from one camera. Counters continue where the log's own restarted from 0.
+    """What the operator received from one camera. Counters continue where those in the log restarted from 0.
 
     t                        s, of each sample
     kbps                     over the second before
@@ -171,7 +171,7 @@ class Series:
     began      s since 1970 at t = 0
     end        s; the last line of the side that gives the axis
     measured   "received" or "sent": what `actual` is; "" if neither was logged
-    predicted, allocated  each value holds until the next
+    predicted, allocated  step functions: each value is in force until the next
     modes      (from s, mode)
     notes      (s, text)
     refused    number of requests
@@ -208,32 +208,32 @@ def series(drive: Drive, label: str = "") -> Series:
     """A drive's quantities over time.
 
     label   its name among others; "": the drive's own name
-    raises  UserError if only the first line was logged, or nothing was decided yet
+    raises  UserError if only the first line or no decision was logged
     """
     return _series(drive, label or drive.name)
 
 
 def held(line: TimeSeries, at: FloatSeries) -> FloatSeries:
-    """Values in force at some times, of a quantity whose values hold until the next; nan before the first."""
+    """Values of a step function at some times; nan before the first value."""
     index = np.searchsorted(line.t, at, "right") - 1
     return np.where(index >= 0, line.y[np.maximum(index, 0)], np.nan) if line.t.size else np.full(at.shape, np.nan)
 
 
 def spans(t: FloatSeries, begin: float, end: float) -> FloatSeries:
-    """How long each entry of a series whose values hold until the next is in force within [begin, end], s."""
+    """How long each value of a step function is in force within [begin, end], s."""
     edges = np.clip(np.append(t, end), begin, end)
     return np.asarray(np.diff(edges))
 
 
 def mean_held(line: TimeSeries, begin: float, end: float) -> float:
-    """Mean over time of a quantity whose values hold until the next; nan if none is known."""
+    """Mean of a step function over time; nan if no value is known."""
     weights = spans(line.t, begin, end)
     known = np.isfinite(line.y) & (weights > 0)
     return float(np.average(line.y[known], weights=weights[known])) if known.any() else float("nan")
 
 
 def sending_spans(decided: DecidedSeries, end: float) -> list[tuple[float, float]]:
-    """When a camera was to be sent: [(from s, to s), ...]."""
+    """When a camera should have been sending: [(from s, to s), ...]."""
     found: list[tuple[float, float]] = []
     for (start, until), sending in zip(pairwise([*decided.t, end]), decided.sending, strict=True):
         if not sending or until <= start:
@@ -346,9 +346,9 @@ def _link(lines: Sequence[Any]) -> LinkSeries | None:
 
 
 def _positions(leading: _Shifted, samples: Sequence[Any]) -> Positions | None:
-    """As the vehicle received them, otherwise as the operator received them; None if there are none.
+    """Positions as the vehicle received them, otherwise as the operator did; None if there are none.
 
-    Metres by equirectangular projection around the first place, accurate for some km.
+    Metres by equirectangular projection around the first position, accurate within a few km.
     """
     known: list[tuple[float, PositionReported | Position]] = [*leading.of(PositionReported)]
     known = known or [(t, sample.position) for t, sample in samples if sample.position]
@@ -420,8 +420,8 @@ def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> Receive
     def column(key: str) -> FloatSeries:
         return np.array([getattr(camera, key) for *_, camera in received], dtype=float)
 
-    came = [(at + t - line.t, ms) for t, line, camera in received for at, ms in camera.arrivals]
-    arrivals = np.array(came, dtype=float).reshape(-1, 2)
+    pairs = [(at + t - line.t, ms) for t, line, camera in received for at, ms in camera.arrivals]
+    arrivals = np.array(pairs, dtype=float).reshape(-1, 2)
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
@@ -441,7 +441,7 @@ def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> Receive
 
 
 def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, CameraSeries]:
-    """Without negative latencies; in older logs without those around them: all cameras of a vehicle share its clock."""
+    """Remove negative latencies; in older logs also those around them, for all cameras, which share one clock."""
     received = {name: camera.received for name, camera in cameras.items() if camera.received}
     compared = _compared(received.values())
     ahead = [got.arrival_t[got.clocks_ms < CLOCKS_APART_MS] for got in received.values()]
@@ -478,8 +478,8 @@ def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:
 
 def _settled(t: FloatSeries, kbps: FloatSeries, frames: FloatSeries) -> FloatSeries:
     """A rate that is nan until its window has filled with video twice: the first includes the backlog."""
-    came = t[frames > 0]
-    return np.where(t >= (came[0] if came.size else np.inf) + 2 * RATE_WINDOW_S, kbps, np.nan)
+    receiving = t[frames > 0]
+    return np.where(t >= (receiving[0] if receiving.size else np.inf) + 2 * RATE_WINDOW_S, kbps, np.nan)
 
 
 def counted(counter: FloatSeries) -> FloatSeries:
@@ -503,7 +503,7 @@ def rate(t: FloatSeries, sizes: FloatSeries) -> FloatSeries:
 
 
 def panels(cameras: Mapping[str, Any]) -> tuple[Panel, ...]:
-    """Which cameras share a panel: those that look along the road, and those pitched down at the surroundings.
+    """Split cameras into panels: those that look along the road, and those pitched down at the surroundings.
 
     cameras  the configuration's, with `pose` and `place` if they are mounted
     returns  one or two panels, cameras in the configuration's order

@@ -84,8 +84,8 @@ class Model:
 class Estimate:
     """Estimated quality of one camera over time, of each picture compared with the scene that it shows.
 
-    While a picture is frozen it keeps the quality it had. Its difference from the scene as it has become is not
-    included: that would require the pictures. So `mean` is an upper bound, reached if nothing moves, and says little
+    While a picture is frozen it keeps the quality it had. Its growing difference from the scene is not
+    included: that would require the pictures. So `mean` is an upper bound, reached if nothing moves, and means little
     without the share of the time in which pictures were frozen (`CameraStatistics.frozen`).
 
     line     in units of the metric; nan while nothing was shown, the rate is unknown or the factor was not measured
@@ -109,7 +109,7 @@ class Estimate:
 class CameraStatistics:
     """One camera over a drive.
 
-    sending_s         time during which it was to be sent, s
+    sending_s         time during which it should have been sending, s
     kbps, allocated   means, kbit/s; share: the first over the second
     factors           share of the time by factor, 0 for off or paused
     sizes             share of the time by size of the picture, px
@@ -119,7 +119,7 @@ class CameraStatistics:
     lost, rebuilt     packets, pipelines; None if no operator logged
     damaged           share of the frames whose picture shows a loss; nan if unknown
     quality           None without a rate-quality model
-    delivered         measured on the pictures; None if they were not
+    delivered         measured on the pictures; None if it was not measured
     """
 
     name: str
@@ -203,8 +203,8 @@ def statistics(
         share=ratio(kbps, allocated),
         predicted_min=float(known.min()) if known.size else NAN,
         predicted_max=float(known.max()) if known.size else NAN,
-        arrival=latency(together(got.arrival_ms for got in received), clock_bound),
-        decode=latency(together(got.latency_ms for got in received), clock_bound),
+        arrival=latency(concatenated(got.arrival_ms for got in received), clock_bound),
+        decode=latency(concatenated(got.latency_ms for got in received), clock_bound),
         freezes=len(frozen) if watched else None,
         frozen_s=sum(freeze.seconds for freeze in frozen) if watched else None,
         frozen=ratio(sum(freeze.seconds for freeze in frozen), sum(c.sending_s for c in each if c.freezes is not None)),
@@ -265,15 +265,15 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
     if drive.positions is None:
         yield "no positions were logged: not drawn on the map"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
-    frozen = ", ".join(f"{name} {_part(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
+    frozen = ", ".join(f"{name} {_percentage(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
     if frozen:
-        rule = "a frozen picture counts as its last frame, whatever moves meanwhile: an upper bound"
+        rule = "a frozen picture counts as its last frame, whatever moves in the scene: an upper bound"
         yield f"estimated quality: {rule}; frozen {frozen} of the time"
     unseen = [name for name, camera in cameras.items() if camera.delivered and not camera.delivered.clip]
     if unseen:
         names = ", ".join(unseen)
         yield f"quality delivered: {names} compared with the stream as sent: what the encoder lost is not included"
-    clamped = ", ".join(f"{name} {_part(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
+    clamped = ", ".join(f"{name} {_percentage(q.clamped)}" for name, q in estimated.items() if q.clamped > 0)
     if clamped:
         yield f"estimated quality: bitrates outside the measured range, the nearest one used: {clamped} of the time"
     for name, quality in estimated.items():
@@ -284,7 +284,7 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
         yield "the rate-quality models of the cameras use different metrics: no quality of the whole drive"
 
 
-def _part(share: float) -> str:
+def _percentage(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else "<1%"
 
 
@@ -309,10 +309,10 @@ def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> li
         gap >= max(3 * mean, mean + 150 ms)      mean: of the last 30 gaps before it    (W3C webrtc-stats, freezeCount)
 
     arrivals  s, increasing: arrival of each access unit; they replace the rendered frames that the definition counts
-    sending   when the camera was to be sent; gaps do not span the pauses between, and the mean starts anew
+    sending   when the camera should have been sending; gaps do not span pauses, after which the mean starts again
     returns   the whole gap of each, as in totalFreezesDuration
 
-    The definition counts a freeze when the next frame arrives. A stream that stops for good while it is to be sent is
+    The definition counts a freeze when the next frame arrives. A stream that stops for good while it should be sent is
     counted too, up to the end of the span, and one that never begins: otherwise the worst case would look perfect.
     """
     found = []
@@ -351,7 +351,7 @@ def latencies(drive: Series, camera: str | None = None) -> tuple[FloatSeries, Fl
         times, values = ([got.arrival_t for got in received], [got.arrival_ms for got in received])
     else:
         times, values = ([got.t for got in received], [got.latency_ms for got in received])
-    t, ms = together(times), together(values)
+    t, ms = concatenated(times), concatenated(values)
     known = np.isfinite(ms) & (t >= 0)
     return t[known], ms[known]
 
@@ -362,7 +362,7 @@ def to_arrival(drive: Series) -> bool:
     return any(got is not None and bool(np.isfinite(got.arrival_ms).any()) for got in received)
 
 
-def together(values: Iterable[FloatSeries]) -> FloatSeries:
+def concatenated(values: Iterable[FloatSeries]) -> FloatSeries:
     return np.concatenate([np.empty(0), *values])
 
 
@@ -431,16 +431,16 @@ def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] 
         outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
     moving = np.ones(t.shape, dtype=bool)
     for freeze in frozen_spans:
-        _hold(quality, moving, t, freeze)
+        _hold_quality(quality, moving, t, freeze)
     known = np.isfinite(quality) & moving
     clamped = ratio(int((outside & known).sum()), int(known.sum()))
     return Estimate(model.metric, TimeSeries(t, quality), mean(quality[moving]), clamped, tuple(unknown))
 
 
-def _hold(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:
-    """Let a frozen picture keep the quality it had; if there was none before, there is none.
+def _hold_quality(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:
+    """Let a frozen picture keep the quality it had, if any.
 
-    Rates cover a second: for that long after a freeze they include part of it, or a backlog that had built up.
+    Rates cover a second: for a second after a freeze they include part of it, or a backlog that had built up.
     """
     end = freeze.t + freeze.seconds
     during = (t > freeze.t) & (t <= end)

@@ -10,13 +10,13 @@ from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
 TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
 NOTHING = "-"
-MEANING = (
+LEGEND = (
     "Arrival and decode: latency since capture; ±: error bound of the comparison of both clocks."
     " Share: kbit/s over allocated. Freezes as W3C webrtc-stats counts them: gaps of 3 times the mean of the last 30,"
     " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
     " Quality is estimated from the bitrate: a frozen picture keeps its last estimate, so read it together with the"
-    " share of time frozen. Delivered: MSSIM of the picture on show, twice a second, against the scene at that time;"
-    " of sources that are not rendered, against the stream as sent."
+    " share of time frozen. Delivered: MSSIM of the displayed picture, twice a second, against the scene at that time;"
+    " for sources that are not rendered, against the stream as sent."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 
@@ -61,7 +61,7 @@ def _camera(camera: CameraStatistics) -> TableRow:
         shown(camera.allocated),
         percent(camera.share),
         "\n".join(f"{f:g}: {share:.0%}" if f else f"off: {share:.0%}" for f, share in camera.factors.items()),
-        "\n".join(f"{width}x{height}" for width, height in sorted(longest)) or NOTHING,  # increasing, as factors are
+        "\n".join(f"{width}x{height}" for width, height in sorted(longest)) or NOTHING,  # increasing, like the factors
         _latency(camera.arrival),
         _latency(camera.decode),
         counted(len(frozen) if known else None),

@@ -1,1 +1,1 @@
-"""Figures of a running side, served if the configuration names a port."""
+"""Metrics of a running side, served if the configuration names a port."""

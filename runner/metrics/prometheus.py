@@ -1,6 +1,6 @@
-"""Figures of a running side for Prometheus, and its health, over HTTP on loopback.
+"""Metrics of a running side for Prometheus, and its health, over HTTP on loopback.
 
-/metrics  the newest figures, in Prometheus's text format
+/metrics  the newest values, in Prometheus's text format
 /health   200 while the side works; 503 with the reason otherwise
 """
 
@@ -39,14 +39,14 @@ def _ms(value: float | None) -> float | None:
     return None if value is None else value / 1000
 
 
-# By record, those of the whole vehicle, and those of each camera. A name that ends in _total is a counter.
-FIGURES: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
+# By record, metrics of the whole vehicle, and of each camera. A name that ends in _total is a counter.
+METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
         (
             _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: s.total_kbps),
             _Metric(
                 "asked_kbps",
-                "Total that prediction or operator gives",
+                "Total given by prediction or operator",
                 lambda s: s.asked_kbps,
             ),
             _Metric("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
@@ -54,7 +54,7 @@ FIGURES: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
         (
             _Metric("camera_decided_kbps", "Bitrate of the encoder", lambda c: c.kbps),
             _Metric("camera_scaling", "Scaling factor", lambda c: c.scaling),
-            _Metric("camera_sending", "1 while the camera is to be sent", lambda c: c.sending),
+            _Metric("camera_sending", "1 while the camera should be sent", lambda c: c.sending),
             _Metric("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
         ),
     ),
@@ -107,32 +107,32 @@ class Metrics(Collector):
         self._online: bool | None = None
 
     def take(self, record: Any) -> None:
-        """Keep a record, if any figure is made of it."""
-        if type(record) in FIGURES:
+        """Keep a record if it has metrics."""
+        if type(record) in METRICS:
             self._newest[type(record)] = record
 
     def show_online(self, online: bool) -> None:
         """Whether the vehicle is online, as the operator's side sees it."""
         self._online = online
-        if not online:  # figures of a vehicle that is not heard would look as if it drove on
+        if not online:  # stale metrics would look as if the vehicle were still driving
             self._newest.pop(VehicleState, None)
 
     def collect(self) -> Iterator[Metric]:
         if self._online is not None:
-            yield self._family("vehicle_online", "1 while the vehicle is heard", [((), float(self._online))])
+            yield self._family("vehicle_online", "1 while the vehicle is online", [((), float(self._online))])
         for kind, record in list(self._newest.items()):
-            of_all, of_camera = FIGURES[kind]
-            for wanted in of_all:
-                yield from self._values(wanted, {(): record}, ())
-            for wanted in of_camera:
-                yield from self._values(wanted, {(name,): each for name, each in record.cameras.items()}, ("camera",))
+            of_all, of_camera = METRICS[kind]
+            for metric in of_all:
+                yield from self._values(metric, {(): record}, ())
+            for metric in of_camera:
+                yield from self._values(metric, {(name,): each for name, each in record.cameras.items()}, ("camera",))
 
     def _values(
-        self, wanted: _Metric, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
+        self, metric: _Metric, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
     ) -> Iterator[Metric]:
-        values = [(own, float(value)) for own, each in records.items() if (value := wanted.value(each)) is not None]
+        values = [(own, float(value)) for own, each in records.items() if (value := metric.value(each)) is not None]
         if values:
-            yield self._family(wanted.name, wanted.help, values, labels)
+            yield self._family(metric.name, metric.help, values, labels)
 
     def _family(
         self, name: str, text: str, values: Iterable[tuple[tuple[str, ...], float]], labels: tuple[str, ...] = ()

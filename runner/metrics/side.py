@@ -1,4 +1,4 @@
-"""The metrics of a running side, and nothing at all where the configuration names no port."""
+"""The metrics of a running side, or nothing if the configuration names no port."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class SideMetrics:
-    """Takes a side's records, and serves metrics of them. From any thread.
+    """Takes a side's records and serves their metrics. May be used from any thread.
 
     metrics, port  None: nothing is served, and records are ignored
     """

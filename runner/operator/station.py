@@ -331,7 +331,7 @@ class Station:
 
     def _latency_ms(self, readings: Iterable[tuple[float, float]], now: float) -> float | None:
         """The newest that is right; without the control link, which tells of clocks that were set, just the newest."""
-        silent = now - self._clocks.asked > CURRENT_S
+        silent = now - self._clocks.last_sent > CURRENT_S
         recent = [(at, apart_ms) for at, apart_ms in readings if now - at <= CURRENT_S]
         for at, apart_ms in reversed(recent):
             latency_ms = latency(apart_ms, self.clock)
@@ -347,7 +347,7 @@ class Station:
 
     def _was_set(self) -> bool:
         """Whether this machine's clock was set, or the vehicle's was set back, and no exchange has followed."""
-        set_back = self._clocks.asked < self._set_back and self._set_back > time.monotonic() - CURRENT_S
+        set_back = self._clocks.last_sent < self._set_back and self._set_back > time.monotonic() - CURRENT_S
         return set_back or abs(wall_ahead_s() - self._wall_ahead_s) > STEP_S + MOST_DRIFT * KEPT_S
 
     def _sample(self) -> Sample:

@@ -2,7 +2,7 @@
 
 The paper reads its predictions from a pre-recorded bandwidth map by GPS position (section V). No clock, no threads,
 no log here: time comes from the events, and a file is read only while a source is built. Rates are kbit/s.
-NumPy is loaded with the first file: a vehicle that gets predictions and positions live does without it.
+NumPy is loaded with the first file: a vehicle that receives predictions and positions live does not need it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Pqos(Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Suspicious findings about map or positions, for the caller to log; may appear while running."""
+        """Suspicious findings about map or positions, for the caller to log; more may appear while running."""
 
     def observe(self, event: Event) -> BitratePredicted | None:
         """The prediction that follows from this event, stamped with the event's own t; None: nothing new."""
 
 
 class TimedPqos:
-    """Predicts from the time alone: when the value changes, and again every `period_s` so that it does not go stale."""
+    """Predicts by time alone: when the value changes, and again every `period_s` so that it does not go stale."""
 
     warnings: tuple[str, ...] = ()
 
@@ -61,10 +61,10 @@ class LivePqos:
 
 
 class WrongPqos:
-    """Makes the predictions of a source wrong, for experiments.
+    """Distorts the predictions of a source, for experiments.
 
     share   factor applied to the rate
-    late_s  every prediction comes so much later
+    late_s  delay of every prediction, s
     silent  predict nothing
     """
 
@@ -77,10 +77,10 @@ class WrongPqos:
         return self._source.warnings
 
     def observe(self, event: Event) -> BitratePredicted | None:
-        """The newest prediction that is due."""
-        made = self._source.observe(event)
-        if made and not self._silent:
-            self._waiting.append(made)
+        """The newest prediction whose delay has passed."""
+        prediction = self._source.observe(event)
+        if prediction and not self._silent:
+            self._waiting.append(prediction)
         due = None
         while self._waiting and self._waiting[0].t + self._late_s <= event.t + 1e-9:
             due = self._waiting.popleft()
@@ -91,9 +91,9 @@ class WrongPqos:
 
 
 def trace(path: Path, loop: bool, off_trace: Kbps | None) -> Callable[[float], Kbps]:
-    """Rate in force at a time: that of the last row not after it; `off_trace` before the first row and after the end.
+    """Rate in force at a time: that of the last row up to it; `off_trace` before the first row and after the end.
 
-    None there: the first and the last rate hold.
+    With `off_trace` None, the first and the last rate apply there.
 
     path  CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop restarts
     """
@@ -101,7 +101,7 @@ def trace(path: Path, loop: bool, off_trace: Kbps | None) -> Callable[[float], K
 
     table = read_table(path, (TIME, RATE))
     if len(table) < 2:
-        raise ModelError("file", path, "must have at least two rows, else the duration of a rate is unknown")
+        raise ModelError("file", path, "must have at least two rows, otherwise the duration of a rate is unknown")
     times, rates = table[:, 0].tolist(), [exact(rate) for rate in table[:, 1].tolist()]
     begin, end = times[0], 2 * times[-1] - times[-2]
 
@@ -165,18 +165,18 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
             with within("position"):
                 speed = number(position, "speed_mps", positive=True)
             from runner.pqos.table import read_map
-            from runner.pqos.track import drive
+            from runner.pqos.track import track_on_map
 
-            return drive(read_map(find_file(settings, "file", bases)), speed, loop)
+            return track_on_map(read_map(find_file(settings, "file", bases)), speed, loop)
         case "track":
             with within("position"):
                 path = find_path(position, "file", bases)
                 from runner.bag import is_bag
-                from runner.pqos.track import of_bag, recorded
+                from runner.pqos.track import read_track, track_of_bag
 
                 if is_bag(path):
-                    return of_bag(path, position.get("topic"), loop)
-                return recorded(find_file(position, "file", bases), loop)
+                    return track_of_bag(path, position.get("topic"), loop)
+                return read_track(find_file(position, "file", bases), loop)
         case "live":
             return None
     raise ModelError("position.kind", kind, "must be route, track or live")

@@ -16,13 +16,13 @@ Ints = NDArray[np.int64]
 
 
 def offset(lat0: float, lon0: float, lat: float, lon: float) -> tuple[float, float]:
-    """Metres east and north from one place to another: equirectangular projection, accurate for some km."""
+    """Metres east and north from one position to another: equirectangular projection, accurate within a few km."""
     east = math.radians(math.remainder(lon - lon0, 360)) * math.cos(math.radians(lat0)) * EARTH_M
     return east, math.radians(lat - lat0) * EARTH_M
 
 
 class Way(NamedTuple):
-    """Straight path from a place (degrees) to where the vehicle will be (m east and north of it)."""
+    """Straight path from a position (degrees) to where the vehicle will be (m east and north of it)."""
 
     lat: float
     lon: float
@@ -41,7 +41,7 @@ class BandwidthMap:
 
     def __init__(self, lat: Floats, lon: Floats, kbps: Floats, radius_m: float) -> None:
         self._radius = radius_m
-        self._cell = max(radius_m / 4, 1.0)  # many cells lie fully inside the radius; few are cut by its edge
+        self._cell = max(radius_m / 4, 1.0)  # many cells are fully inside the radius; few are cut by its edge
         row = np.floor(np.radians(lat) * EARTH_M / self._cell).astype(np.int64)
         key = self._key(row, lon)
         order = np.lexsort((kbps, key))
@@ -56,7 +56,7 @@ class BandwidthMap:
         first = self._first[cells]
         inside = self._inside(first, way)
         best = self._kbps[first[inside]].min(initial=np.inf)
-        # The first point of a cell is its lowest: only if it lies outside may a later one lie inside and be lower.
+        # The first point of a cell is its lowest: only if it is outside can a later one be inside and lower.
         cells = cells[~inside & (self._kbps[first] < best)]
         rest = _spans(self._first[cells] + 1, self._first[cells + 1])
         rest = rest[self._kbps[rest] < best]
@@ -85,7 +85,7 @@ class BandwidthMap:
         return _spans(self._keys.searchsorted(first, "left"), self._keys.searchsorted(last, "right"))
 
     def _inside(self, index: Ints, way: Way) -> NDArray[np.bool_]:
-        """Which points lie within the radius of the path: distance to a segment in the plane around its start."""
+        """Which points are within the radius of the path: distance to a segment in the plane around its start."""
         x = np.radians(self._lon[index] - way.lon) * (EARTH_M * math.cos(math.radians(way.lat)))
         y = np.radians(self._lat[index] - way.lat) * EARTH_M
         square = way.east**2 + way.north**2
@@ -97,7 +97,7 @@ class BandwidthMap:
 
 
 def _spans(begin: Ints, end: Ints) -> Ints:
-    """All numbers of the half open ranges [begin, end), one after the other."""
+    """All numbers of the half-open ranges [begin, end), one range after the other."""
     length = end - begin
     before = np.cumsum(length) - length
     spans: Ints = np.arange(length.sum()) + np.repeat(begin - before, length)

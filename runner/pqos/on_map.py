@@ -1,4 +1,4 @@
-"""Predictions by position: what a bandwidth map states about the road ahead."""
+"""Predictions by position: the rate that a bandwidth map gives for the road ahead."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from runner.core.model import Kbps, exact, plain
 from runner.pqos.bandwidth_map import BandwidthMap, Way, offset
 
 SLOWEST_MPS = 1.0  # below this speed the direction of movement is mostly GPS noise
-BASELINE_S = 0.5  # movement is measured over at least this long, otherwise a 20 Hz GPS gives noise again
-REACH_M = 10_000.0  # the map's plane fits the Earth about this far; also limits an absurd speed
+BASELINE_S = 0.5  # movement is measured over at least this long: at 20 Hz, single GPS steps are noise
+REACH_M = 10_000.0  # the flat projection is accurate to about this distance; also limits an absurd speed
 
 
 class _Motion:
-    """Speed and heading, as reported or otherwise from the movement between positions."""
+    """Speed and heading, as reported, otherwise from the movement between positions."""
 
     def __init__(self) -> None:
         self._last: PositionReported | None = None
-        self._speed = 0.0  # m/s, taken as 0 before the second position
+        self._speed = 0.0  # m/s, 0 before the second position
         self._course: float | None = None  # degrees, of the movement
         self._heading: float | None = None  # degrees, the one in force
 
@@ -39,7 +39,7 @@ class _Motion:
         elapsed = event.t - last.t
         if elapsed >= BASELINE_S:
             self._last = event
-        elif elapsed <= 0 or self._course is not None:  # a first guess may come earlier
+        elif elapsed <= 0 or self._course is not None:  # a first guess is allowed earlier
             return
         east, north = offset(last.lat, last.lon, event.lat, event.lon)
         self._speed = math.hypot(east, north) / elapsed
@@ -60,12 +60,12 @@ class MapPqos:
             return None
         lowest = self._points.lowest(self._motion.way(event, self._look_ahead_s))
         if lowest is None:
-            self.warnings = self.warnings or self._swapped(event)
+            self.warnings = self.warnings or self._swap_warning(event)
         kbps = self._off_map if lowest is None else exact(lowest)
         return BitratePredicted(t=event.t, kbps=kbps, valid_s=self._valid_s)
 
-    def _swapped(self, event: PositionReported) -> tuple[str, ...]:
-        """A defect that looks like a dead spot: lon and lat swapped in the map or in the reported positions."""
+    def _swap_warning(self, event: PositionReported) -> tuple[str, ...]:
+        """A warning if lon and lat seem swapped in map or positions, which otherwise looks like a dead spot."""
         if abs(event.lon) > 90 or self._points.lowest(Way(event.lon, event.lat)) is None:
             return ()
         return (

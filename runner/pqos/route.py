@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from runner.core.model import ModelError
 from runner.pqos.bandwidth_map import EARTH_M, Floats, Ints
 
-THIN_M = 4.0  # points closer than this make a route jitter
+THIN_M = 4.0  # points closer together make a route jitter
 POINTS = 3000  # a larger map is thinned further before it is ordered, so that ordering stays below 1 s
-HOPS = 3.0  # times the usual distance of neighbours: points further away are not on the same road
+HOPS = 3.0  # in usual distances between neighbours: points further apart are not on the same road
 STRAIGHT = 2.0  # extra cost of a hop that turns off at a right angle, in multiples of its length
 
 
@@ -23,7 +23,7 @@ def route(points: Floats) -> Ints:
 
     A map whose points are in driving order keeps that order, its direction and its first point. Through any other map
     a closed route is found by driving: straight on while there are new points ahead, then along known ones to the
-    nearest new one, and finally back to the first. Thus roads that cross or join do not make it jump.
+    nearest new one, and finally back to the first. So the route does not jump where roads cross or join.
     """
     x, y = _plane(points)
     near = _thin(x, y)
@@ -32,7 +32,7 @@ def route(points: Floats) -> Ints:
     distance = np.hypot(x[near, None] - x[near], y[near, None] - y[near])
     hop = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
     steps = np.hypot(np.diff(x), np.diff(y))
-    # The second condition is for big maps: thinned to long hops, they hide that the file jumps between nearby roads.
+    # The second condition is for large maps: thinned to long hops, they hide that the file jumps between nearby roads.
     if steps.mean() <= 2 * hop and np.median(np.diag(distance, 1)) <= 2 * hop:
         return _as_given(x, y, steps, HOPS * hop)
     return near[_drive(x[near], y[near], distance, HOPS * hop)]

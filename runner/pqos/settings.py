@@ -1,4 +1,4 @@
-"""What a section of the configuration says: numbers, and files of limited size."""
+"""Reads settings from a section of the configuration: numbers, and files of limited size."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST_BYTES = 200_000_000  # a month at 1 Hz
 
 
 def find_path(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> Path:
-    """The path that a setting names: an absolute one as it is, otherwise in the first of the directories that has it.
+    """The path that a setting names: absolute, or relative to the first of the directories that has it.
 
     raises  ModelError
     """

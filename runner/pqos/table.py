@@ -45,7 +45,7 @@ class _Text(NamedTuple):
 
     values  float64 (rows, columns); None: some cell is not a number
     names   name of each column in this file
-    rows    line number and cells of each row, read again to report a mistake
+    rows    line number and cells of each row, read again to report an error
     """
 
     values: NDArray[np.float64] | None
@@ -56,7 +56,7 @@ class _Text(NamedTuple):
 def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
     """The requested columns of a CSV file with a header, as float64 (rows, columns); other columns are ignored.
 
-    raises  ModelError with file, line, cell and rule of the first mistake
+    raises  ModelError with file, line, cell and rule of the first error
     """
     return _checked(path, columns, _csv(path, columns))
 
@@ -64,7 +64,7 @@ def read_table(path: Path, columns: Sequence[Column]) -> NDArray[np.float64]:
 def read_map(path: Path) -> NDArray[np.float64]:
     """A bandwidth map as rows of lon, lat (degrees, WGS-84) and kbit/s: CSV, or the matrix in OpenCV's YAML.
 
-    raises  ModelError with file, line, cell and rule of the first mistake
+    raises  ModelError with file, line, cell and rule of the first error
     """
     columns = (LON, LAT, RATE)
     text = _matrix(path) if path.suffix.lower() in {".yaml", ".yml"} else _csv(path, columns)
@@ -81,10 +81,10 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
     found = header(path)
     names = [next((name for name in column.names if name in found), "") for column in columns]
     if "" in names:
-        # The content of the file is not shown: it may not be the file that was meant.
-        wanted = ", ".join(" or ".join(column.names) for column in columns)
+        # The content is not shown: this may be the wrong file.
+        expected = ", ".join(" or ".join(column.names) for column in columns)
         lacks = ", ".join(column.names[0] for column, name in zip(columns, names, strict=True) if not name)
-        raise ModelError("file", f"{path}:1: no column {lacks}", f"must be a header with the columns {wanted}")
+        raise ModelError("file", f"{path}:1: no column {lacks}", f"must be a header with the columns {expected}")
     index = [found.index(name) for name in names]
 
     def rows() -> Iterator[tuple[int, Sequence[str]]]:
@@ -111,7 +111,7 @@ def _matrix(path: Path) -> _Text:
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     data = re.search(r"\bdata:\s*\[([^\]]*)\]", text)
     if not data:
-        raise ModelError("file", path, "must hold a matrix: rows, cols: 3 and data: [lon, lat, kbps, ...]")
+        raise ModelError("file", path, "must contain a matrix: rows, cols: 3 and data: [lon, lat, kbps, ...]")
     cells = data[1].replace(",", " ").split()
     size = [int(found[1]) if (found := re.search(rf"\b{key}:\s*(\d+)", text)) else 0 for key in ("rows", "cols")]
     if size[1] != 3 or size[0] * 3 != len(cells):
@@ -162,4 +162,4 @@ def _not_a_number(path: Path, text: _Text) -> ModelError:
                 float(cell)
             except ValueError:
                 return ModelError("file", f"{path}:{line}: {name} {shown(cell)}", "must be a number")
-    return ModelError("file", path, "must hold plain decimal numbers only")
+    return ModelError("file", path, "must contain only plain decimal numbers")

@@ -1,4 +1,4 @@
-"""Positions for a drive without a GPS: along the points of a bandwidth map, or along a recorded track."""
+"""Positions for a drive without GPS: along the points of a bandwidth map, or along a recorded track."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Track:
 
     times     s, increasing; the first one is the start of the drive
     lat, lon  degrees, interpolated linearly between the rows
-    speed     m/s per row; None: computed from the movement
-    loop      restart at the end, otherwise stay there
+    speed     m/s per row; None: derived from the movement
+    loop      restart at the end instead of staying there
     """
 
     def __init__(self, times: Floats, lat: Floats, lon: Floats, speed: Floats | None, loop: bool) -> None:
@@ -40,7 +40,7 @@ class Track:
         return float(self._times[-1])
 
     def at(self, t: float) -> PositionReported:
-        """Position of the vehicle `t` seconds after the start; while it stands, the last heading holds."""
+        """Position of the vehicle `t` seconds after the start; while it stands still, it keeps its last heading."""
         now = t % self.duration_s if self._loop else min(max(t, 0.0), self.duration_s)
         row = min(int(np.searchsorted(self._times, now, "right")) - 1, len(self._pace) - 1)
         ended = not self._loop and t > self.duration_s
@@ -54,7 +54,7 @@ class Track:
         )
 
 
-def recorded(path: Path, loop: bool) -> Track:
+def read_track(path: Path, loop: bool) -> Track:
     """A recorded drive: CSV with t_s (never decreasing), lat, lon (degrees) and, if it was measured, speed_mps."""
     columns = (TIME, LAT, LON, SPEED) if SPEED.names[0] in header(path) else (TIME, LAT, LON)
     times, lat, lon, *speed = read_table(path, columns).T
@@ -63,8 +63,8 @@ def recorded(path: Path, loop: bool) -> Track:
     return Track(times, lat, lon, speed[0] if speed else None, loop)
 
 
-def of_bag(path: Path, topic: str | None, loop: bool) -> Track:
-    """A drive from a bag of ROS: the positions of a topic, or of the only one, at the times of their stamps.
+def track_of_bag(path: Path, topic: str | None, loop: bool) -> Track:
+    """A drive from a ROS bag: the positions of a topic, or of the only one, at the times of their stamps.
 
     raises  ModelError
     """
@@ -84,7 +84,7 @@ def of_bag(path: Path, topic: str | None, loop: bool) -> Track:
     return Track(times, lat, lon, None, loop)
 
 
-def drive(points: Floats, speed_mps: float, loop: bool) -> Track:
+def track_on_map(points: Floats, speed_mps: float, loop: bool) -> Track:
     """A drive at one speed through the points (lon, lat in degrees, ...) of a map, in the order of `route`."""
     lon, lat = points[route(points), :2].T
     if loop and (lon[0], lat[0]) != (lon[-1], lat[-1]):  # an open road is driven there and back

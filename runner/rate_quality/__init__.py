@@ -1,4 +1,4 @@
-"""Rate-quality models, measured offline with the live graph's own encoder (paper, sections III and V-A).
+"""Rate-quality models, measured offline with the encoder of the live graph (paper, sections III and V-A).
 
     sequence -> plans -> sweep -> task (lanes, metrics) -> Point -> curves -> choice -> artefact, plots
 

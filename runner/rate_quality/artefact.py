@@ -20,7 +20,7 @@ from runner.rate_quality.sequence import Sequence as Clip
 
 VERSION = 1
 SCHEMA = "rate_quality"
-MARK = "Measured by `tod-runner model`"  # in each camera YAML that was written here
+MARK = "Measured by `tod-runner model`"  # in each camera YAML written by this module
 
 
 @dataclass(frozen=True, slots=True)

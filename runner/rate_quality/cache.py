@@ -14,7 +14,7 @@ from runner.system.files import write_whole
 
 
 def digest(*parts: object) -> str:
-    """Digest of values identified by their text."""
+    """Digest of values, by their text."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
@@ -29,7 +29,7 @@ def file_digest(path: Path) -> str:
 class Cache:
     """JSON documents by digest, one small file each, written atomically.
 
-    on_warning  called with a line about a file that cannot be used; it is made again
+    on_warning  called with a line about a file that cannot be used and will be replaced
     """
 
     def __init__(self, directory: Path, on_warning: Callable[[str], None]) -> None:

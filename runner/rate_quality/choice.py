@@ -15,15 +15,15 @@ from runner.rate_quality.curves import (
     Ladder,
     Point,
     best_ladder,
-    climb,
+    bitrate_for_quality,
+    build_ladder,
     crossings,
     draw_curves,
-    falls,
     mean_score,
-    reaches,
+    quality_drops,
 )
 
-FEW_FRAMES = 40  # scored frames, below which a mean is uncertain
+FEW_FRAMES = 40  # with fewer scored frames a mean is uncertain
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
 
 
 def pooled(groups: Sequence[Sequence[Point]]) -> list[Point]:
-    """Points of several cameras as those of one: the mean over all their frames."""
+    """Points of several cameras merged into those of one: the mean over all their frames."""
     by_lane: dict[tuple[Fraction, int], list[Point]] = {}
     for point in (point for group in groups for point in group):
         by_lane.setdefault((point.scaling, point.target_kbps), []).append(point)
@@ -132,13 +132,13 @@ def cores_needed(points: Iterable[Point], fps: Fraction) -> dict[Fraction, float
 
 def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[int, list[str]]:
     """The bitrate at which the quality is good enough; the largest measured one if it never is."""
-    reached = reaches(curves, ladder, criteria.sign * criteria.good)
+    reached = bitrate_for_quality(curves, ladder, criteria.sign * criteria.good)
     if reached is not None:
         return ceil(reached), []
     largest = round(float(curves.kbps[-1]))
     best = criteria.sign * float(curves.best[-1])
     warning = (
-        f"b_full: {criteria.metric} {criteria.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is taken"
+        f"b_full: {criteria.metric} {criteria.good:g} is not reached, {best:.4g} at {largest} kbit/s, which is used"
     )
     return largest, [warning]
 
@@ -146,7 +146,7 @@ def _b_full(curves: Curves, ladder: Ladder, criteria: ChoiceCriteria) -> tuple[i
 def _below(curves: Curves, ladder: Ladder, b_full: int) -> Ladder:
     """Without the factors that no bitrate below b_full would choose."""
     used = [bound for bound in ladder.bounds if round(bound) < b_full]
-    return climb(curves, ladder.scaling[: len(used) + 1]) or ladder
+    return build_ladder(curves, ladder.scaling[: len(used) + 1]) or ladder
 
 
 def _why_dropped(factor: Fraction, curves: Curves, b_full: int) -> str:
@@ -169,18 +169,18 @@ def _warnings(points: Sequence[Point], curves: Curves, ladder: Ladder, criteria:
     if ladder.regret_max > criteria.tolerance:
         warning = f"{ladder.regret_max:.2g} of {criteria.metric}, more than the {criteria.tolerance:g} allowed"
         yield f"no choice of factors whose ranges are wide enough loses less than {warning}"
-    fallen = falls(points, score, criteria.tolerance)
+    fallen = quality_drops(points, score, criteria.tolerance)
     if fallen:
         worst = max(fallen, key=lambda pair: score(pair[0]) - score(pair[1]))
         pair = " to ".join(str(point.target_kbps) for point in worst)
         where = f"worst for {_shown(worst[0].scaling)} from {pair} kbit/s, by {score(worst[0]) - score(worst[1]):.2g}"
         yield f"more bitrate looks worse in {len(fallen)} place{'' if len(fallen) == 1 else 's'}; {where}"
     for factor in curves.quality:
-        over = [point for point in points if point.scaling == factor and not point.holds]
+        over = [point for point in points if point.scaling == factor and not point.meets_target]
         if over:
             top = max(over, key=lambda point: point.target_kbps)
-            comes = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
-            yield f"{_shown(factor)} does not hold {len(over)} of its targets: it reaches {comes}; excluded there"
+            actual = f"{top.actual_kbps:.0f} at a target of {top.target_kbps} kbit/s"
+            yield f"{_shown(factor)} exceeds {len(over)} of its targets: it reaches {actual}; excluded there"
 
 
 def _shown(factor: Fraction) -> str:

@@ -1,7 +1,7 @@
 """From measured points to a ladder of scaling factors: curves over bitrate, crossings, factors worth keeping. Pure.
 
 Quality is signed so that higher is better. Bitrates are the targets that an encoder was given, since the allocation
-commands targets; an encoding that does not hold its target is excluded.
+commands targets; an encoding that exceeds its target is excluded.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 GRID = 400  # bitrates at which curves are compared, log-spaced
-HOLDS = 1.1  # actual over target bitrate, up to which an encoding holds its target
-SATURATED = 0.8  # below it the encoder cannot use more
+MAX_OVERSHOOT = 1.1  # largest ratio of actual to target bitrate at which an encoding meets its target
+SATURATED = 0.8  # below this ratio the encoder cannot use more bitrate
 RESAMPLED = 200  # bootstrap samples for the confidence of a crossing
 BLOCKS = 8  # time blocks that are resampled
 CONFIDENCE = (5, 95)  # percentiles
@@ -40,8 +40,8 @@ class Point:
     scores: Mapping[str, tuple[float, ...]]
 
     @property
-    def holds(self) -> bool:
-        return self.actual_kbps <= HOLDS * self.target_kbps
+    def meets_target(self) -> bool:
+        return self.actual_kbps <= MAX_OVERSHOOT * self.target_kbps
 
     @property
     def saturated(self) -> bool:
@@ -56,7 +56,7 @@ class Curves:
     """Quality of each factor over bitrate.
 
     kbps     grid, log-spaced
-    quality  by factor, on the grid; -inf where the factor does not hold its target or was not measured
+    quality  by factor, on the grid; -inf where the factor exceeds its target or was not measured
     """
 
     kbps: Values
@@ -73,10 +73,10 @@ class Ladder:
     """A choice of factors and the bitrates from which each is used.
 
     scaling      increasing
-    bounds       kbit/s, one less: from bounds[i] on, scaling[i + 1] is used
+    bounds       kbit/s, one entry fewer: from bounds[i] on, scaling[i + 1] is used
     regret_max   largest loss of quality compared with the best of all factors
     regret_mean  the same on average over log bitrate
-    width_min    narrowest range: its end over its beginning
+    width_min    narrowest range: ratio of its end to its beginning
     """
 
     scaling: tuple[Fraction, ...]
@@ -108,17 +108,17 @@ def mean_score(metric: str, sign: int = 1) -> Score:
 def draw_curves(points: Iterable[Point], score: Score) -> Curves:
     """Curves through the points: piecewise cubic in log bitrate, monotone where the points are (PCHIP).
 
-    raises  ValueError if no point holds its target
+    raises  ValueError if no point meets its target
     """
-    held: dict[Fraction, list[Point]] = {}
+    valid: dict[Fraction, list[Point]] = {}
     for point in sorted(points, key=lambda p: (p.scaling, p.target_kbps)):
-        if point.holds:
-            held.setdefault(point.scaling, []).append(point)
-    targets = [point.target_kbps for group in held.values() for point in group]
+        if point.meets_target:
+            valid.setdefault(point.scaling, []).append(point)
+    targets = [point.target_kbps for group in valid.values() for point in group]
     if not targets:
-        raise ValueError("no encoding holds its target bitrate")
+        raise ValueError("no encoding meets its target bitrate")
     kbps = np.geomspace(min(targets), max(targets), GRID)
-    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in held.items()})
+    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in valid.items()})
 
 
 def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
@@ -138,10 +138,10 @@ def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
 def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
     """The bitrate from which the larger factor looks better; None if one of the two wins throughout.
 
-    Noisy curves may cross more than once: the bound is the one that loses least quality, summed over log bitrate.
+    Noisy curves may cross more than once: the bound chosen loses least quality, summed over log bitrate.
     """
     gain = _gain(curves.quality[upper], curves.quality[lower])
-    lost_below = np.concatenate([[0.0], np.cumsum(np.maximum(gain, 0))])  # by taking the lower one up to here
+    lost_below = np.concatenate([[0.0], np.cumsum(np.maximum(gain, 0))])  # by using the lower factor up to here
     lost_above = np.concatenate([np.cumsum(np.maximum(-gain, 0)[::-1])[::-1], [0.0]])
     at = int(np.argmin(lost_below + lost_above))
     if at in (0, len(gain)):
@@ -153,20 +153,20 @@ def cross(curves: Curves, lower: Fraction, upper: Fraction) -> float | None:
 
 
 def _gain(upper: Values, lower: Values) -> Values:
-    """Gain of the larger factor, finite: all or nothing if only one of them works."""
+    """Gain of the larger factor, made finite: a large value if only one of them works."""
     return np.nan_to_num(upper - lower, nan=0.0, posinf=1e3, neginf=-1e3)
 
 
 def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Ladder, list[Ladder]]:
-    """The smallest choice of factors that loses no more than `tolerance` at any bitrate.
+    """The smallest set of factors that loses no more than `tolerance` at any bitrate.
 
     tolerance  quality, see `Metric.tolerance`
-    narrowest  a range must end at this many times its beginning, or its factor is not worth a switch
-    returns    the ladder, and for each number of factors the best one, to show what fewer would lose
+    narrowest  least ratio of the end of a range to its beginning; in a narrower one its factor is not worth a switch
+    returns    the ladder, and for each number of factors the best one, to show what fewer factors would lose
 
-    If no choice meets both, the one that loses least.
+    If no set meets both, the one that loses least is returned.
     """
-    ladders = [ladder for chosen in _choices(curves) if (ladder := climb(curves, chosen)) is not None]
+    ladders = [ladder for chosen in _choices(curves) if (ladder := build_ladder(curves, chosen)) is not None]
     wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
     by_size: dict[int, Ladder] = {}
     for ladder in sorted(wide, key=lambda one: (one.regret_max, one.regret_mean)):
@@ -183,22 +183,22 @@ def _choices(curves: Curves) -> Iterator[tuple[Fraction, ...]]:
         yield from combinations(winners, size)
 
 
-def climb(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
-    """These factors, each used in its range; None if one of them would have none."""
+def build_ladder(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
+    """The ladder of these factors; None if one of them would have no range."""
     bounds = [cross(curves, lower, upper) for lower, upper in pairwise(scaling)]
     found = [bound for bound in bounds if bound is not None]
     if len(found) < len(bounds) or any(a >= b for a, b in pairwise(found)):
         return None
-    quality = along(curves, scaling, found)
+    quality = ladder_quality(curves, scaling, found)
     best = curves.best
     regret = (best - quality)[np.isfinite(best)]
-    # The first range reaches down to 0 and the last has no end: only those between are narrow.
+    # The first range reaches down to 0 and the last has no end: only those in between can be narrow.
     width = min((b / a for a, b in pairwise(found)), default=np.inf)
     return Ladder(tuple(scaling), tuple(found), float(regret.max()), float(regret.mean()), width)
 
 
-def along(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
-    """Quality on the grid when each factor is used in its range."""
+def ladder_quality(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:
+    """Quality on the grid if each factor is used in its range."""
     taken = np.searchsorted(bounds, curves.kbps, side="right")
     return np.asarray(np.choose(taken, [curves.quality[factor] for factor in scaling]))
 
@@ -225,7 +225,7 @@ def crossings(points: Sequence[Point], ladder: Ladder, metric: str, sign: int) -
 
 
 def _resampled(frames: int) -> Iterator[Values]:
-    """Weights of the frames, summing to 1, for each bootstrap sample; always the same ones."""
+    """Weights of the frames, summing to 1, for each bootstrap sample; the same in every run."""
     random = np.random.default_rng(0)
     block = np.arange(frames) * min(BLOCKS, frames) // frames
     sizes = np.bincount(block)
@@ -235,17 +235,17 @@ def _resampled(frames: int) -> Iterator[Values]:
         yield weights / weights.sum()
 
 
-def reaches(curves: Curves, ladder: Ladder, quality: float) -> float | None:
-    """The smallest bitrate at which a ladder reaches a quality and keeps it; None if it does not."""
-    below = np.flatnonzero(along(curves, ladder.scaling, ladder.bounds) < quality)
+def bitrate_for_quality(curves: Curves, ladder: Ladder, quality: float) -> float | None:
+    """The smallest bitrate from which a ladder keeps a quality; None if there is none."""
+    below = np.flatnonzero(ladder_quality(curves, ladder.scaling, ladder.bounds) < quality)
     if not below.size:
         return float(curves.kbps[0])
     first = int(below[-1]) + 1
     return float(curves.kbps[first]) if first < len(curves.kbps) else None
 
 
-def falls(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
-    """Pairs of neighbouring points of a factor in which more bitrate looks worse."""
+def quality_drops(points: Iterable[Point], score: Score, tolerance: float) -> list[tuple[Point, Point]]:
+    """Pairs of neighbouring points of a factor where the higher bitrate looks worse."""
     found = []
     ordered = sorted(points, key=lambda p: (p.scaling, p.target_kbps))
     for before, after in pairwise(ordered):

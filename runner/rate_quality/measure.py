@@ -18,7 +18,7 @@ from runner.rate_quality.cache import Cache, file_digest
 from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.metrics import Metric, find_metric
-from runner.rate_quality.sequence import Filmed, as_filmed, survey
+from runner.rate_quality.sequence import Footage, as_recorded, survey
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
     from runner.rate_quality.metrics import Mask
 
-LATER_ROUNDS = 0.3  # of the first round's work: what the adaptive plan is expected to add
+LATER_ROUNDS = 0.3  # work that the adaptive plan is expected to add, as a share of the first round's
 
 
 def measure(
     vehicle: Vehicle,
     study: Study,
-    sequences: Mapping[str, Filmed],
+    sequences: Mapping[str, Footage],
     output: Path,
     progress: Progress,
     on_note: Callable[[str], None],
@@ -61,7 +61,7 @@ def measure(
 
 
 def _check_output(output: Path, models: Iterable[str]) -> None:
-    """Check before hours of work that models may be written there, and that no other camera file is overwritten.
+    """Check before hours of work that models can be written there and would not overwrite other camera files.
 
     raises  UserError
     """
@@ -99,14 +99,14 @@ def _sweep(
 ) -> Sweep:
     from runner.apply import versions
 
-    camera, _ = as_filmed(vehicle.cameras[name], clip)
+    camera, _ = as_recorded(vehicle.cameras[name], clip)
     try:
         check_size(study, camera)
     except ModelError as error:
         raise UserError("command line", error.key, str(error.found), error.rule) from None
     plan = compile_graph(camera, vehicle.media)
     roi = camera.in_source
-    before, behind = cut(plan)
+    before, after = cut(plan)
     mask = study.masks.get(name)
     key_interval = round(float(camera.graph.settings.get("key_interval_s", 0)) * float(camera.fps))
     return Sweep(
@@ -118,7 +118,7 @@ def _sweep(
         stride=stride(study, clip.frames, key_interval),
         mask=_read_mask(mask, name, camera) if mask else None,
         mask_digest=file_digest(mask) if mask else "",
-        encoder=versions((*before, *behind)),
+        encoder=versions((*before, *after)),
         cache=cache,
         executor=executor,
         parallel=parallel,
@@ -126,7 +126,7 @@ def _sweep(
 
 
 def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
-    """A picture of the camera's size; its black pixels do not count.
+    """A picture of the camera's size whose black pixels do not count.
 
     raises  UserError
     """
@@ -149,14 +149,14 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
 def _measure(
     name: str, vehicle: Vehicle, study: Study, sweeps: Sequence[Sweep], metrics: tuple[Metric, ...], progress: Progress
 ) -> Measured:
-    chooses = metrics[0]
-    sign = 1 if chooses.higher_is_better else -1
+    deciding = metrics[0]
+    sign = 1 if deciding.higher_is_better else -1
     criteria = ChoiceCriteria(
-        metric=chooses.name,
+        metric=deciding.name,
         sign=sign,
-        tolerance=chooses.tolerance if study.tolerance is None else study.tolerance,
+        tolerance=deciding.tolerance if study.tolerance is None else study.tolerance,
         narrowest=study.narrowest,
-        good=chooses.good if study.b_full_quality is None else study.b_full_quality,
+        good=deciding.good if study.b_full_quality is None else study.b_full_quality,
         cores=study.cpu_cores,
         fps=sweeps[0].plan.camera.fps,
     )
@@ -176,7 +176,7 @@ def _measure(
         encoder={"graph": text, "versions": first.encoder},
         metrics={metric.name: metric.identity for metric in metrics},
         labels={metric.name: metric.label for metric in metrics},
-        metric=chooses.name,
+        metric=deciding.name,
         sign=sign,
         good=criteria.good,
         plan=study.plan,
@@ -220,7 +220,7 @@ def _next(study: Study, criteria: ChoiceCriteria, points: Sequence[Point]) -> li
 def _notes(camera: Camera, clip: Clip) -> Iterator[str]:
     if not clip.lossless:
         yield f"{Path(clip.path).name} is already compressed with loss ({clip.codec}): high scores are overestimated"
-    _, form = as_filmed(camera, clip)
+    _, form = as_recorded(camera, clip)
     if form:
         yield form
 

@@ -10,10 +10,10 @@ from itertools import pairwise
 import numpy as np
 
 from runner.lanes import Lane
-from runner.rate_quality.curves import Curves, Ladder, Point, Score, along, best_ladder, draw_curves
+from runner.rate_quality.curves import Curves, Ladder, Point, Score, best_ladder, draw_curves, ladder_quality
 
 FIRST_RATES = 4  # of the adaptive plan, for each factor
-CLOSE = 1.05  # a crossing is known when both factors were encoded within this ratio of it
+CLOSE = 1.05  # a crossing is known once both factors were encoded within this ratio of it
 SHARE = 3  # the adaptive plan makes at most one in this many encodings of the full one
 
 
@@ -30,7 +30,7 @@ def adaptive(
     tolerance: float,
     narrowest: float,
 ) -> list[Lane]:
-    """A few bitrates for each factor, then both neighbours of each crossing until it stays where it was predicted.
+    """A few bitrates for each factor, then both factors at each crossing until it stays where it was predicted.
 
     rates      of the full plan, increasing; their ends are kept, and no more than a third of its encodings are made
     score, tolerance, narrowest  as `curves.best_ladder` takes them
@@ -45,27 +45,27 @@ def adaptive(
 
 
 def _crossings(ladder: Ladder) -> list[Lane]:
-    """Both neighbours of each predicted crossing."""
+    """Both factors at each predicted crossing."""
     pairs = zip(pairwise(ladder.scaling), ladder.bounds, strict=True)
     return [Lane(factor, round(kbps)) for neighbours, kbps in pairs for factor in neighbours]
 
 
 def _near_best(curves: Curves, ladder: Ladder, tolerance: float) -> list[Lane]:
-    """Factors left out though nearly as good, at the bitrate where they come closest, with the kept factor there."""
-    kept = along(curves, ladder.scaling, ladder.bounds)
-    wanted: list[tuple[float, list[Lane]]] = []
+    """Dropped factors that are nearly as good, where they come closest, with the factor kept there."""
+    kept = ladder_quality(curves, ladder.scaling, ladder.bounds)
+    near: list[tuple[float, list[Lane]]] = []
     for factor, quality in curves.quality.items():
         gain = np.where(np.isfinite(kept) & np.isfinite(quality), quality - kept, -np.inf)
         at = int(np.argmax(gain))
         if factor not in ladder.scaling and gain[at] > -tolerance:
             kbps = float(curves.kbps[at])
             taken = ladder.scaling[bisect_right(ladder.bounds, kbps)]
-            wanted.append((float(gain[at]), [Lane(factor, round(kbps)), Lane(taken, round(kbps))]))
-    return [lane for _, lanes in sorted(wanted, key=lambda one: -one[0]) for lane in lanes]
+            near.append((float(gain[at]), [Lane(factor, round(kbps)), Lane(taken, round(kbps))]))
+    return [lane for _, lanes in sorted(near, key=lambda one: -one[0]) for lane in lanes]
 
 
 def _unknown(lanes: Iterable[Lane], points: Sequence[Point]) -> list[Lane]:
-    """Lanes without an encoding near enough."""
+    """Lanes that have no encoding near enough."""
     return [
         lane
         for lane in dict.fromkeys(lanes)
@@ -75,10 +75,10 @@ def _unknown(lanes: Iterable[Lane], points: Sequence[Point]) -> list[Lane]:
 
 def spread(rates: Sequence[int], count: int) -> list[int]:
     """Some of the bitrates, including both ends, as evenly spaced in log bitrate as possible."""
-    wanted = np.geomspace(rates[0], rates[-1], min(count, len(rates)))
-    return sorted({min(rates, key=lambda rate: float(abs(np.log(rate / want)))) for want in wanted})
+    goals = np.geomspace(rates[0], rates[-1], min(count, len(rates)))
+    return sorted({min(rates, key=lambda rate: float(abs(np.log(rate / goal)))) for goal in goals})
 
 
 def _missing(lanes: Sequence[Lane], points: Iterable[Point]) -> list[Lane]:
-    have = {(point.scaling, point.target_kbps) for point in points}
-    return [lane for lane in lanes if (lane.scaling, lane.kbps) not in have]
+    encoded = {(point.scaling, point.target_kbps) for point in points}
+    return [lane for lane in lanes if (lane.scaling, lane.kbps) not in encoded]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 
-mpl.use("Agg")  # no screen
+mpl.use("Agg")  # works without a display
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from runner.core.model import plain
 from runner.rate_quality.artefact import Measured
-from runner.rate_quality.curves import Curves, along, draw_curves, mean_score
+from runner.rate_quality.curves import Curves, draw_curves, ladder_quality, mean_score
 from runner.system.files import write_whole
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def plot(measured: Measured, path: Path) -> list[Path]:
     axes = figure.add_subplot()
     colours = _draw_curves(axes, measured, curves)
     _draw_ladder(axes, measured, curves, colours)
-    _dress(axes, measured, curves)
+    _label_axes(axes, measured, curves)
     return [_saved(figure, path, form) for form in FORMATS]
 
 
@@ -55,7 +55,7 @@ def _draw_curves(axes: Axes, measured: Measured, curves: Curves) -> dict[Fractio
         shown = np.where(np.isfinite(quality), measured.sign * quality, np.nan)
         label = f"s = {plain(factor)}" if kept else None
         axes.plot(curves.kbps, shown, color=colour, lw=1.6 if kept else 0.9, label=label, zorder=3 if kept else 2)
-        own = [point for point in measured.points if point.scaling == factor and point.holds]
+        own = [point for point in measured.points if point.scaling == factor and point.meets_target]
         means = [float(np.mean(point.scores[measured.metric])) for point in own]
         axes.plot([p.target_kbps for p in own], means, ".", ms=5 if kept else 3, color=colour, zorder=3 if kept else 2)
     dropped = [f"{plain(factor)}" for factor in curves.quality if factor not in colours]
@@ -67,7 +67,7 @@ def _draw_curves(axes: Axes, measured: Measured, curves: Curves) -> dict[Fractio
 def _draw_ladder(axes: Axes, measured: Measured, curves: Curves, colours: dict[Fraction, str]) -> None:
     """The ranges of the factors, the crossings with their confidence, and b_full."""
     choice = measured.choice
-    taken = measured.sign * along(curves, choice.scaling, choice.ladder.bounds)
+    taken = measured.sign * ladder_quality(curves, choice.scaling, choice.ladder.bounds)
     axes.plot(curves.kbps, taken, color="black", lw=5, alpha=0.14, solid_capstyle="butt", zorder=1)
     for crossing in choice.crossings:
         axes.axvspan(crossing.low, crossing.high, color=colours[crossing.upper], alpha=0.13, lw=0, zorder=0)
@@ -78,7 +78,7 @@ def _draw_ladder(axes: Axes, measured: Measured, curves: Curves, colours: dict[F
 
 
 def _mark(axes: Axes, kbps: float, text: str, *, left: bool) -> None:
-    """Text beside a vertical line."""
+    """Label a vertical line."""
     axes.annotate(
         text,
         xy=(kbps, 0.02),
@@ -92,7 +92,7 @@ def _mark(axes: Axes, kbps: float, text: str, *, left: bool) -> None:
     )
 
 
-def _dress(axes: Axes, measured: Measured, curves: Curves) -> None:
+def _label_axes(axes: Axes, measured: Measured, curves: Curves) -> None:
     clips = ", ".join(Path(clip.path).name for clip in measured.clips.values())
     axes.set_title(f"{measured.name}   ({clips})", fontsize=10)
     axes.set_xscale("log")

@@ -15,8 +15,8 @@ from runner.redact import redacted
 from runner.system.files import unfinished
 
 INDEX = "recording.json"
-LEAST_S = 60  # a recording without an end needs space for at least this long
-MARGIN_BYTES = 64_000_000  # never filled; plus the raw frames of the next seconds
+LEAST_S = 60  # a recording of open length needs space for at least this long
+MARGIN_BYTES = 64_000_000  # never filled, plus the raw frames of MARGIN_S
 MARGIN_S = 2
 
 
@@ -31,7 +31,7 @@ def margin(cameras: Iterable[Camera]) -> float:
 
 
 def check_space(directory: Path, cameras: Iterable[Camera], recording: Recording, duration_s: float | None) -> None:
-    """Check that a recording has room, for its whole length or, if that is open, for a minute.
+    """Check that there is room for a recording: for its whole length, or for a minute if that is open.
 
     raises  RunError with the space needed and available
     """
@@ -61,13 +61,13 @@ def make_directory(path: Path) -> None:
 
 
 def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
-    """By camera, the file that will be written; each is made, empty, so that no other recording writes it too.
+    """By camera, the file to write; each is created empty, so that no other recording uses it.
 
     raises  UserError if something would be overwritten, or nothing can be written
     """
     cameras = list(cameras)
-    wanted = [directory / INDEX, *(final(directory, name) for name in cameras)]
-    taken = [path.name for path in (*wanted, *(part(directory, name) for name in cameras)) if path.exists()]
+    outputs = [directory / INDEX, *(final(directory, name) for name in cameras)]
+    taken = [path.name for path in (*outputs, *(part(directory, name) for name in cameras)) if path.exists()]
     if taken:
         rule = f"{', '.join(taken)} already exist; choose another directory"
         raise UserError("command line", "output", repr(str(directory)), rule)
@@ -92,14 +92,14 @@ def part(directory: Path, camera: str) -> Path:
 
 
 def keep(directory: Path, camera: str) -> Path:
-    """Give a complete file its name, once it is on the disk.
+    """Rename a complete file to its final name, once it is flushed to the disk.
 
-    raises  RunError if that name was taken meanwhile, or the disk fails
+    raises  RunError if that name was taken in the meantime, or the disk fails
     """
     incomplete, path = part(directory, camera), final(directory, camera)
     try:
         if path.exists():
-            raise RunError(f"{path} was created meanwhile; the recording is {incomplete}")
+            raise RunError(f"{path} was created in the meantime; the recording is {incomplete}")
         _flush(incomplete)
         incomplete.rename(path)
         _flush(directory)
@@ -130,7 +130,7 @@ def write_index(directory: Path, document: Mapping[str, Any]) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file or a directory is on the disk."""
+    """Flush a file or a directory to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

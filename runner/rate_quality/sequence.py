@@ -1,4 +1,4 @@
-"""A recorded sequence of a camera, analysed once: its length, its complexity."""
+"""A recorded sequence of a camera, analysed once for length and complexity."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 SURVEY_VERSION = 1
 FEWEST_FRAMES = 25
-ARGUMENT = "sequence"  # that names it, for messages
-Filmed = Path | BagTopic  # a clip, or pictures of a bag
+ARGUMENT = "sequence"  # of the command line, for messages
+Footage = Path | BagTopic  # a clip, or pictures of a bag
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Sequence:
     width, height  px
     fps            frames per second
     lossless       whether its codec keeps every sample
-    topic          of the bag; "": it is a clip
+    topic          of the bag; "" for a clip
     si, ti         spatial and temporal information, the maximum over all frames (ITU-T P.910); si_mean, ti_mean: mean
     """
 
@@ -57,37 +57,37 @@ class Sequence:
 
     @property
     def decode(self) -> str:
-        """The line that decodes its frames."""
+        """The pipeline that decodes its frames."""
         return decoding(self.bag or Path(self.path), self.fps)
 
 
-def decoding(filmed: Filmed, fps: Fraction) -> str:
-    """The line for GStreamer that decodes a clip, or the pictures of a bag, to I420 frames at a constant rate."""
+def decoding(footage: Footage, fps: Fraction) -> str:
+    """The GStreamer pipeline that decodes a clip, or the pictures of a bag, to I420 frames at a constant rate."""
     rate = f"video/x-raw,framerate={fps.numerator}/{fps.denominator}"
     raw = "videoconvert ! video/x-raw,format=I420"
-    if isinstance(filmed, BagTopic):
+    if isinstance(footage, BagTopic):
         begin = f"appsrc name={BAG} format=time max-buffers=2"
     else:
-        quoted = str(filmed).replace("\\", "\\\\").replace('"', '\\"')
+        quoted = str(footage).replace("\\", "\\\\").replace('"', '\\"')
         begin = f'filesrc location="{quoted}"'
     return f"{begin} ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}"
 
 
-def survey(filmed: Filmed, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
+def survey(footage: Footage, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
     """Analyse a clip, or the pictures of a bag.
 
-    on_note  called with a line, since this takes a while
+    on_note  called with a line when the analysis starts, since it takes a while
     raises   UserError if it cannot be used
     """
-    path, topic = (Path(filmed.path), filmed.topic) if isinstance(filmed, BagTopic) else (filmed, "")
-    properties = _bag_form(filmed) if isinstance(filmed, BagTopic) else _clip_form(filmed)
+    path, topic = (Path(footage.path), footage.topic) if isinstance(footage, BagTopic) else (footage, "")
+    properties = _bag_form(footage) if isinstance(footage, BagTopic) else _clip_form(footage)
     whole = BagTopic(str(path.resolve()), topic) if topic else path.resolve()
     sha256 = file_digest(path)
     key = digest("survey", SURVEY_VERSION, sha256, *filter(None, [topic]))
     known = cache.load(key)
     if known is None:
-        on_note(f"looking through {path} {topic}".rstrip())
-        known = _look_through(whole, properties["fps"])
+        on_note(f"analysing {path} {topic}".rstrip())
+        known = _analyse(whole, properties["fps"])
         cache.store(key, known)
     sequence = Sequence(path=str(path.resolve()), sha256=sha256, topic=topic, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
@@ -100,22 +100,22 @@ def _clip_form(path: Path) -> dict[str, Any]:
     from runner.apply import discover
 
     form = discover(path, ARGUMENT)
-    return asdict(form) | {"lossless": form.lossless or _recorded(path)}
+    return asdict(form) | {"lossless": form.lossless or _is_recording(path)}
 
 
-def _bag_form(filmed: BagTopic) -> dict[str, Any]:
+def _bag_form(footage: BagTopic) -> dict[str, Any]:
     from runner.bag import Bag
 
     try:
-        with Bag(Path(filmed.path)) as bag:
-            form = bag.form(filmed.topic)
+        with Bag(Path(footage.path)) as bag:
+            form = bag.form(footage.topic)
     except ModelError as error:
         raise UserError("command line", ARGUMENT, str(error.found), error.rule) from None
     size = {"width": form.width, "height": form.height, "fps": form.fps}
     return {**size, "codec": form.format, "lossless": form.format != "jpeg"}
 
 
-def _recorded(path: Path) -> bool:
+def _is_recording(path: Path) -> bool:
     """Whether `tod-runner record` made the clip, which is lossless with any codec."""
     try:
         cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]
@@ -124,7 +124,7 @@ def _recorded(path: Path) -> bool:
         return False
 
 
-def _look_through(filmed: Filmed, fps: Fraction) -> dict[str, Any]:
+def _analyse(footage: Footage, fps: Fraction) -> dict[str, Any]:
     from runner.apply import run_lanes
     from runner.rate_quality.siti import spatial, temporal
 
@@ -132,35 +132,35 @@ def _look_through(filmed: Filmed, fps: Fraction) -> dict[str, Any]:
     ti: list[float] = []
     before: Luma | None = None
 
-    def look(_number: int, luma: Luma) -> None:
+    def on_frame(_number: int, luma: Luma) -> None:
         nonlocal before
         si.append(spatial(luma))
         if before is not None:
             ti.append(temporal(before, luma))
         before = luma
 
-    line = f"{decoding(filmed, fps)} ! identity name={FRAMES} ! fakesink sync=false"
-    bag = filmed if isinstance(filmed, BagTopic) else None
+    line = f"{decoding(footage, fps)} ! identity name={FRAMES} ! fakesink sync=false"
+    bag = footage if isinstance(footage, BagTopic) else None
     try:
-        run_lanes(LaneSet(line, fps, (), bag), look, lambda *_: None, lambda _: None)
+        run_lanes(LaneSet(line, fps, (), bag), on_frame, lambda *_: None, lambda _: None)
     except RunError as error:
-        raise UserError("command line", "sequence", _named(filmed), f"cannot be decoded to its end: {error}") from None
+        raise UserError("command line", "sequence", _named(footage), f"cannot be decoded to its end: {error}") from None
     means = {"si_mean": fmean(si or [0.0]), "ti_mean": fmean(ti or [0.0])}
     return {"frames": len(si), "si": max(si, default=0.0), "ti": max(ti, default=0.0), **means}
 
 
-def _named(filmed: Filmed) -> str:
-    return f"{filmed.path}: {filmed.topic}" if isinstance(filmed, BagTopic) else repr(str(filmed))
+def _named(footage: Footage) -> str:
+    return f"{footage.path}: {footage.topic}" if isinstance(footage, BagTopic) else repr(str(footage))
 
 
-def as_filmed(camera: Camera, sequence: Sequence) -> tuple[Camera, str]:
+def as_recorded(camera: Camera, sequence: Sequence) -> tuple[Camera, str]:
     """A camera at the size and rate of a sequence, and a note on what that means for its bitrates, or ""."""
     size = (sequence.width, sequence.height)
     if size == camera.source_size:
-        filmed = replace(camera, fps=sequence.fps)
+        recorded = replace(camera, fps=sequence.fps)
     else:
-        filmed = replace(camera, width=size[0], height=size[1], native=None, crop=None, fps=sequence.fps)
-    form, own = (f"{c.width}x{c.height} at {float(c.fps):g} Hz" for c in (filmed, camera))
+        recorded = replace(camera, width=size[0], height=size[1], native=None, crop=None, fps=sequence.fps)
+    form, own = (f"{c.width}x{c.height} at {float(c.fps):g} Hz" for c in (recorded, camera))
     if form == own:
-        return filmed, ""
-    return filmed, f"the sequence is {form}, the camera {own}: the bitrates are those of the sequence"
+        return recorded, ""
+    return recorded, f"the sequence is {form}, the camera {own}: the bitrates are those of the sequence"

@@ -39,7 +39,7 @@ class SiTi:
 
 
 def measure(frames: Iterable[Luma]) -> SiTi:
-    """SI and TI of a clip, of which two frames are held at a time; 0 if it has too few frames."""
+    """SI and TI of a clip, keeping two frames in memory; 0 if it has too few frames."""
     si: list[float] = []
     ti: list[float] = []
     before: Luma | None = None
@@ -69,6 +69,6 @@ def temporal(before: Luma, luma: Luma) -> float:
 
 
 def _deviation(values: cv2.typing.MatLike) -> float:
-    """Of a population, as P.910 has it: divided by the number of pixels."""
+    """Population standard deviation, as in P.910: divided by the number of pixels."""
     _, deviation = cv2.meanStdDev(values)
     return float(deviation[0, 0])

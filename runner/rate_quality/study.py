@@ -12,7 +12,7 @@ from typing import Any
 
 from runner.core.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain, suggest
 
-FEWEST_SCORED = 40  # frames; with fewer, the next sequence does not confirm the mean
+FEWEST_SCORED = 40  # frames; a mean over fewer does not carry over to other sequences
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
 
 
 def check_cameras(study: Study, cameras: Sequence[str]) -> None:
-    """Check that the cameras that a study names are measured.
+    """Check that all cameras that a study names are measured.
 
     raises  ModelError
     """
@@ -107,9 +107,9 @@ def stride(study: Study, frames: int, key_interval: int) -> int:
     """Sampling interval of the metric, in frames.
 
     frames        of the sequence
-    key_interval  frames of a refresh wave, with which the samples must not stay in step; 0: unknown
+    key_interval  frames of a refresh wave, with which the samples must not be in phase; 0: unknown
 
-    In short sequences fewer frames are skipped, so that at least 40 are scored if there are as many.
+    In short sequences fewer frames are skipped, so that at least 40 are scored if possible.
     """
     if study.plan == "full":
         return 1

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from runner.rate_quality.metrics import Mask, Metric
 
 LANES_VERSION = 2  # increment with every change that affects scores
-PIXELS_AT_ONCE = 16_000_000  # in the lanes of all tasks together, which keeps them below 2 GB
+PIXELS_AT_ONCE = 16_000_000  # in the lanes of all tasks together, which keeps memory below 2 GB
 
 
 @dataclass
@@ -55,10 +55,10 @@ class Sweep:
         on_progress  called with the share of the work that is done, never decreasing
         raises  RunError; points finished by then stay in the cache
         """
-        points = [point for lane in lanes if (point := self._kept(lane))]
+        points = [point for lane in lanes if (point := self._cached(lane))]
         self.found += len(points)
-        have = {(point.scaling, point.target_kbps) for point in points}
-        missing = [lane for lane in lanes if (lane.scaling, lane.kbps) not in have]
+        known = {(point.scaling, point.target_kbps) for point in points}
+        missing = [lane for lane in lanes if (lane.scaling, lane.kbps) not in known]
         for point in self._run(self._tasks(missing), on_progress):
             self.cache.store(self._key(Lane(point.scaling, point.target_kbps)), self._json(point))
             points.append(point)
@@ -71,14 +71,14 @@ class Sweep:
         own_process = isinstance(self.executor, ThreadPoolExecutor)
         futures: dict[Future[list[Point]], int] = {}
         for number, task in enumerate(tasks):
-            tell = (lambda share, n=number: done.update(n, share),) if own_process else ()
-            futures[self.executor.submit(run_task, task, *tell)] = number
+            callback = (lambda share, n=number: done.update(n, share),) if own_process else ()
+            futures[self.executor.submit(run_task, task, *callback)] = number
         try:
             waiting = set(futures)
             while waiting:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
-                    number = futures.pop(future)  # a cluster frees unreferenced results, and need not recover them
+                    number = futures.pop(future)  # a cluster frees results that nobody references
                     yield from future.result()
                     done.update(number, 1.0)
         finally:
@@ -87,7 +87,7 @@ class Sweep:
                 future.cancel()
 
     def _tasks(self, lanes: Sequence[Lane]) -> list[Task]:
-        """Lanes in sets that share their decoder, none much larger than the encodings at full size alone."""
+        """Lanes in sets that share a decoder, none much more costly than those at full size alone."""
         by_factor: dict[Fraction, list[Lane]] = {}
         for lane in sorted(lanes, key=lambda lane: lane.scaling, reverse=True):
             by_factor.setdefault(lane.scaling, []).append(lane)
@@ -104,7 +104,7 @@ class Sweep:
         return [self._task(one) for one in sets]
 
     def _in_memory(self, lanes: Sequence[Lane]) -> Iterator[Sequence[Lane]]:
-        """Lanes of one factor in parts that run at once: encoders and decoders hold several pictures each."""
+        """Lanes of one factor in parts that run together: each encoder and decoder keeps several pictures."""
         pixels = self.roi.pixels * float(lanes[0].scaling) ** 2
         most = max(1, int(PIXELS_AT_ONCE / self.parallel / pixels))
         return (lanes[at : at + most] for at in range(0, len(lanes), most))
@@ -122,7 +122,7 @@ class Sweep:
             self._keys[lane] = digest("point", LANES_VERSION, *parts)
         return self._keys[lane]
 
-    def _kept(self, lane: Lane) -> Point | None:
+    def _cached(self, lane: Lane) -> Point | None:
         document = self.cache.load(self._key(lane))
         return None if document is None else point_from_json(lane.scaling, lane.kbps, document, self._identities)
 

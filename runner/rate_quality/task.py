@@ -16,7 +16,7 @@ from runner.rate_quality.curves import Point
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Metric, QualityMeter
 
-OVERHEAD = 0.1  # of an encoding at full size: what a lane of any size costs, for decoding and scoring pictures
+OVERHEAD = 0.1  # cost of decoding and scoring a lane of any size, in encodings at full size
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,12 @@ class Task:
     mask: Mask | None
 
     def scored(self, frame: int) -> bool:
-        """Whether a frame is scored: from the middle of the first stride on, since the very first picture does not
-        represent the others."""
+        """Whether a frame is scored: starts in the middle of the first stride, since the first picture is atypical."""
         return frame % self.stride == self.stride // 2
 
     @property
     def cost(self) -> float:
-        """In encodings at full size."""
+        """Cost, in encodings at full size."""
         return sum(OVERHEAD + float(lane.scaling) ** 2 for lane in self.lanes)
 
 
@@ -96,16 +95,16 @@ class _References:
     def __init__(self, task: Task) -> None:
         self._task = task
         self._lock = threading.Lock()
-        self._kept: dict[int, tuple[Luma, int]] = {}  # frame: picture, lanes that have not asked for it yet
+        self._kept: dict[int, tuple[Luma, int]] = {}  # frame: picture, number of lanes that still need it
         self.every = any(metric.every_frame for metric in task.metrics)
 
-    def wanted(self, frame: int) -> bool:
+    def is_needed(self, frame: int) -> bool:
         return self.every or self._task.scored(frame)
 
     def put(self, frame: int, luma: Luma) -> None:
         import numpy as np
 
-        if not self.wanted(frame):
+        if not self.is_needed(frame):
             return
         roi = self._task.roi
         part = np.ascontiguousarray(luma[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
@@ -113,7 +112,7 @@ class _References:
             self._kept[frame] = (part, len(self._task.lanes))
 
     def take(self, frame: int) -> Luma:
-        """To be called once by each lane."""
+        """The frame; to be called once by each lane."""
         with self._lock:
             luma, left = self._kept.pop(frame)
             if left > 1:
@@ -122,7 +121,7 @@ class _References:
 
 
 class _Scoring:
-    """Scores of one lane. A frame that the encoder left out shows the previous picture, as on a screen."""
+    """Scores of one lane. A frame that the encoder dropped shows the previous picture, as on a screen."""
 
     def __init__(self, task: Task, number: int) -> None:
         size = (task.roi.width, task.roi.height)
@@ -135,7 +134,7 @@ class _Scoring:
         self._next = 0
 
     def take(self, frame: int, luma: Luma, references: _References) -> None:
-        """A decoded picture."""
+        """Score a decoded picture."""
         self._fill(frame, references)
         self._shown = luma
         self._fill(frame + 1, references)
@@ -151,13 +150,13 @@ class _Scoring:
     def _fill(self, end: int, references: _References) -> None:
         """Score all frames before `end` with the picture on the screen."""
         for frame in range(self._next, end):
-            if references.wanted(frame):
+            if references.is_needed(frame):
                 self._score(frame, references.take(frame))
         self._next = max(self._next, end)
 
     def _score(self, frame: int, reference: Luma) -> None:
         if self._shown is None:
-            raise RunError("the encoder leaves out the first frame")
+            raise RunError("the encoder dropped the first frame")
         picture = _enlarged(self._shown, self._size)
         for name, meter in self._meters.items():
             if self._every[name] or self._task.scored(frame):
@@ -169,7 +168,7 @@ def _enlarged(luma: Luma, size: tuple[int, int]) -> Luma:
     import cv2
     import numpy as np
 
-    cv2.setNumThreads(1)  # lanes run in parallel anyway
+    cv2.setNumThreads(1)  # lanes already run in parallel
     if luma.shape == size[::-1]:
         return np.ascontiguousarray(luma)
     enlarged: Luma = cv2.resize(luma, size, interpolation=cv2.INTER_CUBIC)  # type: ignore[assignment]

@@ -17,12 +17,12 @@ from runner.system.bound import die_with
 P = ParamSpec("P")
 T = TypeVar("T")
 
-SCHEDULER_S = 10  # a Dask scheduler that has not answered by then is offline
+SCHEDULER_S = 10  # timeout for the answer of a Dask scheduler
 
 
-def parallel_tasks(wanted: int | None) -> int:
-    """How many tasks run at once on this machine; each has many threads of its own."""
-    return wanted or max(1, (os.cpu_count() or 1) // 2)
+def parallel_tasks(requested: int | None) -> int:
+    """How many tasks run in parallel on this machine; each has many threads of its own."""
+    return requested or max(1, (os.cpu_count() or 1) // 2)
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
     if workers == "threads":
         pool = ThreadPoolExecutor(parallel)
     else:
-        # Idle workers would wait forever for a killed process.
+        # Without this, idle workers would wait forever for a killed process.
         pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
     try:
         yield pool
@@ -77,7 +77,7 @@ class _Cluster(Executor):
 
 
 class _Collector:
-    """Keeps Python's cyclic garbage collector off while any thread of the process needs that."""
+    """Keeps Python's cyclic garbage collector off while any thread of the process requires it."""
 
     def __init__(self) -> None:
         self._lock, self._users, self._was_on = threading.Lock(), 0, False
@@ -100,7 +100,7 @@ _collector = _Collector()
 
 
 def without_cycle_collection(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a function without cyclic garbage collection, until the last such call of the process is over.
+    """Call a function without cyclic garbage collection; it resumes after the last such call of the process.
 
     A Dask worker inspects the frames of its threads every few milliseconds. If cycles are collected at that moment and
     a thread of GStreamer enters Python for the first time, early releases of Python 3.11, Debian 12's among them,

@@ -1,4 +1,4 @@
-"""The control link of a vehicle as topics and services of ROS: state out, requests in, answers out."""
+"""The control link of a vehicle as ROS topics and services: state out, requests in, answers out."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ EVERY_S = 0.1  # between two positions, and between two predictions
 
 
 class Bridge:
-    """One end of a vehicle's control link, and a node of ROS, from `start` until `close`.
+    """One end of a vehicle's control link, and a ROS node, from `start` until `close`.
 
-    keyring    whose name and role requests have; None: for a broker that does not ask, under an id of its own
+    keyring    name and role of the requests' sender; None: for a broker without authentication, with a random id
     on_report  called with one line on what is wrong, from any thread
 
-    It does not state by itself that an operator is present: who sends requests through it does, by the event
-    operator_connected or messages of PRESENCE. It refuses these where it reports positions or predictions, too, since
-    the vehicle takes any message for a sign that the operator is still there.
+    It does not by itself report that an operator is present. The sender of requests does, with the event
+    operator_connected or messages on PRESENCE. If it also reports positions or predictions, it refuses these, since
+    the vehicle takes any message from it as a sign that the operator is still present.
     """
 
     def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
@@ -50,13 +50,13 @@ class Bridge:
         self.identity = login.user if login else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
         self._answer_s = answer_s(vehicle.expires_s)
-        self._pending: dict[str, float] = {}  # by id of a request of somebody, until when it may be answered
-        self._calls: dict[str, str] = {}  # by id of a request, the call of a service that waits for its answer
+        self._pending: dict[str, float] = {}  # by id of a request, until when it may be answered
+        self._calls: dict[str, str] = {}  # by id of a request, the service call that waits for its answer
         self._numbers = itertools.count(1)  # of requests without an id of their own
         self._topics, self._services = input_topics(vehicle), input_services(vehicle)
         self._reports = bool(vehicle.ros.position or vehicle.ros.prediction)
         self._due: dict[str, float] = {}  # by event, when the next may be sent
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._requests = topic(vehicle.name, "request", self.identity)
         listen = {
             topic(vehicle.name, "state"): self._on_state,
@@ -65,7 +65,7 @@ class Bridge:
         }
         will = (self._requests, OPERATOR_GONE)
         self._link = ControlLink(vehicle.control, will, listen, lambda here: None, on_report, login)
-        inputs = {REQUEST: "text", **{name: its.kind for name, its in self._topics.items()}}
+        inputs = {REQUEST: "text", **{name: operator_input.kind for name, operator_input in self._topics.items()}}
         if not self._reports:
             inputs[PRESENCE] = "sign"
         if vehicle.ros.position:
@@ -83,7 +83,7 @@ class Bridge:
             self._on_node_report,
             inputs=inputs,
             outputs={REPLY: False, TELEMETRY: False, STATE: True, **dict.fromkeys(self._urls, True)},
-            services={name: its.kind for name, its in self._services.items()},
+            services={name: operator_input.kind for name, operator_input in self._services.items()},
             insecure=vehicle.insecure,
         )
 
@@ -103,7 +103,7 @@ class Bridge:
         now = time.monotonic()
         for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
             if self._pending.pop(identity, None) is not None:
-                self._answer(identity, "timed out", f"the vehicle has not answered within {self._answer_s:g} s")
+                self._answer(identity, "timed out", f"the vehicle did not answer within {self._answer_s:g} s")
 
     # --- from the vehicle, in the link's thread -----------------------------------------------------------------------
 
@@ -122,7 +122,7 @@ class Bridge:
         if self._pending.pop(reply.id, None) is not None:
             self._answer(reply.id, reply.result, reply.reason, reply.t)
         elif reply.result != "applied":
-            self._tell(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
+            self._report_once(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
 
     # --- from ROS, in the node's thread -------------------------------------------------------------------------------
 
@@ -144,21 +144,21 @@ class Bridge:
                 identity = f"{message['topic']} {next(self._numbers)}"
                 self._on_input(identity, self._topics[message["topic"]], message)
 
-    def _on_input(self, identity: str, its: OperatorInput, message: Message) -> None:
+    def _on_input(self, identity: str, operator_input: OperatorInput, message: Message) -> None:
         try:
-            event = its.event(message)
+            event = operator_input.event(message)
         except ValueError as error:
             self._answer(identity, "refused", str(error))
         else:
             self._request(identity, event)
 
     def _may_predict(self, nodes: list[str]) -> bool:
-        """Whether only the named node publishes predictions; not, as long as names are unknown."""
+        """Whether only the named node publishes predictions; False while names are unknown."""
         prediction = self._vehicle.ros.prediction
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
-            self._tell(f"{prediction.topic} {published}: predictions are left out")
+            self._report_once(f"{prediction.topic} {published}: predictions are left out")
         return nodes == [prediction.node]
 
     def _on_request(self, text: str) -> None:
@@ -184,7 +184,7 @@ class Bridge:
             self._answer(identity, "refused", "the vehicle is offline")
 
     def _report(self, event: str, **values: Any) -> None:
-        """An event that nobody waits for an answer to."""
+        """Send an event whose answer nobody waits for."""
         now = time.monotonic()
         if self._is_online() and now >= self._due.get(event, now):
             self._due[event] = now + EVERY_S
@@ -196,8 +196,8 @@ class Bridge:
         return time.monotonic() - self._vehicle_time[1] <= SILENT_S
 
     def _send(self, identity: str, event: Mapping[str, Any]) -> None:
-        t, came = self._vehicle_time
-        as_of = round(t + time.monotonic() - came, 6)
+        t, arrived = self._vehicle_time
+        as_of = round(t + time.monotonic() - arrived, 6)
         self._link.publish(self._requests, {**event, "id": identity, "as_of": as_of})
 
     def _answer(self, identity: str, result: str, reason: str, t: float | None = None) -> None:
@@ -211,8 +211,8 @@ class Bridge:
     def _on_node_report(self, name: str, what: str) -> None:
         self._on_report(f"{name}: {what}" if name else what)
 
-    def _tell(self, what: str) -> None:
+    def _report_once(self, what: str) -> None:
         """Report a fault once."""
-        if what not in self._told:
-            self._told.add(what)
+        if what not in self._reported:
+            self._reported.add(what)
             self._on_report(what)

@@ -1,4 +1,4 @@
-"""Pictures of topics of ROS for cameras: what they are, whether they may be passed on, what to report about them."""
+"""Pictures of ROS topics for cameras: their type, whether they can be passed on, and what to report about them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from runner.bag.pictures import SECOND_NS, compressed_form, image_format
 from runner.core.model import Camera, RosSettings
 from runner.ros.process import Message, NodeProcess
 
-OLD_NS = SECOND_NS  # a stamp that is older, or further in the future than FUTURE_NS, is of another clock
+OLD_NS = SECOND_NS  # a stamp that is older, or further in the future than FUTURE_NS, is from another clock
 FUTURE_NS = 20_000_000
-HEAD_BYTES = 65_536  # of a compressed picture, which hold its headers
-RATED_S = 5.0  # over which a rate is taken
-ENOUGH = 0.8  # of the camera's rate
+HEAD_BYTES = 65_536  # of a compressed picture, which contain its headers
+RATE_WINDOW_S = 5.0  # over which rates are measured
+ENOUGH = 0.8  # share of the camera's rate
 
 
 class PictureType(NamedTuple):
@@ -37,7 +37,7 @@ class SharedPicture:
     size      bytes
     step      bytes from one row to the next; 0: it is compressed
     captured  ns by CLOCK_MONOTONIC
-    untimed   whether that is not known, and `captured` when the picture came
+    untimed   whether the capture time is unknown and `captured` is the time of arrival
     """
 
     memory: int
@@ -55,9 +55,9 @@ class SharedPicture:
 class RosCameras:
     """The node that subscribes to the topics of cameras, from `start` until `close`.
 
-    insecure   whether a node of another machine may be found that need not prove who it is
+    insecure   whether unauthenticated nodes on other machines may be discovered
     push       called with a camera's name and its next picture, which it closes; from one thread
-    on_report  called with a camera's name, "" for all of them, and one line; from the same thread
+    on_report  called with a camera's name, or "" for all of them, and one line; from the same thread
     """
 
     def __init__(
@@ -98,16 +98,16 @@ class RosCameras:
 
 
 class CameraStream:
-    """What is known about the pictures of a camera's topic. Reports each change once."""
+    """State of the pictures of a camera's topic. Reports each change once."""
 
     def __init__(self, camera: Camera, on_report: Callable[[str, str], None]) -> None:
         self._camera, self._on_report = camera, on_report
         self.name = camera.name
-        self._faults: set[str] = set()  # of pictures that are left out, until one is passed on
+        self._faults: set[str] = set()  # why pictures are left out, until one is passed on
         self._type: PictureType | None = None
         self._captured = 0  # of the last picture, ns
-        self._untimed = False  # whether the last stamp was of another clock
-        self._rated = (0, 0)  # pictures since a time, in ns, at which one came
+        self._untimed = False  # whether the last stamp was from another clock
+        self._rated = (0, 0)  # count of pictures, and the arrival of the first of them, ns
         self._slow = False
 
     def report(self, what: str) -> None:
@@ -145,18 +145,18 @@ class CameraStream:
         self.report(f"pictures are {kind}{scaled}" + (f"; they were {before}" if before else ""))
 
     def _capture_time(self, message: Message) -> int:
-        """By CLOCK_MONOTONIC, ns: that of the stamp, or of arrival where the stamp is of another clock."""
+        """By CLOCK_MONOTONIC, ns: from the stamp, or the time of arrival if the stamp is from another clock."""
         at, age = int(message["at"]), message["age"]
         untimed = age is None or not -FUTURE_NS <= age <= OLD_NS
         if untimed != self._untimed:
             self._untimed = untimed
-            self.report(_doubt(age) if untimed else "stamps are right again")
+            self.report(_stamp_problem(age) if untimed else "stamps are correct again")
         return at if untimed else at - max(0, age)
 
     def _rate(self, at: int) -> None:
         """Compare the rate with that of the camera."""
         count, since = self._rated
-        if not since or at - since < RATED_S * SECOND_NS:
+        if not since or at - since < RATE_WINDOW_S * SECOND_NS:
             self._rated = (count + 1, since or at)
             return
         rate, fps = (count * SECOND_NS) / (at - since), float(self._camera.fps)
@@ -176,7 +176,7 @@ def _picture_type(message: Message, memory: int) -> PictureType:
     return PictureType(form, width, height)
 
 
-def _doubt(age: int | None) -> str:
+def _stamp_problem(age: int | None) -> str:
     if age is None:
         return "pictures have no stamp: their latency is unknown"
     of = f"{age / SECOND_NS:.2f} s old" if age > 0 else f"{-age / SECOND_NS:.2f} s in the future"

@@ -1,4 +1,4 @@
-"""Operator inputs as topics and services of ROS: which there are, and what each requests of the vehicle. Pure."""
+"""Operator inputs as ROS topics and services, and the event that each requests of the vehicle. Pure."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OperatorInput(NamedTuple):
 
 
 def ros_name(camera: str) -> str:
-    """A camera's name as part of the name of a topic, where a hyphen is not allowed, nor a digit in front."""
+    """A camera's name as part of a topic name, which may not contain hyphens or begin with a digit."""
     name = camera.replace("-", "_")
     return f"_{name}" if name[0].isdigit() else name
 
@@ -67,7 +67,7 @@ def _number(name: str, key: str, **more: str) -> OperatorInput:
 
 def _region(camera: Camera) -> Callable[[InputValues], dict[str, Any]]:
     def event(values: InputValues) -> dict[str, Any]:
-        """All zeros stand for the whole picture: sensor_msgs/RegionOfInterest."""
+        """All zeros mean the whole picture, as in sensor_msgs/RegionOfInterest."""
         region = {key: values[key] for key in ("x", "y", "width", "height")}
         if not any(region.values()):
             region = camera.full_roi.to_json()

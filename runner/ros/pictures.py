@@ -1,4 +1,4 @@
-"""Decoded pictures of the operator's side as topics of ROS, with the intrinsics of what was delivered."""
+"""Decoded pictures of the operator's side as ROS topics, with the intrinsics of the delivered pictures."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class DecodedPictures:
     ) -> None:
         """Publish a picture.
 
-        captured  s since 1970 by the vehicle's clock, its stamp; None: unknown, which is a stamp of 0
+        captured  the stamp, s since 1970 by the vehicle's clock; None: unknown, published as a stamp of 0
         data      rows of RGB, of any length
-        state     the camera's, as the vehicle published it last
+        state     the camera's state, as last published by the vehicle
         """
         lens = intrinsics_of(self._cameras[name], state, width, height)
         self._node.publish_picture(
@@ -58,7 +58,7 @@ class DecodedPictures:
 
 
 def intrinsics_of(camera: Camera, state: CameraState | None, width: int, height: int) -> Intrinsics | None:
-    """Of a picture of that size; None while it is not of the size and region that the vehicle states as applied."""
+    """Intrinsics of a picture of this size; None while it differs from the size and region that the vehicle applied."""
     applied = state.applied if state else {}
     if applied.get("size") != {"width": width, "height": height} or "roi" not in applied:
         return None

@@ -1,4 +1,4 @@
-"""The process of the node of ROS: started, started again when it has ended, received from."""
+"""The process of the ROS node: starts it, restarts it when it has ended, and receives its messages."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from runner.ros.node.port import MAX_MESSAGE_BYTES, shared_memory
 from runner.security.exposure import is_loopback
 from runner.system import children
 
-START_S = 30.0  # ROS is loaded, and its node there, within a second; on a machine that boots much later
-RETRY_S = (1.0, 10.0)  # between two starts: doubled from the first value up to the second while they fail
+START_S = 30.0  # the node usually starts within a second, but takes much longer while a machine boots
+RETRY_S = (1.0, 10.0)  # between two starts: exponential backoff from the first value up to the second
 END_S = 2.0
-LOCAL = ("off", "localhost")  # ranges of discovery that stay on this machine
+LOCAL = ("off", "localhost")  # discovery ranges that stay on this machine
 
-MAKE = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}  # by version of ROS, what brings its Python
+INSTALL_HINT = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}  # by version of ROS
 MASTER = "http://localhost:11311"  # of ROS 1, as in rosgraph
 
 SCRIPT = Path(__file__).parent / "node" / "__main__.py"
@@ -39,7 +39,7 @@ NO_OUTPUTS: Mapping[str, bool] = {}
 
 
 def check_discovery(settings: RosSettings, insecure: bool) -> None:
-    """Refuse to find nodes of other machines that need not prove who they are.
+    """Refuse to discover unauthenticated nodes on other machines.
 
     raises  UserError
     """
@@ -48,7 +48,7 @@ def check_discovery(settings: RosSettings, insecure: bool) -> None:
         return
     enforced = os.environ.get("ROS_SECURITY_ENABLE") == "true" and os.environ.get("ROS_SECURITY_STRATEGY") == "Enforce"
     if settings.discovery not in LOCAL and not enforced and not insecure:
-        rule = "admits any node of the network: set up SROS 2 (ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce)"
+        rule = "admits any node on the network: set up SROS 2 (ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce)"
         raise UserError("command line", "ros.discovery", settings.discovery, f"{rule}, or give insecure=true")
 
 
@@ -57,12 +57,12 @@ def _check_master(insecure: bool) -> None:
     try:
         parts = urlsplit(uri)
         is_address = parts.scheme == "http" and bool(parts.hostname and parts.port)
-    except ValueError:  # no port is written so
+    except ValueError:  # not a valid port
         is_address = False
     if not is_address:
         raise UserError("environment", "ROS_MASTER_URI", uri, "must be http://HOST:PORT")
     if not is_loopback(parts.hostname or "") and not insecure:
-        rule = "admits any node of the network, and ROS 1 has no keys: must be of this machine, or give insecure=true"
+        rule = "admits any node on the network, and ROS 1 has no keys: must be on this machine, or give insecure=true"
         raise UserError("environment", "ROS_MASTER_URI", uri, rule)
 
 
@@ -71,10 +71,10 @@ def _master_uri() -> str:
 
 
 def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict[str, str]:
-    """What a node's process has in addition to the environment of this one."""
+    """Variables added to this process's environment for the node's process."""
     if settings.version == 1:
         own = {"ROS_MASTER_URI": _master_uri(), "ROS_NAMESPACE": settings.namespace}
-        return own if insecure else {**own, "ROS_HOSTNAME": "127.0.0.1"}  # listens there alone
+        return own if insecure else {**own, "ROS_HOSTNAME": "127.0.0.1"}  # listens only there
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
     if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
         own["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
@@ -82,19 +82,19 @@ def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict
 
 
 class NodeProcess:
-    """A node in a process of its own, from `start` until `close`.
+    """A node in its own process, from `start` until `close`.
 
-    on_message  called with a message of a topic; of a picture with what is known about it, and a file descriptor of its
-                memory, which is then the callee's to close
+    on_message  called with a message of a topic; for a picture, with properties and the file descriptor of its memory,
+                which the callee must close
     on_report   called with a topic and one line about it; "" stands for the node itself
     pictures    topics with pictures, to subscribe to
     inputs      other topics to subscribe to, with the kind of their messages, see `runner.ros.node.inputs`
-    outputs     topics of texts, with whether the newest is kept for subscribers that come later
-    services    to offer, with the kind of their calls, see `runner.ros.node.inputs`; each is answered by `answer`
-    publishes   whether it publishes pictures, too, for which the middleware needs more shared memory than it takes
-    insecure    whether a node of another machine may be found that need not prove who it is
+    outputs     text topics, with whether the newest text is latched for late subscribers
+    services    services to offer, with the kind of their calls, see `runner.ros.node.inputs`; answered by `answer`
+    publishes   whether it also publishes pictures, for which the middleware needs more shared memory than by default
+    insecure    whether unauthenticated nodes on other machines may be discovered
 
-    Both are called from one thread.
+    Both callbacks are called from one thread.
     """
 
     def __init__(
@@ -111,48 +111,48 @@ class NodeProcess:
         insecure: bool = False,
     ) -> None:
         self._settings, self._on_message, self._on_report = settings, on_message, on_report
-        asked = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
+        subscriptions = {topic: asdict(settings.qos.get(topic, RosQos())) for topic in pictures}
         own = {key: getattr(settings, key) for key in ("version", "node", "namespace", "use_sim_time")}
         offered = {"inputs": dict(inputs), "outputs": dict(outputs), "services": dict(services)}
-        self._task = {**own, "remap": dict(settings.remap), "pictures": asked, **offered, "admit_all": insecure}
+        self._task = {**own, "remap": dict(settings.remap), "pictures": subscriptions, **offered, "admit_all": insecure}
         self._outputs = outputs
         self._environment = _environment(settings, insecure, publishes)
-        self._kept: dict[str, str] = {}  # text by topic
+        self._latched: dict[str, str] = {}  # text by topic
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None  # while there is a process
         self._closing, self._tried = threading.Event(), threading.Event()
-        self._is_ready, self._fatal = False, ""  # of the present process
+        self._is_ready, self._fatal = False, ""  # of the current process
         self._fault = ""  # as reported
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     def start(self) -> None:
-        """Start the node, and wait until it works, or has reported that it waits for the master of ROS 1.
+        """Start the node and wait until it works, or has reported that it waits for the ROS 1 master.
 
         raises  RunError with the remedy
         """
         python = self._settings.interpreter
         if shutil.which(python) is None:
-            raise RunError(f"ros.python: {python}: no such program; {MAKE[self._settings.version]}")
+            raise RunError(f"ros.python: {python}: no such program; {INSTALL_HINT[self._settings.version]}")
         self._thread.start()
         if not self._tried.wait(START_S):
             self.close()
-            raise RunError(f"the ROS node does not start within {START_S:g} s")
+            raise RunError(f"the ROS node did not start within {START_S:g} s")
         if self._fault:
             self.close()
             raise RunError(f"the ROS node does not start: {self._fault}")
 
     def publish(self, topic: str, text: str) -> None:
-        """Publish a text as std_msgs/String, from any thread. While there is no node, only what is kept comes later.
+        """Publish a text as std_msgs/String, from any thread. While no node runs, latched texts wait; others are lost.
 
         topic  one of the outputs
         """
         with self._lock:
             if self._outputs[topic]:
-                self._kept[topic] = text
+                self._latched[topic] = text
             self._send(topic=topic, text=text)
 
     def answer(self, call: str, success: bool, text: str) -> None:
-        """Answer a call of a service, from any thread."""
+        """Answer a service call, from any thread."""
         with self._lock:
             self._send(call=call, success=success, text=text)
 
@@ -170,7 +170,7 @@ class NodeProcess:
             os.close(memory)
 
     def _send(self, *memory: int, **values: Any) -> None:
-        """Under the lock."""
+        """Send an order to the node; the caller must hold the lock."""
         order = json.dumps(values).encode()
         if self._socket and self._is_ready and len(order) <= MAX_MESSAGE_BYTES:
             with suppress(OSError):  # the node is behind, or has just ended
@@ -185,7 +185,7 @@ class NodeProcess:
             self._thread.join(2 * END_S)
 
     def _run(self) -> None:
-        """In a thread that lives as long as the processes that it starts: see `children.bound`."""
+        """Main loop of the thread; it must live as long as the processes that it starts, see `children.bound`."""
         failed = 0
         while not self._closing.is_set():
             why = self._run_once()
@@ -215,7 +215,7 @@ class NodeProcess:
                 children.bound([self._settings.interpreter, "-P", str(SCRIPT), str(its.fileno())]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,  # what rclpy prints is in its own log, too
+                stderr=subprocess.DEVNULL,  # rclpy also writes this to its own log
                 env={**os.environ, **self._environment},
                 pass_fds=[its.fileno()],
                 start_new_session=True,
@@ -231,7 +231,7 @@ class NodeProcess:
         return self._fatal or children.ending(process.wait())
 
     def _receive(self, own: socket.socket) -> None:
-        """Until the process ends, or this one closes the connection."""
+        """Receive messages until the process ends, or this one closes the connection."""
         while True:
             with suppress(ConnectionResetError):
                 data, memory, _, _ = socket.recv_fds(own, MAX_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC)
@@ -250,7 +250,7 @@ class NodeProcess:
             case "ready":
                 with self._lock:
                     self._is_ready = True
-                    for topic, text in self._kept.items():
+                    for topic, text in self._latched.items():
                         self._send(topic=topic, text=text)
                 if self._fault:
                     self._fault = ""

@@ -1,1 +1,1 @@
-"""Keys: a small certificate authority, what each side holds, and what follows from it."""
+"""Keys: a small certificate authority, the keys of each side, and access control based on them."""

@@ -1,10 +1,10 @@
-"""The directory of a small certificate authority: one directory for each holder of keys, to be copied to its machine.
+"""The directory of a small certificate authority: one directory for each key holder, to be copied to its machine.
 
-    authority/   the authority's certificate and key, and what it issued; it stays where it was made
+    authority/   the authority's certificate and key, and the list of issued certificates; never copied
     broker/      for mosquitto
     NAME/        for one vehicle, operator, predictor or positioner
 
-Whatever changes for one holder is written to the directories of all others that have to know it.
+A change for one holder is written to the directories of all others that need to know it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from runner.security.broker_files import ACL, broker_settings
 from runner.security.certificates import Pair, new_authority, new_certificate, revocation_list, serial_of
 from runner.system.files import read_file, unfinished
 
-NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; the common name of a certificate is no longer
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
 RESERVED = ("authority", "broker")
 ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
 PASSWORDS, ACCESS, SETTINGS = "passwords", "access", "mosquitto.conf"
@@ -45,7 +45,7 @@ class Issued(msgspec.Struct, frozen=True):
     serial   hexadecimal
     hosts    addresses and DNS names at which the holder is reached
     until    when it expires
-    revoked  since when it is not accepted any more; None: it is
+    revoked  since when it is no longer accepted; None: it is accepted
     """
 
     name: str
@@ -60,7 +60,7 @@ class Issued(msgspec.Struct, frozen=True):
 class Authority:
     """An authority's directory. Only one process at a time changes it, see `opened`.
 
-    installed  where the broker's files will lie on the broker's machine
+    installed  directory of the broker's files on the broker's machine
     """
 
     directory: Path
@@ -71,13 +71,13 @@ class Authority:
     def opened(self) -> Iterator[None]:
         """Create the authority unless it exists, and keep other processes out.
 
-        raises  UserError if the directory holds something else, RunError if another process uses it
+        raises  UserError if the directory contains something else, RunError if another process uses it
         """
         own = self._own
         if not own.exists() and self.directory.is_dir() and any(self.directory.iterdir()):
-            rule = "must be a directory of `tod-runner keys`, or a new one: it holds other files"
+            rule = "must be a directory of `tod-runner keys`, or a new one: it contains other files"
             raise UserError("command line", "output", str(self.directory), rule)
-        with _errors_named():
+        with _os_errors_reported():
             own.mkdir(parents=True, exist_ok=True)
             self.directory.chmod(0o700)
             with (own / LOCK).open("w") as lock:
@@ -90,11 +90,11 @@ class Authority:
                 yield
 
     def holders(self) -> list[Issued]:
-        """The newest certificate of each name, in the order of first issue."""
+        """The newest certificate of each name, in order of first issue."""
         return list({issued.name: issued for issued in self._issued()}.values())
 
     def issue(self, name: str, role: Role, hosts: Sequence[str]) -> bool:
-        """Make a holder's directory; returns False if it has one already, with the same role and hosts.
+        """Create a holder's directory; returns False if it already has one with the same role and hosts.
 
         raises  UserError for a name that is taken by another role or invalid
         """
@@ -110,7 +110,7 @@ class Authority:
         return True
 
     def rotate(self, name: str) -> None:
-        """New keys and passwords for a holder; its previous ones are not accepted any more.
+        """Replace a holder's keys and passwords; its previous ones are no longer accepted.
 
         raises  UserError for an unknown name
         """
@@ -118,7 +118,7 @@ class Authority:
         self._renew(known.name, known.role, known.hosts)
 
     def revoke(self, name: str) -> None:
-        """Accept a holder's keys no more, and remove its directory.
+        """Revoke a holder's keys, and remove its directory.
 
         raises  UserError for an unknown name
         """
@@ -142,7 +142,7 @@ class Authority:
         _write(self._own / keyring.AUTHORITY, pair.certificate)
         _write(self._own / AUTHORITY_KEY, pair.key)
         _write(self._own / keyring.MEDIA_SECRET, _secret())
-        self._write_issued([])  # last: it says that the authority is complete
+        self._write_issued([])  # last: marks the authority as complete
 
     def _issued(self) -> list[Issued]:
         return msgspec.json.decode(_read(self._own / ISSUED), type=list[Issued])
@@ -157,7 +157,7 @@ class Authority:
         return active[name]
 
     def _revoked(self, name: str) -> list[Issued]:
-        """All that was issued, with what a name has had so far revoked."""
+        """All issued certificates, with those of a name marked as revoked."""
         return [
             msgspec.structs.replace(issued, revoked=self.now())
             if issued.name == name and not issued.revoked
@@ -166,12 +166,12 @@ class Authority:
         ]
 
     def _in_use(self, issued: Issued) -> bool:
-        """Whether a holder has this certificate: a run that was killed may not have written it."""
+        """Whether a holder has this certificate: a killed run may not have written it."""
         certificate = self.directory / issued.name / keyring.CERTIFICATE
         return not issued.revoked and certificate.exists() and serial_of(_read(certificate)) == int(issued.serial, 16)
 
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
-        # Listed before it exists: a serial number that the authority does not know could never be revoked.
+        # Listed before it exists: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
         self._write_issued([*self._revoked(name), Issued(name, role, f"{serial:x}", hosts, until)])
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
@@ -187,7 +187,7 @@ class Authority:
         self._distribute()
 
     def _files_of(self, name: str, role: Role) -> dict[str, bytes]:
-        """What holders of a role have beyond the keys that all have."""
+        """Files that holders of a role have in addition to those that all have."""
         media_secret = _read(self._own / keyring.MEDIA_SECRET)
         if role is Role.VEHICLE:
             return {keyring.PASSPHRASE: keyring.srt_passphrase(media_secret, name).encode()}
@@ -198,12 +198,12 @@ class Authority:
         return {}
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
-        """A holder's directory, as a whole or not at all."""
+        """Replace a holder's directory as a whole."""
         new, old, final = (
             self.directory / f"{dot}{name}{end}" for dot, end in ((".", ".new"), (".", ".old"), ("", ""))
         )
-        for left in (new, old):  # by a run that was killed
-            shutil.rmtree(left, ignore_errors=True)
+        for leftover in (new, old):  # of a killed run
+            shutil.rmtree(leftover, ignore_errors=True)
         new.mkdir(mode=0o700)
         for file, content in files.items():
             _write(new / file, content)
@@ -213,10 +213,10 @@ class Authority:
         shutil.rmtree(old, ignore_errors=True)
 
     def _distribute(self) -> None:
-        """Write who is accepted into the directories of all that have to know."""
+        """Write the accepted holders and revocations to all directories that need them."""
         issued, holders = self._issued(), list(filter(self._in_use, self.holders()))
-        gone = [each for each in issued if each.revoked and each.until > self.now()]
-        serials = [(int(each.serial, 16), each.revoked) for each in gone if each.revoked]
+        revoked = [each for each in issued if each.revoked and each.until > self.now()]
+        serials = [(int(each.serial, 16), each.revoked) for each in revoked if each.revoked]
         crl = revocation_list(self._pair, serials, self.now())
         passwords = {each.name: _read(self.directory / each.name / keyring.SECRET) for each in holders}
         for holder in holders:
@@ -252,7 +252,7 @@ def _secret() -> bytes:
 
 def _read(path: Path) -> bytes:
     try:
-        return read_file(path, keyring.LONGEST)
+        return read_file(path, keyring.MOST_BYTES)
     except ValueError as error:
         raise RunError(f"{path}: {error}") from None
 
@@ -269,7 +269,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def _errors_named() -> Iterator[None]:
+def _os_errors_reported() -> Iterator[None]:
     try:
         yield
     except OSError as error:

@@ -1,11 +1,11 @@
-"""What mosquitto needs to serve vehicles and operators that nobody else may join."""
+"""The files with which mosquitto serves only known vehicles and operators."""
 
 from __future__ import annotations
 
 PORT = 8883  # IANA: secure-mqtt
 
-# %u is the user name: an operator's id in a topic is true, and a vehicle speaks for itself only. The vehicle checks
-# what the role of an operator allows.
+# %u is the user name: operators cannot use another id in a topic, and vehicles publish only for themselves. The vehicle
+# checks what an operator's role allows.
 ACL = """\
 pattern write tod/+/request/%u
 pattern write tod/+/reception/%u
@@ -29,9 +29,9 @@ pattern read tod/%u/reception/+
 
 
 def broker_settings(directory: str, host: str = "", port: int = PORT) -> str:
-    """mosquitto.conf: TLS 1.3 with certificates and passwords on both sides, nothing for anybody else.
+    """mosquitto.conf: TLS 1.3 with certificates on both sides, and passwords; all other clients are refused.
 
-    directory  where the broker's files lie
+    directory  of the broker's files
     host       address to listen on; "": all
     """
     return "\n".join(

@@ -1,4 +1,4 @@
-"""Certificates and revocation lists (RFC 5280) by the package `cryptography`. Times are passed in."""
+"""Certificates and revocation lists (RFC 5280), with the package `cryptography`. Times are passed in."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.core.roles import Role
 
-EARLIER = timedelta(hours=1)  # a holder's clock may be behind when it gets its certificate
+BACKDATED = timedelta(hours=1)  # a holder's clock may be behind when it gets its certificate
 AUTHORITY_YEARS = 20
 YEAR = timedelta(days=365)
 # A side is a server for one protocol and a client for another: RTSP, MQTT, HTTPS.
@@ -30,7 +30,7 @@ class Pair(NamedTuple):
 
 
 def new_authority(name: str, now: datetime) -> Pair:
-    """A self-signed certificate that may sign those of holders and nothing else."""
+    """A self-signed certificate that may only sign certificates of holders."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     builder = (
@@ -68,15 +68,15 @@ def new_certificate(
 
 
 def revocation_list(authority: Pair, revoked: Iterable[tuple[int, datetime]], now: datetime) -> bytes:
-    """A CRL, PEM, of serial numbers and since when they are revoked. It does not expire before the authority does.
+    """A CRL, PEM, of serial numbers and times of revocation. It does not expire before the authority does.
 
-    An expired list would lock everybody out: OpenSSL then refuses every certificate.
+    An expired list would lock everyone out: OpenSSL would refuse every certificate.
     """
     issuer, signer = _loaded(authority)
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.subject)
-        .last_update(now - EARLIER)
+        .last_update(now - BACKDATED)
         .next_update(now + AUTHORITY_YEARS * YEAR)
     )
     for serial, since in revoked:
@@ -112,7 +112,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(serial)
-        .not_valid_before(now - EARLIER)
+        .not_valid_before(now - BACKDATED)
         .not_valid_after(now + valid)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )

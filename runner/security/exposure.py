@@ -1,4 +1,4 @@
-"""Refuse to serve or to connect beyond this machine without keys."""
+"""Refuses to serve or connect beyond this machine without keys."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, TO
 def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
     """The keys that a side's configuration names; None: it names none and needs none.
 
-    needed  files that this side needs beyond those that every holder has
-    raises  UserError if keys are missing although video or control leave this machine, or are incomplete
+    needed  files that this side needs in addition to those that every holder has
+    raises  UserError if keys are incomplete, or missing although video or control leave this machine
     """
     if vehicle.keys is not None:
         return Keyring.of(Path(vehicle.keys), *needed)
@@ -29,7 +29,7 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
 
 
 class KeysOfAll(NamedTuple):
-    """Directories of keys of the broker and of both sides."""
+    """Key directories of the broker and of both sides."""
 
     broker: Path
     vehicle: Path
@@ -37,7 +37,7 @@ class KeysOfAll(NamedTuple):
 
     @staticmethod
     def of(vehicle: Vehicle) -> KeysOfAll | None:
-        """For a process that runs both sides: `keys` then names the directory with everybody's; None: it is not set.
+        """For a process that runs both sides: `keys` names the directory with everyone's keys; None: it is not set.
 
         raises  UserError
         """
@@ -50,12 +50,13 @@ class KeysOfAll(NamedTuple):
             for role in (Role.BROKER, Role.CONTROLLER)
         }
         own = next(
-            (path for path, its in holders.items() if (its.name, its.role) == (vehicle.name, Role.VEHICLE)), None
+            (path for path, holder in holders.items() if (holder.name, holder.role) == (vehicle.name, Role.VEHICLE)),
+            None,
         )
         broker, controller = found.values()
         if not (broker and controller and own):
-            lacking = {"broker=localhost": broker, f"vehicle={vehicle.name}": own, "controller=NAME": controller}
-            words = " ".join(word for word, path in lacking.items() if path is None)
+            required = {"broker=localhost": broker, f"vehicle={vehicle.name}": own, "controller=NAME": controller}
+            words = " ".join(word for word, path in required.items() if path is None)
             raise UserError("keys", "", vehicle.keys, f"lacks keys: tod-runner keys output={vehicle.keys} {words}")
         return KeysOfAll(broker, own, controller)
 
@@ -64,22 +65,22 @@ def vehicle_keyring(vehicle: Vehicle) -> Keyring | None:
     """The vehicle's keys; raises UserError as `keyring_of`, and for those of another holder."""
     keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
     if keyring and (keyring.holder.name, keyring.holder.role) != (vehicle.name, Role.VEHICLE):
-        raise _of_another(keyring, f"vehicle {vehicle.name}")
+        raise _wrong_holder(keyring, f"vehicle {vehicle.name}")
     return keyring
 
 
 def viewer_keyring(vehicle: Vehicle) -> Keyring | None:
-    """The keys of someone who sees a vehicle's pictures; raises UserError as `keyring_of`, and for other roles."""
+    """The keys of a role that may see a vehicle's pictures; raises UserError as `keyring_of`, and for other roles."""
     keyring = keyring_of(vehicle, MEDIA_SECRET)
     if keyring and keyring.holder.role not in VIEWERS:
-        raise _of_another(keyring, "a controller or a watcher")
+        raise _wrong_holder(keyring, "a controller or a watcher")
     return keyring
 
 
 def page_keyring(vehicle: Vehicle) -> Keyring | None:
-    """The keys by which the page is served to other machines; None: it is served on loopback.
+    """The keys with which the page is served to other machines; None: it is served on loopback.
 
-    raises  UserError if it is to be served elsewhere without keys
+    raises  UserError if it would be served elsewhere without keys
     """
     if is_loopback(vehicle.page.host):
         return None
@@ -94,13 +95,13 @@ def page_keyring(vehicle: Vehicle) -> Keyring | None:
     return keyring
 
 
-def _of_another(keyring: Keyring, expected: str) -> UserError:
+def _wrong_holder(keyring: Keyring, expected: str) -> UserError:
     found = f"{keyring.holder.role} {keyring.holder.name}"
     return UserError("keys", "", str(keyring.directory), f"must be those of {expected}, not of {found}")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name is of this machine only."""
+    """Whether an address or name is a loopback address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:

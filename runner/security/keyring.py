@@ -1,14 +1,14 @@
-"""What one holder of keys has in its directory, read when a side starts and again when a file changes.
+"""The files in the directory of one key holder, read when a side starts and again when a file changes.
 
 ca.crt          certificate of the authority
-own.crt         its certificate: name, role, hosts
+own.crt         the holder's certificate: name, role, hosts
 own.key         its private key
 own.json        its name and role
-own.secret      from which its passwords follow, see `derived`
-crl.pem         certificates that are not accepted any more
-people.json     vehicle only: by name, role and RTSP password of those that may reach it
+own.secret      from which its passwords are derived, see `derived`
+crl.pem         revoked certificates
+people.json     vehicle only: by name, role and RTSP password of those who may reach it
 srt.passphrase  vehicle only
-media.secret    controllers and watchers only: from which the SRT passphrase of each vehicle follows
+media.secret    controllers and watchers only: from which the SRT passphrase of each vehicle is derived
 page.token      controllers and watchers only: for browsers on other machines
 """
 
@@ -34,8 +34,8 @@ AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "o
 REVOKED, PEOPLE = "crl.pem", "people.json"
 PASSPHRASE, MEDIA_SECRET, TOKEN = "srt.passphrase", "media.secret", "page.token"
 PUBLIC = (AUTHORITY, CERTIFICATE, HOLDER, REVOKED)  # others may read these
-LONGEST = 1_000_000  # bytes of a file
-LOOK_S = 1.0  # how often a file is looked at for changes
+MOST_BYTES = 1_000_000  # of a file
+CHECK_S = 1.0  # between two checks of a file for changes
 
 T = TypeVar("T")
 
@@ -43,7 +43,7 @@ T = TypeVar("T")
 class Person(msgspec.Struct, frozen=True):
     """Someone who may reach a vehicle.
 
-    rtsp  password for the vehicle's RTSP server, user name is the person's; "" for a role that sees no video
+    rtsp  password for the vehicle's RTSP server, where the user is the person's name; "" for a role without video
     """
 
     role: Role
@@ -51,7 +51,7 @@ class Person(msgspec.Struct, frozen=True):
 
 
 class Holder(msgspec.Struct, frozen=True):
-    """Whose keys these are.
+    """The owner of keys.
 
     hosts  addresses and DNS names at which the holder is reached
     """
@@ -62,13 +62,13 @@ class Holder(msgspec.Struct, frozen=True):
 
 
 def derived(secret: bytes, purpose: str) -> str:
-    """A password that follows from a secret and tells nothing about it (HMAC-SHA256, RFC 2104); 43 characters."""
+    """A password derived from a secret, which it does not reveal (HMAC-SHA256, RFC 2104); 43 characters."""
     digest = hmac.new(secret, purpose.encode(), hashlib.sha256).digest()
     return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
 
 
 def rtsp_password(secret: bytes, vehicle: str) -> str:
-    """Of one operator for one vehicle: what one vehicle knows opens no other."""
+    """Password of one operator for one vehicle, of no use with another vehicle."""
     return derived(secret, f"rtsp {vehicle}")
 
 
@@ -81,7 +81,7 @@ def srt_passphrase(media_secret: bytes, vehicle: str) -> str:
 
 
 class Watched(Generic[T]):
-    """A value read from a file, and again when the file has changed. From any thread.
+    """A value read from a file, and again when the file has changed. May be used from any thread.
 
     A file that cannot be used leaves the last value in force, and is reported once.
 
@@ -93,18 +93,18 @@ class Watched(Generic[T]):
     def __init__(self, path: Path, read: Callable[[], T], on_report: Callable[[str], None]) -> None:
         self._path, self._read, self._on_report = path, read, on_report
         self._lock = threading.Lock()
-        self._version, self._looked = self._stat(), time.monotonic()
+        self._version, self._checked = self._stat(), time.monotonic()
         self._value = read()
 
     def get(self) -> T:
         with self._lock:
             now = time.monotonic()
-            if now - self._looked > LOOK_S:
-                self._looked = now
-                self._renew()
+            if now - self._checked > CHECK_S:
+                self._checked = now
+                self._reload()
             return self._value
 
-    def _renew(self) -> None:
+    def _reload(self) -> None:
         version = self._stat()
         if version == self._version:
             return
@@ -112,7 +112,7 @@ class Watched(Generic[T]):
         try:
             self._value = self._read()
         except UserError as error:
-            self._on_report(f"{error}; what it held before stays in force")
+            self._on_report(f"{error}; the previous content stays in force")
 
     def _stat(self) -> tuple[int, int, int] | None:
         try:
@@ -135,7 +135,7 @@ class Keyring:
     def of(directory: Path, *needed: str) -> Keyring:
         """Check that all files are in place.
 
-        needed  names of files beyond those that every holder has
+        needed  names of files in addition to those that every holder has
         raises  UserError
         """
         ring = Keyring(directory)
@@ -175,21 +175,21 @@ class Keyring:
 
     @property
     def passphrase(self) -> str:
-        """That encrypts this vehicle's SRT streams."""
+        """The passphrase that encrypts this vehicle's SRT streams."""
         return self.read(PASSPHRASE).decode()
 
     def read(self, name: str) -> bytes:
-        """Content of a file, without the end of line that an editor may have added.
+        """Content of a file, without a trailing newline that an editor may have added.
 
         raises  UserError
         """
         try:
-            return read_file(self.directory / name, LONGEST).strip()
+            return read_file(self.directory / name, MOST_BYTES).strip()
         except ValueError as error:
             raise UserError("keys", name, str(self.directory), str(error)) from None
 
     def revoked(self) -> frozenset[int]:
-        """Serial numbers that are not accepted any more."""
+        """Serial numbers of revoked certificates."""
         from runner.security.certificates import serials_of
 
         try:

@@ -1,4 +1,4 @@
-"""The `synthetic` source: a procedural drive, rendered once into a cache as one clip per camera.
+"""The `synthetic` source: a procedural drive, rendered once as one clip per camera and cached.
 
 The street repeats after one lap, so the last frame of a clip is followed by its first. This module divides the work;
 the street is in `world.py`, the picture in `picture.py`, the file in `gst/clip_writer.py`.
@@ -29,7 +29,7 @@ REPORT_EVERY_S = 0.25  # of drive
 
 
 def render(views: Sequence[View], seconds: float, cache: Path, progress: Progress) -> None:
-    """Render the clips that the cache does not hold yet, one process per core.
+    """Render the clips that are missing from the cache, with one process per core.
 
     seconds   length of the drive, at least 4
     progress  called with the current step and the share of all pixels done, from 0 to 1 and never decreasing
@@ -41,7 +41,7 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
         raise ValueError(f"seconds: {seconds:g}: must be at least {SHORTEST_S}")
     cache.mkdir(parents=True, exist_ok=True)
     with _only_renderer(cache, progress):
-        _remove_unfinished(cache)  # of a killed run
+        _remove_unfinished(cache)  # left by a killed run
         missing = [view for view in dict.fromkeys(views) if not clip_path(view, seconds, cache).exists()]
         if missing:
             _need_numba()
@@ -55,12 +55,12 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
 
 @contextmanager
 def _only_renderer(cache: Path, progress: Progress) -> Iterator[None]:
-    """Lock the cache: a second run waits for the first and then finds its clips."""
+    """Lock the cache: a second run waits for the first and uses its clips."""
     with (cache / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            progress("waiting for another run that renders", 0.0)
+            progress("waiting for another run to finish rendering", 0.0)
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
@@ -91,18 +91,18 @@ def _need_space(views: Sequence[View], seconds: float, cache: Path) -> None:
 
 
 def _render_missing(views: Sequence[View], seconds: float, cache: Path, progress: Progress) -> None:
-    """Build the world, then let the workers take one view after the other, the largest first."""
+    """Build the world, then let the workers render the views, the largest first."""
     from runner.synthetic.world import build_world
 
     progress("building the street", 0.0)
     world = cache / f"world{UNFINISHED}"
     build_world(seconds, world)
     ordered = sorted(views, key=lambda view: -_pixels(view, seconds))
-    _share_out(ordered, seconds, cache, world, progress)
+    _distribute(ordered, seconds, cache, world, progress)
 
 
-def _share_out(views: Sequence[View], seconds: float, cache: Path, world: Path, progress: Progress) -> None:
-    """Hand views to workers and add up their reports; the workers have ended when this returns or raises."""
+def _distribute(views: Sequence[View], seconds: float, cache: Path, world: Path, progress: Progress) -> None:
+    """Hand views to workers and sum up their reports; the workers have ended when this returns or raises."""
     total = sum(_pixels(view, seconds) for view in views)
     waiting = list(views)
     done = clips = 0
@@ -129,7 +129,7 @@ def _share_out(views: Sequence[View], seconds: float, cache: Path, world: Path, 
 
 
 def _start_worker(seconds: float, cache: Path, world: Path) -> tuple[Connection, BaseProcess]:
-    """A fresh interpreter: a fork of a process that has used GStreamer or threads may hang."""
+    """Start a fresh interpreter: a fork of a process that has used GStreamer or threads may hang."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     worker = context.Process(target=_work, args=(theirs, seconds, cache, world), daemon=True)
@@ -151,7 +151,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
 
 
 def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
-    """A worker's main loop: views in, reports out; the parent handles Ctrl-C, then ends the worker."""
+    """A worker's main loop: receives views, sends reports. The parent handles Ctrl-C and ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -161,7 +161,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
         try:
             _render_clip(view, seconds, cache, world, pipe.send)
         except BrokenPipeError:
-            return  # the parent is gone
+            return  # the parent has ended
         except Exception as error:
             pipe.send(f"{type(error).__name__}: {error}")
             return
@@ -169,7 +169,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
 
 
 def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: Callable[[int], None]) -> None:
-    """Render into a file beside the clip and rename it: a clip is complete or does not exist."""
+    """Render to a temporary file and rename it: a clip is complete or does not exist."""
     from runner.apply import write_clip
     from runner.synthetic.picture import pictures
 

@@ -1,4 +1,4 @@
-"""Pictures of the counter that `tod-runner latency` reads, as the camera that films it would deliver them.
+"""Pictures of the counter that `tod-runner latency` reads, as a camera that films it would deliver them.
 
 The cells are those of `runner/page/static/counter.js`.
 """

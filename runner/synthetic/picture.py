@@ -34,11 +34,11 @@ from runner.synthetic.world import (
 )
 
 AZIMUTHS = 8192  # about a pixel of the sharpest usual view, 1920 over 90 degrees
-LAYERS = 20  # faces kept per azimuth; a farther one is not visible
-index = np.uintp  # tells the compiler that an index is not negative, i.e. does not count from the end
+LAYERS = 20  # faces kept per azimuth; farther ones are not visible
+index = np.uintp  # tells the compiler that an index is not negative and does not count from the end
 OWN_BODY = (((-0.95, -0.96, 0.3), (3.65, 0.96, 1.0)), ((-0.85, -0.8, 1.0), (2.3, 0.8, 1.68)))  # m, two corners each
 GLOSS = 70  # light of the sky reflected in its paint, of 256
-SOFT = 1.5  # levels per doubling of distance instead of 1: the lens resolves less far away, and nothing flickers there
+SOFT = 1.5  # levels per doubling of distance instead of 1: distant objects are blurred and do not flicker
 SKY_M = 12.0  # height of the clouds, in metres of their texture
 
 
@@ -106,7 +106,7 @@ def directions(view: View) -> Array:
 
 
 def cast_rays(view: View, ground_per_m: float, sky_per_m: float) -> Rays:
-    """Everything that does not change from frame to frame; *_per_m are texels of level 0."""
+    """The rays, which are the same in every frame; *_per_m are texels of level 0."""
     x, y, z = np.moveaxis(directions(view), -1, 0)
     own = hits_own_body(view.pose, x, y, z) if view.lens == "fisheye" else np.zeros(x.shape, bool)
     flat = np.maximum(np.hypot(x, y), 1e-5)
@@ -125,7 +125,7 @@ def cast_rays(view: View, ground_per_m: float, sky_per_m: float) -> Rays:
 
 
 def hits_own_body(pose: Pose, x: Array, y: Array, z: Array) -> Array:
-    """Where the rays of a camera on the vehicle's outside meet the vehicle: a box for the body, one for the cabin."""
+    """Which rays of a camera outside the vehicle hit the vehicle: a box for the body, one for the cabin."""
     eye, hit = (pose.x_m, pose.y_m, pose.z_m), np.zeros(x.shape, bool)
     for low, high in OWN_BODY:
         if all(a < b < c for a, b, c in zip(low, eye, high, strict=True)):
@@ -176,7 +176,7 @@ def cover(
     layers: Array, distance: Array, planes: Array, ends: Array, along: Array, texture: Array,
     eye: Array, cos: float, sin: float, compass: Array, pixel: float, per_m: Array,
 ) -> None:  # fmt: skip
-    """For each azimuth the faces that it meets, nearest first, as face * 16 + mip level; -1 ends the list.
+    """For each azimuth, the faces that it meets, nearest first, as face * 16 + mip level; -1 ends the list.
 
     distance  buffer for the distances of the same faces
     planes    out: [face, (nx, ny, tx, ty)]: a ray r meets the face at distance 1 / (n . r), and the place in the
@@ -215,7 +215,7 @@ def cover(
             while slot > 0 and (layers[k, slot - 1] < 0 or distance[k, slot - 1] > far):
                 slot -= 1
             behind_wall = slot > 0 and texture[layers[k, slot - 1] >> 4] == WALL != texture[f]
-            if slot == LAYERS or behind_wall:  # all things are lower than any wall
+            if slot == LAYERS or behind_wall:  # everything is lower than any wall
                 continue
             for s in range(LAYERS - 1, slot, -1):
                 layers[k, s], distance[k, s] = layers[k, s - 1], distance[k, s - 1]
@@ -302,7 +302,7 @@ def trace(x: Array, y: Array, per_m: Array, azimuth: Array, level: Array, scene:
 def fill_blocks(
     hits: Array, top: int, atlas: Texels, luma: Array, chroma_u: Array, chroma_v: Array, edges: Array
 ) -> int:
-    """Fill the blocks whose four corners lie on one surface, and of the others only the chroma that their own ray hit.
+    """Fill the blocks whose corners are all on one surface; of the others, only the chroma that their own ray hit.
 
     hits     of two rows, `top` is the index of the upper one
     luma     out: two rows of pixels
@@ -321,7 +321,7 @@ def fill_blocks(
         chroma_u[i] = 128 + (((texels_u[at] - 128) * shade) >> 8)
         chroma_v[i] = 128 + (((texels_v[at] - 128) * shade) >> 8)
         same = surface == hits[top, 0, i + 1] and surface == hits[low, 0, i] and surface == hits[low, 0, i + 1]
-        # Far apart on one surface: the texture repeats between them, or another piece of it is in front.
+        # If far apart on one surface, the texture repeats in between, or another part of it is in front.
         near = abs(u - hits[low, 1, i + 1]) + abs(hits[top, 1, i + 1] - hits[low, 1, i]) < 6144
         if not (same and near) or TREE <= texture <= RAILING:
             edges[count] = i
@@ -358,7 +358,7 @@ def cast_between(rays: Rays, j: int, edges: Array, slopes: Array, tables: Array)
 
 @compiled
 def fill_edges(edges: Array, hits: Array, atlas: Texels, luma: Array) -> None:
-    """Fill all four pixels of some blocks; at the rim of a cut-out only the nearest texel counts."""
+    """Fill all four pixels of some blocks; at the edge of a cut-out only the nearest texel counts."""
     texels, bases, log2_width, log2_height = atlas.luma, atlas.base, atlas.log2_width, atlas.log2_height
     for n in range(len(edges)):
         for corner in range(4):

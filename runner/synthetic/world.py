@@ -24,11 +24,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 SPEED_MPS = 12.0
 LONGEST_LAP_S = 13.0  # a longer drive repeats the lap: textures stay small and sharp
-LANE_D = -1.2  # the vehicle keeps right
+LANE_D = -1.2  # the vehicle drives on the right
 PARKING_D, ROAD_D, PAVEMENT_D, WALL_D = 3.1, 5.1, 6.6, 7.7  # where parking begins (left only), and where each ends
 HEDGE_D, TREE_D = 6.8, 6.0
 TIGHTEST_M = 14.0  # bend radius of the centre line; above WALL_D, or the inner wall would fold
-VISIBLE_M = 140.0  # the street is repeated this far
+VISIBLE_M = 140.0  # the street repeats up to this distance
 SUN = np.array([0.5, -0.87])  # horizontal direction to the sun
 SUN_SLOPE = 1.8
 LEVELS = 8  # mip levels of each texture; its sides are at least 2**LEVELS texels
@@ -65,7 +65,7 @@ class Course:
         return float(self.x[-1])
 
     def at(self, share: float) -> tuple[float, float, float]:
-        """Position and heading of the vehicle after that share of the drive, in [0, 1]."""
+        """Position and heading of the vehicle after a share of the drive, in [0, 1]."""
         s = share * self.laps % 1 * self.length_m
         x, y, psi = (float(np.interp(s, self.s, values)) for values in (self.x, self.y, self.psi))
         return x - LANE_D * math.sin(psi), y + LANE_D * math.cos(psi), psi
@@ -76,7 +76,7 @@ class Course:
 
 
 def plan_course(seconds: float) -> Course:
-    """The course that takes that long at 12 m/s."""
+    """The course of a drive of this length at 12 m/s."""
     laps = math.ceil(seconds / LONGEST_LAP_S)
     length = SPEED_MPS * seconds / laps
     s = np.linspace(0, length, 4097)
@@ -186,7 +186,7 @@ def halve(picture: Array, smaller: Array) -> None:
 
 
 def fractal_noise(size: int, finest: float = 2) -> Array:
-    """Tile of noise with equal contrast in each octave, like surfaces of stone and plants; mean 0, deviation 1.
+    """Tile of noise with equal contrast in each octave, like stone and plants; mean 0, standard deviation 1.
 
     finest  texels of the shortest wave in it
     """
@@ -200,7 +200,7 @@ def fractal_noise(size: int, finest: float = 2) -> Array:
 
 @compiled
 def chance(a: int, b: int) -> float:
-    """A number in [0, 1[ that depends only on a and b."""
+    """A pseudorandom number in [0, 1) that depends only on a and b."""
     h = (a * 374761393 + b * 668265263 + 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
@@ -293,7 +293,7 @@ Houses = tuple[Array, Array, Array]  # index of the house at each metre of wall;
 def plan_houses(course: Course) -> Houses:
     """Split the left side of the street, in pieces of about 1 m, into houses 8 to 14 m wide and 2 or 3 floors high.
 
-    The houses on the right are the same, half a lap further on.
+    The houses on the right are the same, offset by half a lap.
     """
     pieces = round(course.length_m)
     random = np.random.default_rng(20)
@@ -389,7 +389,7 @@ def draw_things(atlas: Atlas, noise: Array, soft: Array) -> None:
     trunk = (np.abs(x - 3.5) < 0.16 - 0.02 * z) & (z < 4)
     leaves = 78 + 14 * noise[256:768, 256:768] + 6 * soft[256:768, 256:768] + 7 * (z - 3)
     luma[:] = np.where(crown, np.clip(leaves, 20, 200), np.where(trunk, 62 + 10 * noise[:512, 512:], 0))
-    green = (z > 2.2)[::2, ::2]  # also transparent texels: chroma is coarser than the rim of the leaves
+    green = (z > 2.2)[::2, ::2]  # also for transparent texels: chroma is coarser than the edge of the leaves
     u[:], v[:] = np.where(green, 108, 124), np.where(green, 117, 134)
     luma, u, v = level_of(atlas, LAMP, 0)
     x, z = x[:, :256] - 1.75, z[:, :256]
@@ -552,7 +552,7 @@ def strip(course: Course, s: float, d: float, texture: int, height: float) -> li
 
 
 def upright(course: Course, s: float, d: float, texture: int, width: float, height: float) -> list[FaceRow]:
-    """Two crossed cut-outs, so that a tree looks like one from every side."""
+    """Two crossed cut-outs, which look like a tree or a lamp from every side."""
     x, y, psi = at_offset(course, s, d)
     rows: list[FaceRow] = []
     for turn in (0.6, 0.6 + math.pi / 2):

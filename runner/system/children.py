@@ -14,11 +14,11 @@ from runner.errors import RunError
 from runner.system.signals import LIFELINE
 
 ROOT = Path(__file__).resolve().parents[2]
-KILLED_S = 1.0  # a killed process is gone by then, unless the kernel itself holds it
+KILLED_S = 1.0  # a killed process ends within this time, unless it is blocked in the kernel
 
 
 def bound(command: Sequence[str]) -> list[str]:
-    """The command wrapped so that the kernel kills it when this process, or the thread that starts it, ends."""
+    """Wrap a command so that the kernel kills it when this process, or the thread that starts it, ends."""
     launcher = str(Path(__file__).with_name("bound.py"))
     return [sys.executable, "-I", "-S", launcher, str(os.getpid()), *command]
 
@@ -30,9 +30,9 @@ def environment() -> dict[str, str]:
 
 
 def end(process: subprocess.Popen[bytes] | subprocess.Popen[str], within_s: float) -> bool:
-    """Wait for a process that was asked to end, and kill it after a timeout.
+    """Wait for a process that has been asked to end, and kill it after a timeout.
 
-    returns  whether it ended by itself
+    returns  whether it ended without being killed
     """
     try:
         process.wait(within_s)
@@ -54,10 +54,10 @@ def ending(status: int) -> str:
 
 
 class VerbProcess:
-    """A verb as a child process. It shuts down in an orderly way when asked to, or when this process ends.
+    """A verb as a child process. It shuts down cleanly when asked to, or when this process ends.
 
-    A pipe whose other end this process holds signals both. Terminal signals reach only this process, which decides
-    what ends first.
+    A pipe whose other end is open in this process signals both. Terminal signals reach only this process, which decides
+    the order in which processes end.
 
     name    for messages
     before  prefix of its command line
@@ -95,8 +95,8 @@ class VerbProcess:
             text = self._stderr.read().strip()
         raise RunError(f"{self.name} ended early ({ending(status)})" + (f":\n{text}" if text else ""))
 
-    def ask(self) -> None:
-        """Ask it to end; asking again does no harm."""
+    def request_end(self) -> None:
+        """Ask it to end; repeated calls have no effect."""
         if self._lifeline >= 0:
             os.close(self._lifeline)
             self._lifeline = -1

@@ -1,16 +1,16 @@
-"""The difference between the clocks of two machines, bounded by the messages that they exchange. Pure."""
+"""The difference between the clocks of two machines, with bounds from the messages that they exchange. Pure."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import NamedTuple
 
-MOST_DRIFT = 5e-4  # by which two clocks drift apart: crystals by 100 ppm; adjtime(3) slews a clock by 500 ppm
-SET_S = 5e-4  # a clock that moves by more than this and the drift, between two exchanges, was set or slewed faster
-STEP_S = 5e-3  # one that moves by this much was set, perhaps in the middle of an exchange
-KEPT_S = 10.0  # that an exchange counts; without a newer one nothing is known
-CLOCKS_APART_MS = -1.0  # in logs without exchanges: a negative age above it is noise, below it the clocks are apart
-TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age in which ages are unknown
+MOST_DRIFT = 5e-4  # of two clocks: crystals drift by 100 ppm; adjtime(3) slews a clock by 500 ppm
+SET_S = 5e-4  # a clock that moved by more than this plus the drift between two exchanges was set or slewed faster
+STEP_S = 5e-3  # one that moved by this much was set, perhaps in the middle of an exchange
+KEPT_S = 10.0  # how long an exchange is used; without a newer one the difference is unknown
+CLOCKS_APART_MS = -1.0  # in logs without exchanges: negative ages above this are noise, below it the clocks differ
+TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age during which ages are unknown
 
 
 class Exchange(NamedTuple):
@@ -19,7 +19,7 @@ class Exchange(NamedTuple):
     sent, returned      by this machine's clock
     received, answered  by the other's
     set_s               how far each clock, this machine's and the other's, is ahead of one that is never set
-    errors_s            sum of the errors that both kernels state against a common time; None if one is not synchronised
+    errors_s            sum of both kernels' stated errors against a common time; None if one is not synchronised
     """
 
     sent: float
@@ -31,14 +31,14 @@ class Exchange(NamedTuple):
 
 
 class ClockDifference(NamedTuple):
-    """How far the other machine's clock is ahead of this one's, s, and by how much that may be wrong."""
+    """How far the other machine's clock is ahead of this one's, s, and the error bound of that."""
 
     ahead_s: float
     bound_s: float
 
 
 def latency(apart_ms: float | None, clock: ClockDifference | None) -> float | None:
-    """A latency, ms, right to within the bound of `clock`; None if either is unknown, or they contradict each other.
+    """A latency, ms, within the error bound of `clock`; None if either is unknown, or they contradict each other.
 
     apart_ms  time of the later event by this machine's clock minus that of the earlier by the other's, ms
     """
@@ -49,7 +49,7 @@ def latency(apart_ms: float | None, clock: ClockDifference | None) -> float | No
 
 
 class _Interval(NamedTuple):
-    """What the difference lay between at a time, s."""
+    """Bounds of the difference at a time, s."""
 
     at: float
     least: float
@@ -59,23 +59,23 @@ class _Interval(NamedTuple):
 class ClockComparison:
     """Compares two clocks by exchanged messages.
 
-    No message arrives before it was sent: the one there bounds the difference from above, the answer from below. Each
-    exchange yields such an interval, whatever the delay in either direction, and the truth lies in all of them. An
-    exchange of t seconds ago counts with its interval widened by what the clocks may have drifted apart since. Once
-    either clock has been set, or slewed faster, only what comes after counts.
+    No message arrives before it was sent: the request bounds the difference from above, the answer from below. Each
+    exchange yields such an interval, whatever the delay in either direction, and the true difference is in all of them.
+    The interval of an exchange t seconds ago is widened by the drift since then. Once either clock has been set, or
+    slewed faster, only later exchanges count.
 
-    A clock that is set shows with the next exchange only. Until then, what has been read from it since the last one may
-    be wrong by any amount: see `held`.
+    The next exchange shows that a clock was set. Until then, times read from it since the last exchange may be wrong by
+    any amount: see `held`.
     """
 
     def __init__(self) -> None:
         self._set_at = float("-inf")  # when a clock was found to have been set
-        self._asked = float("-inf")
+        self._last_sent = float("-inf")
         self._intervals: deque[_Interval] = deque()
         self._set_s: tuple[float, float] | None = None
 
     def add(self, at: float, exchange: Exchange) -> None:
-        """Take an exchange that was completed at time `at`, s, by a clock that is never set.
+        """Add an exchange that was completed at time `at`, s, by a clock that is never set.
 
         raises  ValueError if the times contradict each other
         """
@@ -83,34 +83,34 @@ class ClockComparison:
             raise ValueError(f"answered {exchange.received - exchange.answered:g} s before it was received")
         interval = _interval(at, exchange)
         if interval.least > interval.most:
-            raise ValueError("answered after the answer arrived: a clock was set meanwhile, or is stated wrongly")
+            raise ValueError("answered after the answer arrived: a clock was set meanwhile, or its times are wrong")
         before, self._set_s = self._set_s or exchange.set_s, exchange.set_s
         allowed = SET_S + MOST_DRIFT * (at - self._intervals[-1].at if self._intervals else 0.0)
         moved = max(abs(now - then) for now, then in zip(exchange.set_s, before, strict=True))
         if moved > allowed:
             self._intervals.clear()
             self._set_at = at
-        if moved < STEP_S:  # otherwise perhaps in the middle of this exchange
+        if moved < STEP_S:  # otherwise it may have moved in the middle of this exchange
             self._intervals.append(interval)
-            self._asked = max(self._asked, at - (exchange.returned - exchange.sent))
+            self._last_sent = max(self._last_sent, at - (exchange.returned - exchange.sent))
 
     def was_set_since(self, begin: float) -> bool:
         """Whether a clock is known to have been set after a time, by the same clock."""
         return self._set_at >= begin
 
     def held(self, begin: float, end: float) -> bool:
-        """Whether no clock was set between two times, by the same clock: `difference` then holds for what was read."""
-        return not self.was_set_since(begin) and end <= self._asked
+        """Whether no clock was set between two times, by the same clock; then `difference` is valid in between."""
+        return not self.was_set_since(begin) and end <= self._last_sent
 
     @property
     def was_set(self) -> bool:
         """Whether a clock was set after the newest exchange that counts."""
-        return self._set_at > self._asked
+        return self._set_at > self._last_sent
 
     @property
-    def asked(self) -> float:
+    def last_sent(self) -> float:
         """When the newest exchange that counts was sent, by the same clock."""
-        return self._asked
+        return self._last_sent
 
     def difference(self, now: float) -> ClockDifference | None:
         """The difference at a time, by the same clock; None if nothing was exchanged for KEPT_S."""
@@ -122,14 +122,14 @@ class ClockComparison:
         for interval in reversed(self._intervals):
             drift = MOST_DRIFT * abs(now - interval.at)  # answers may overtake each other
             low, high = max(least, interval.least - drift), min(most, interval.most + drift)
-            if low > high:  # a clock has been set in between: only what came after counts
+            if low > high:  # a clock has been set in between: only later exchanges count
                 break
             least, most = low, high
         return ClockDifference((least + most) / 2, (most - least) / 2)
 
 
 def _interval(at: float, exchange: Exchange) -> _Interval:
-    """Bounds of the difference by one exchange, and by both kernels where these are synchronised and agree with it."""
+    """Bounds of the difference by one exchange, and by both kernels if these are synchronised and agree with it."""
     drift = MOST_DRIFT * max(0.0, exchange.returned - exchange.sent)
     least = exchange.answered - exchange.returned - drift
     most = exchange.received - exchange.sent + drift

@@ -1,4 +1,4 @@
-"""Atomic writing of files, limited reading, and a file from another package."""
+"""Atomic writes, size-limited reads, and a file from another package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runner.system.signals import urgent
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[Path]:
-    """A temporary name to write `path` under; the finished file then replaces `path`, an unfinished one is removed."""
+    """A temporary path to write to; the finished file replaces `path`, an unfinished one is removed."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
     with urgent(lambda: part.unlink(missing_ok=True)):
         try:
@@ -29,7 +29,7 @@ def unfinished(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def unfinished_directory(path: Path) -> Iterator[Path]:
-    """Like `unfinished`, for a directory that does not exist yet and is made under the path given here."""
+    """Like `unfinished`, for a directory, which the caller creates at the path given."""
     above = path.with_name(f".{path.name}.{os.getpid()}")
     with urgent(lambda: rmtree(above, ignore_errors=True)):
         try:
@@ -47,10 +47,10 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
     An existing path that is not a file, such as /dev/null, is written to directly. An existing file is kept if writing
     ends early.
 
-    partly  keep the output up to an error in the input, a UserError
+    partly  keep the output written before a UserError, an error in the input
     raises  UserError if it cannot be opened, RunError if it cannot be written
     """
-    mistake = None
+    user_error = None
     try:
         special = path.exists() and not path.is_file()
         with nullcontext(path) if special else unfinished(path) as part, _opened(part, path, argument) as file:
@@ -59,13 +59,13 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
             except UserError as error:
                 if not partly:
                     raise
-                mistake = error
+                user_error = error
     except BrokenPipeError:
         raise
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
-    if mistake:
-        raise mistake
+    if user_error:
+        raise user_error
 
 
 def _opened(part: Path, path: Path, argument: str) -> TextIO:
@@ -76,7 +76,7 @@ def _opened(part: Path, path: Path, argument: str) -> TextIO:
 
 
 def file_problem(path: Path) -> str:
-    """The rule broken by a path that names no regular file: a device, a pipe or a directory is not one."""
+    """The rule that a path breaks which is not a regular file but, for example, a device, a pipe or a directory."""
     return "must be a file" if path.exists() else "no such file"
 
 
@@ -98,7 +98,7 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
 
 def exposure(path: Path) -> str | None:
-    """What is wrong with the mode of a file that only its owner may read; None: nothing.
+    """What is wrong with the mode of a file that only its owner may read; None if nothing is.
 
     raises  OSError
     """
@@ -122,7 +122,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def plotly_script(extra: str) -> Path:
-    """The script in plotly's wheel.
+    """The JavaScript file in plotly's wheel.
 
     extra   of this package, which installs it
     raises  RunError

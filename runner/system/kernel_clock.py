@@ -1,4 +1,4 @@
-"""How far the wall clock is ahead of another one, and what the kernel knows about its error."""
+"""How far the wall clock is ahead of another clock, and the error that the kernel states for it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from collections.abc import Callable
 TIME_ERROR = 5  # state of a clock that is not synchronised (adjtimex(2))
 STA_NANO = 0x2000  # the offset is in ns, otherwise in us
 MICRO, NANO = 1e-6, 1e-9
-CLOSE_NS = 20_000  # two clocks read within this count as read simultaneously
+CLOSE_NS = 20_000  # clocks read within this time count as read simultaneously
 TRIES = 10
 
 
 class _Timex(ctypes.Structure):
-    """struct timex of adjtimex(2), as far as it is read; the rest as reserve."""
+    """struct timex of adjtimex(2), as far as it is used; the rest is reserved."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -31,16 +31,16 @@ class _Timex(ctypes.Structure):
 def ahead_of(read: Callable[[], int], own: Callable[[], int] = time.time_ns) -> int:
     """By how much the wall clock is ahead of another, ns.
 
-    Another thread may run between the two readings. So the wall clock is read before and after the other, several
-    times if that took long, and the closest reading counts.
+    Another thread may run between the two readings. So the wall clock is read before and after the other one, several
+    times if that took too long, and the closest reading counts.
 
     read  reads the other clock, ns
-    own   reads a clock that stands in for the wall clock
+    own   reads a clock that replaces the wall clock
     """
     readings: list[tuple[int, int]] = []  # duration of the reading, ns; difference at its middle
     while len(readings) < TRIES and min(readings, default=(CLOSE_NS + 1, 0))[0] > CLOSE_NS:
-        before, there, after = own(), read(), own()
-        readings.append((after - before, (before + after) // 2 - there))
+        before, other, after = own(), read(), own()
+        readings.append((after - before, (before + after) // 2 - other))
     return min(readings)[1]
 
 
@@ -50,10 +50,10 @@ def wall_ahead_s() -> float:
 
 
 def clock_error_s() -> float | None:
-    """By how much CLOCK_REALTIME may differ from UTC, s, by the kernel's own account; None if it is not synchronised.
+    """By how much CLOCK_REALTIME may differ from UTC, s, as stated by the kernel; None if it is not synchronised.
 
-    NTP and PTP daemons state it by ntp_adjtime; the kernel lets it grow until their next update (RFC 1589). What is
-    still to be slewed comes on top. systemd-timesyncd states 0 for all errors: it is not believed.
+    NTP and PTP daemons set it with ntp_adjtime; the kernel lets it grow until their next update (RFC 1589). The offset
+    still to be slewed is added. systemd-timesyncd states 0 for all errors, which is not trusted.
     """
     if not sys.platform.startswith("linux"):
         return None

@@ -9,7 +9,7 @@ from runner.errors import RunError
 
 
 def check_port_free(endpoint: Endpoint) -> None:
-    """raises RunError if something else already listens there, or the address is not this machine's"""
+    """raises RunError if another process already listens there, or the address is not one of this machine"""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

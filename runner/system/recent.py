@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Generic, TypeVar
 
-CURRENT_S = 1.0  # an older one says nothing about now
+CURRENT_S = 1.0  # an older value is stale
 
 T = TypeVar("T")
 

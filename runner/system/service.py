@@ -1,4 +1,4 @@
-"""State for the service manager: sd_notify(3) of systemd, a protocol that others understand as well."""
+"""State for the service manager: systemd's sd_notify(3) protocol, which others also support."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import suppress
 def notify(state: str) -> None:
     """Send a state to the service manager; without one nothing happens.
 
-    state  READY=1 once the service works, WATCHDOG=1 while it does, STOPPING=1 when it begins to end
+    state  READY=1 once the service works, WATCHDOG=1 while it does, STOPPING=1 when shutdown begins
     """
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:

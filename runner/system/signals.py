@@ -1,12 +1,12 @@
 """SIGINT and SIGTERM, the same for every verb.
 
 The first signal asks the verb to end. It raises KeyboardInterrupt in the main thread or, after `stopping`, sets a
-`Stop` that the verb checks. A second signal ends the process at once, and so does a shutdown that takes longer than its
-limit; files are then still complete or absent, since `urgent` registers what must be cleaned up.
+`Stop` that the verb checks. A second signal ends the process immediately, and so does a shutdown that exceeds its
+time limit; files are still complete or absent, since `urgent` registers the necessary cleanup.
 
-No handler does any of this. The interpreter writes the number of each signal to a pipe (signal.set_wakeup_fd), and a
-thread reads it there: a second signal cannot interrupt the handling of the first, and a main thread that is busy in a C
-library delays nothing.
+This does not happen in signal handlers. The interpreter writes the number of each signal to a pipe
+(signal.set_wakeup_fd), and a thread reads it: a second signal cannot interrupt the handling of the first, and a main
+thread that is busy in a C library delays nothing.
 
 A process with a lifeline (see `runner.system.children`) treats the end of its parent as SIGTERM.
 """
@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end the parent holds
+LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end is open in the parent
 END_S = 2.0  # how long an orderly shutdown may take
 URGENT_S = 0.5  # how long cleanup may take without an orderly shutdown
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
@@ -31,7 +31,7 @@ Action = Callable[[], object]
 
 
 class Stop:
-    """Set when the verb is to end. May be used from any thread.
+    """Set when the verb must end. May be used from any thread.
 
     limit_s  how long the shutdown may take from then on; None: unlimited
     action   called once when it is set, from another thread
@@ -46,7 +46,7 @@ class Stop:
 
     @property
     def status(self) -> int:
-        """Exit status of a verb that normally ends this way: 130 for Ctrl-C, 0 for SIGTERM or without a signal."""
+        """Exit status of a verb that ends normally: 130 after Ctrl-C, 0 after SIGTERM or without a signal."""
         return 128 + signal.SIGINT if self.is_set() and _watch.number == signal.SIGINT else 0
 
     def set(self) -> None:
@@ -66,8 +66,8 @@ class _Watch:
         self.number = 0  # of the first signal
         self.stop: Stop | None = None
         self.urgent: list[Action] = []
-        self.delivered = False  # whether the main thread knows of it
-        self.interrupted = False  # by an exception
+        self.delivered = False  # whether the main thread has been notified
+        self.interrupted = False  # whether the main thread was interrupted by an exception
         self._deadline: float | None = None
 
     @contextmanager
@@ -87,7 +87,7 @@ class _Watch:
         finally:
             self._over = True
             self._wake()
-            # First, since the kernel may have given it a signal: Python complains of one whose handler is gone.
+            # Joined first: it may still receive a signal, and Python reports one whose handler has been removed.
             thread.join(END_S)
             signal.set_wakeup_fd(wakeup)
             for number, handler in zip(NUMBERS, before, strict=True):
@@ -124,10 +124,10 @@ class _Watch:
         if self._deadline is not None or (self.stop and self.stop.is_set()):
             self._end("second signal: ending now")
         self.number = self.number or number
-        self.ask()
+        self.begin_shutdown()
 
-    def ask(self) -> None:
-        """Ask the verb to end: its time limit starts now. From any thread."""
+    def begin_shutdown(self) -> None:
+        """Ask the verb to end: its time limit starts now. May be called from any thread."""
         stop = self.stop
         limit_s = stop.limit_s if stop else END_S
         self._deadline = None if limit_s is None else time.monotonic() + limit_s
@@ -145,11 +145,11 @@ class _Watch:
         return None if self._deadline is None else max(0.0, 1000 * (self._deadline - time.monotonic())) + 1
 
     def _end(self, why: str) -> None:
-        """End the process at once, without waiting for threads or calling libraries."""
+        """End the process immediately, without waiting for threads or calling libraries."""
         cleaning = threading.Thread(target=self._clean, daemon=True)
         cleaning.start()
         cleaning.join(URGENT_S)
-        if select.select([], [2], [], 0)[1]:  # its reader may have stopped reading
+        if select.select([], [2], [], 0)[1]:  # skipped if its reader is stalled
             with suppress(OSError):
                 os.write(2, f"{why}\n".encode())
         os._exit(128 + self.number)
@@ -165,7 +165,7 @@ _watch = _Watch()
 
 @contextmanager
 def handled() -> Iterator[None]:
-    """Within, signals are handled, and interrupt `interruptible` code. Outside the main thread this does nothing."""
+    """Within the block signals are handled and interrupt `interruptible` code. No effect outside the main thread."""
     if threading.current_thread() is threading.main_thread():
         with _watch.handled():
             yield
@@ -175,28 +175,28 @@ def handled() -> Iterator[None]:
 
 @contextmanager
 def stopping(limit_s: float | None = END_S, action: Action = lambda: None) -> Iterator[Stop]:
-    """From here on a signal interrupts nothing but sets the yielded `Stop`, and the verb shuts down in an orderly way.
+    """From here on a signal only sets the yielded `Stop`, without interrupting, and the verb shuts down cleanly.
 
     Code after the block counts as part of that shutdown, unless it is `interruptible`.
 
     limit_s, action  see `Stop`
     """
     stop = _watch.stop = Stop(limit_s, action)
-    if _watch.number:  # it came just before
-        _watch.ask()
+    if _watch.number:  # a signal arrived just before
+        _watch.begin_shutdown()
     try:
         yield stop
     finally:
         stop.limit_s = END_S if limit_s is None else limit_s
         if _watch.number and limit_s is None:
-            _watch.ask()
+            _watch.begin_shutdown()
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Within, a signal raises KeyboardInterrupt; one that was received before does so at once.
+    """Within the block a signal raises KeyboardInterrupt; one received earlier does so immediately.
 
-    C libraries may turn it into other exceptions, which are treated as a KeyboardInterrupt.
+    C libraries may turn it into other exceptions, which are treated as KeyboardInterrupt.
     """
     stop, _watch.stop = _watch.stop, None
     try:
@@ -213,18 +213,18 @@ def interruptible() -> Iterator[None]:
 
 
 def hold() -> None:
-    """From here on a signal raises nothing before the next `check`.
+    """From here on a signal raises no exception before the next `check`.
 
     For code before `stopping` that uses PyGObject, which crashes if an exception is raised inside it.
     """
     _watch.stop = Stop()
     if _watch.number:
-        _watch.ask()
+        _watch.begin_shutdown()
 
 
 @contextmanager
 def urgent(action: Action) -> Iterator[None]:
-    """Within, an action to run, quickly and from any thread, if the process ends without an orderly shutdown."""
+    """Within the block, register a quick action to run, from any thread, if there is no clean shutdown."""
     _watch.urgent.append(action)
     try:
         yield
@@ -233,9 +233,9 @@ def urgent(action: Action) -> Iterator[None]:
 
 
 def check() -> None:
-    """For loops that wait while a signal interrupts nothing, after `hold` and `stopping`.
+    """For loops that wait while signals do not interrupt, after `hold` and `stopping`.
 
-    raises  KeyboardInterrupt, only in the main thread, if the verb is to end
+    raises  KeyboardInterrupt, only in the main thread, if the verb must end
     """
     if _watch.stop and _watch.stop.is_set() and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
@@ -247,6 +247,6 @@ def received() -> int:
 
 
 def _lifeline() -> int | None:
-    """The descriptor passed by the parent; not passed on to children of this process."""
+    """The descriptor passed by the parent, which children of this process do not inherit."""
     number = os.environ.pop(LIFELINE, "")
     return int(number) if number.isdecimal() else None

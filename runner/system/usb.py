@@ -1,4 +1,4 @@
-"""Bandwidth that V4L2 cameras need of the USB buses they share, as an estimate from their formats."""
+"""Estimates, from their formats, the USB bandwidth that V4L2 cameras need on the buses they share."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import NamedTuple
 from runner.core.model import Capture
 
 # Mbit/s of payload that a bus has for periodic transfers, by its speed in Mbit/s as sysfs states it. USB 2.0 gives them
-# at most 80 % of a microframe of 7500 bytes, in which 5 transactions of 1024 bytes and 38 of overhead fit;
+# at most 80 % of a microframe of 7500 bytes, enough for 5 transactions of 1024 bytes and 38 of overhead;
 # USB 3 gives them at most 90 % of what its line code (8b/10b, 128b/132b) leaves.
 BUDGET_MBPS = {480: 327, 5000: 3600, 10_000: 8700, 20_000: 17_400}
 RAW_BITS = {"YUY2": 16, "YVYU": 16, "UYVY": 16, "NV16": 16, "NV12": 12, "I420": 12, "YV12": 12, "RGB": 24, "BGR": 24}
-# Bits per pixel of the other formats. Compressed ones vary with picture and camera: a busy picture in good quality.
+# Bits per pixel of the other formats. Compressed ones vary with picture and camera: for a busy picture of good quality.
 BITS = {**RAW_BITS, "GRAY8": 8, "raw": 16, "mjpeg": 4, "h264": 0.3, "h265": 0.2}
 SYSFS = Path("/sys")
 
 
 class UsbCamera(NamedTuple):
-    """A camera and what it is asked to deliver; `fps` where its capture names none."""
+    """A camera and the capture requested from it; `fps` applies if the capture names none."""
 
     name: str
     device: Path
@@ -30,11 +30,11 @@ class UsbCamera(NamedTuple):
 
     @property
     def mbps(self) -> float | None:
-        """What it needs; None: unknown, the camera chooses."""
-        asked = self.capture
-        if not (asked.format and asked.width and asked.height):
+        """The bandwidth it needs; None: unknown, since the camera chooses the format."""
+        capture = self.capture
+        if not (capture.format and capture.width and capture.height):
             return None
-        return asked.width * asked.height * float(asked.fps or self.fps) * BITS[asked.format] / 1e6
+        return capture.width * capture.height * float(capture.fps or self.fps) * BITS[capture.format] / 1e6
 
 
 class Bus(NamedTuple):
@@ -56,14 +56,14 @@ class Bus(NamedTuple):
 
 
 def buses(cameras: Iterable[UsbCamera], sysfs: Path = SYSFS) -> Iterator[Bus]:
-    """The buses on which these cameras are, in order; cameras that are not on USB are left out."""
+    """The buses of these cameras, in order; cameras that are not on USB are left out."""
     found: dict[int, list[UsbCamera]] = {}
     for camera in cameras:
         number = _bus_of(camera.device, sysfs)
         if number is not None:
             found.setdefault(number, []).append(camera)
-    for number, there in sorted(found.items()):
-        needs = {camera.name: camera.mbps for camera in there}
+    for number, attached in sorted(found.items()):
+        needs = {camera.name: camera.mbps for camera in attached}
         yield Bus(
             number,
             int((sysfs / f"bus/usb/devices/usb{number}/speed").read_text()),

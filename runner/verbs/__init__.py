@@ -19,10 +19,10 @@ DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
 class Verb(NamedTuple):
     """A verb: a short description, its module, its arguments.
 
-    takes     meaning of words without =, any number of them; "": none are accepted
+    takes     meaning of its positional arguments, of which there may be any number; "": none are accepted
     sweeps    whether -m is accepted
-    composes  whether it reads a configuration, and so takes overrides
-    choices   the words that an argument may have, by argument; the first is the default
+    composes  whether it reads a configuration, and therefore takes overrides
+    choices   by argument, its possible values; the first is the default
     """
 
     summary: str
@@ -46,7 +46,7 @@ VERBS = {
         choices={"format": ("text", "json", "yaml")},
     ),
     "init": Verb(
-        "a directory of your own to start from",
+        "create a configuration directory of your own",
         "runner.verbs.init",
         ("files",),
         "DIR",
@@ -61,7 +61,7 @@ VERBS = {
         choices={"all": NO_YES},
     ),
     "replay": Verb(
-        "events in, decisions out, no video",
+        "turn events into decisions, without video",
         "runner.verbs.replay",
         ("input", "output", "log", "link", "positions", "topic"),
         sweeps=True,
@@ -75,11 +75,11 @@ VERBS = {
         ("camera", "duration_s", "loop"),
         choices={"loop": NO_YES},
     ),
-    "ros": Verb("the control link as topics of ROS", "runner.verbs.ros", ("duration_s",)),
+    "ros": Verb("the control link as ROS topics", "runner.verbs.ros", ("duration_s",)),
     "demo": Verb(
         "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
     ),
-    "record": Verb("each camera without loss into a file", "runner.verbs.record", ("output", "duration_s")),
+    "record": Verb("record each camera losslessly", "runner.verbs.record", ("output", "duration_s")),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "report": Verb(
         "the paper's figures from real drives",
@@ -88,7 +88,7 @@ VERBS = {
         DRIVE,
         composes=False,
     ),
-    "quality": Verb("measure the pictures that the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
+    "quality": Verb("measure the quality of what the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
     "map": Verb(
         "a bandwidth map from drives",
         "runner.verbs.map",
@@ -114,23 +114,23 @@ VERBS = {
     ),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
-    "completion": Verb("what completes words in bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
+    "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }
 
 
-SWEPT = ("total_kbps",)  # arguments over which -m sweeps, like over overrides; others may be paths with a comma
-# Flags of a Hydra application, and what stands in their place here.
-HYDRAS_FLAGS = {
+SWEPT = ("total_kbps",)  # arguments that -m sweeps like overrides; others may be paths that contain a comma
+# Flags of a Hydra application, and what replaces them here.
+HYDRA_FLAGS = {
     ("--multirun",): "write -m",
     ("--cfg", "-c"): "print format=yaml shows the composed configuration, and where each value comes from",
     ("--resolve",): "print format=yaml resolves interpolations",
     ("--package", "-p"): "print format=yaml shows the whole configuration",
     ("--info", "-i"): "print format=yaml shows which files were composed; validate all=true checks all of them",
     ("--config-dir", "-cd", "--config-path", "-cp"): "conf=DIR names a directory of your own",
-    ("--config-name", "-cn"): "conf=DIR may hold a config.yaml of your own",
+    ("--config-name", "-cn"): "conf=DIR may contain a config.yaml of your own",
     ("--run", "-r"): "a verb runs without a flag",
     ("--shell-completion", "-sc"): "tod-runner completion bash or zsh prints the script",
-    ("--hydra-help",): "docs/configuration.md says what of Hydra is supported",
+    ("--hydra-help",): "docs/configuration.md lists the supported parts of Hydra",
     ("--experimental-rerun",): "replay input=DRIVE repeats a drive with its own configuration",
 }
 
@@ -158,9 +158,9 @@ def extra_of(module: str) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Arguments:
-    """Words of the command line: a verb's own arguments, taken as literal text, and the overrides left for Hydra.
+    """The command line: a verb's own arguments, taken literally, and the overrides, which are left to Hydra.
 
-    words   those without =, if the verb takes any
+    words   positional arguments, if the verb takes any
     sweeps  whether -m was given
     """
 
@@ -173,9 +173,9 @@ class Arguments:
 
     @staticmethod
     def parse(verb: str, words: Sequence[str]) -> Arguments:
-        """Split the words. A path given to an argument may contain any character, since Hydra never sees it.
+        """Parse the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag other than -m, and for a name that only another verb or none takes
+        raises  UserError for a flag other than -m, and for a name that only another verb takes or that is misspelt
         """
         own = (*VERBS[verb].arguments, "conf")
         sweeps = VERBS[verb].sweeps and "-m" in words
@@ -201,7 +201,7 @@ class Arguments:
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
 
     def runs(self) -> list[tuple[tuple[str, ...], Arguments]]:
-        """The words and the arguments of each run that -m makes of sweeps.
+        """Overrides and arguments of each run that -m expands to.
 
         raises  ConfigError
         """
@@ -217,7 +217,7 @@ class Arguments:
         return made
 
     def in_directory(self, name: str, keys: Sequence[str]) -> Arguments:
-        """The same with directories, as far as they are given, replaced by one below them."""
+        """A copy in which each given directory is replaced by a subdirectory of it."""
         inner = {key: str(path / name) for key in keys if (path := self.path(key))}
         return replace(self, values=self.values | inner)
 
@@ -244,25 +244,25 @@ class Arguments:
 
     def path(self, key: str) -> Path | None:
         """A file or directory; None if not given."""
-        if self.values.get(key) == "":  # an unset variable of the shell, which would mean the current directory
+        if self.values.get(key) == "":  # an unset shell variable, which would mean the current directory
             raise UserError("command line", key, "''", "must not be empty")
         return Path(self.values[key]) if key in self.values else None
 
 
 def unknown_flag(word: str) -> UserError:
-    """What is wrong with a flag; one of Hydra's gets what stands in its place."""
+    """The error for a flag; for one of Hydra's it names the replacement."""
     name = word.partition("=")[0]
     if name == "-m":
-        sweeping = ", ".join(verb for verb, its in VERBS.items() if its.sweeps)
+        sweeping = ", ".join(verb for verb, spec in VERBS.items() if spec.sweeps)
         return UserError("command line", "", word, f"must follow one of {sweeping}")
-    rule = next((instead for names, instead in HYDRAS_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
+    rule = next((instead for names, instead in HYDRA_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
     return UserError("command line", "", word, f"flags are not supported; {rule}")
 
 
 def _check_name(verb: str, key: str) -> None:
     """Refuse words that cannot be overrides: an argument of another verb, or a misspelt name.
 
-    raises  UserError; names unlike any known one are left to the schema of the configuration
+    raises  UserError; names that resemble no known one are left to the schema of the configuration
     """
     if VERBS[verb].takes == DRIVE:  # these verbs read no configuration
         return
@@ -270,10 +270,10 @@ def _check_name(verb: str, key: str) -> None:
     own = (*VERBS[verb].arguments, "conf")
     configured = [*GROUPS, *schema_document("composed")["properties"]]
     if verb in ("model", "doctor"):
-        configured += schema_document("study")["properties"]  # keys of the study may be given alone there
+        configured += schema_document("study")["properties"]  # these verbs take keys of the study without `study.`
     if name in configured:
         return
-    takers = [other for other, its in VERBS.items() if name in its.arguments]
+    takers = [other for other, spec in VERBS.items() if name in spec.arguments]
     if takers:
         rule = f"is an argument of {', '.join(takers)}; {verb} has {', '.join(own)}"
         raise UserError("command line", name, None, rule)
@@ -283,6 +283,6 @@ def _check_name(verb: str, key: str) -> None:
 
 
 def study_word(word: str) -> str:
-    """An override of the verb `model`, where keys of conf/study/ may stand alone: metric=psnr is study.metric=psnr."""
+    """An override of `model`, where keys of conf/study/ need no section: metric=psnr is study.metric=psnr."""
     key = word.replace(".", "=").partition("=")[0]
     return f"study.{word}" if key in schema_document("study")["properties"] else word

@@ -1,15 +1,15 @@
 """usage: tod-runner completion bash|zsh
 
-Print the script by which the shell completes words: verbs, their arguments, groups and their files, those of your
-directory included (conf=DIR in the same line, or TOD_CONF), keys of the configuration, names of cameras, and the values
-of keys that have few.
+Prints the completion script of a shell. It completes verbs, their arguments, groups and their files, including those of
+your directory (conf=DIR on the same line, or TOD_CONF), configuration keys, camera names, and the values of keys that
+allow only a few.
 
   eval "$(tod-runner completion bash)"      # in ~/.bashrc
-  eval "$(tod-runner completion zsh)"       # in ~/.zshrc, behind compinit
+  eval "$(tod-runner completion zsh)"       # in ~/.zshrc, after compinit
   tod-runner completion bash > /etc/bash_completion.d/tod-runner
 """
 
-# Each TAB runs this: it imports nothing that takes long, neither Hydra nor OmegaConf.
+# Runs on every TAB, so it imports nothing slow: neither Hydra nor OmegaConf.
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _tod_runner() {
 }
 compdef _tod_runner tod-runner""",
 }
-WORDS = {"doctor": tuple(VERBS), "completion": tuple(SCRIPTS)}  # by verb, what stands without =
+WORDS = {"doctor": tuple(VERBS), "completion": tuple(SCRIPTS)}  # by verb, its positional arguments
 
 
 def run(arguments: Arguments) -> int:
@@ -61,44 +61,44 @@ def run(arguments: Arguments) -> int:
 
 
 def words(breaks: str, line: str) -> int:
-    """Print what may stand at the end of a line, one word a line; nothing if it is not known: files then.
+    """Print completions of the last word of a line, one per line. If there are none, the shell completes files.
 
-    breaks  characters at which the shell splits words beside blanks: it replaces only what follows the last one
+    breaks  characters other than blanks at which the shell splits words: it replaces only what follows the last one
     """
     before, _, last = line.rpartition(" ")
-    kept = max((last.rfind(character) for character in breaks), default=-1) + 1
+    start = max((last.rfind(character) for character in breaks), default=-1) + 1
     try:
         found = candidates(shlex.split(before)[1:], last)
-    except Exception:  # open quotes, a file with a mistake: its verb reports it, not a TAB
+    except Exception:  # unbalanced quotes, or an invalid file, which its verb will report
         return 1
     for word in found:
-        print(word[kept:])
+        print(word[start:])
     return 0
 
 
 def candidates(before: Sequence[str], last: str) -> list[str]:
-    """The words that may replace the last, unfinished one; `before`: those between the program and it."""
+    """The words that may replace the last, unfinished one; `before`: the words between the program and it."""
     found = _words(before[0], before[1:], last) if before else [*VERBS, "--help", "--version"]
-    # A key with nothing to offer behind its = is no word: the shell would put a blank behind it, in place of files.
+    # A key without known values is not offered: the shell would append a blank instead of completing files.
     return [word for word in dict.fromkeys(found) if word.startswith(last) and (word != last or word[-1] not in "=.")]
 
 
 def _words(verb: str, before: Sequence[str], last: str) -> Iterator[str]:
     if verb not in VERBS:
         return
-    its = VERBS[verb]
+    spec = VERBS[verb]
     yield from WORDS.get(verb, ())
-    yield from (["-m"] if its.sweeps and "-m" not in before else [])
-    yield from (f"{name}=" for name in its.arguments)
+    yield from (["-m"] if spec.sweeps and "-m" not in before else [])
+    yield from (f"{name}=" for name in spec.arguments)
     if "=" in last:
-        yield from (f"{name}={value}" for name, values in its.choices.items() for value in values)
-    if its.composes:
+        yield from (f"{name}={value}" for name, values in spec.choices.items() for value in values)
+    if spec.composes:
         yield "conf="
-        yield from _overrides(_Place(before), last, ("study",) if verb in ("model", "doctor") else ())
+        yield from _overrides(_Selection(before), last, ("study",) if verb in ("model", "doctor") else ())
 
 
-class _Place:
-    """The directories and the vehicle that words of a command line choose."""
+class _Selection:
+    """The configuration directories and the vehicle that a command line selects."""
 
     def __init__(self, given: Sequence[str]) -> None:
         chosen = dict(word.partition("=")[::2] for word in given)
@@ -114,7 +114,7 @@ class _Place:
         return self._cameras(self._vehicle, set())
 
     def _cameras(self, vehicle: str, seen: set[str]) -> Iterator[str]:
-        """Names of the cameras that a vehicle's file mounts, and those that it builds on."""
+        """Names of the cameras that a vehicle's file mounts, and of those mounted by the files it builds on."""
         if vehicle in seen:
             return
         content = _content(find_file(self.directories, "vehicle", vehicle))
@@ -132,59 +132,59 @@ def _content(path: Path) -> dict[str, Any]:
     return content
 
 
-def _overrides(place: _Place, last: str, alone: Sequence[str]) -> Iterator[str]:
-    """Overrides that begin like a word: a group with a file, a key with a value, or the beginning of a longer key.
+def _overrides(selection: _Selection, last: str, implicit: Sequence[str]) -> Iterator[str]:
+    """Overrides that may complete a word: a group with a file, a key with a value, or a prefix of a longer key.
 
-    alone  sections whose keys may be given without the name of the section
+    implicit  sections whose keys may be given without the section's name
     """
     plain = last.lstrip("+~")
     sign = last[: len(last) - len(plain)]
     key, equals, _ = plain.partition("=")
     group = key.partition("@")[0].lstrip("/")
     if equals and group in GROUPS:
-        yield from (f"{sign}{key}={name}" for name in options(group, place.directories))
+        yield from (f"{sign}{key}={name}" for name in options(group, selection.directories))
     elif equals:
-        yield from (f"{sign}{key}={value}" for value in _values(_found(key.split("."), alone)))
+        yield from (f"{sign}{key}={value}" for value in _values(_schema_of(key.split("."), implicit)))
     else:
-        for name in _names(key, place, alone):
+        for name in _names(key, selection, implicit):
             yield f"{sign}{name.rstrip('=.' if '.' in key else '=') if sign == '~' else name}"
 
 
-def _names(key: str, place: _Place, alone: Sequence[str]) -> Iterator[str]:
+def _names(key: str, selection: _Selection, implicit: Sequence[str]) -> Iterator[str]:
     """Groups and keys, one level at a time."""
     above, dot, _ = key.rpartition(".")
     if not dot:
         yield from (f"{group}=" for group in GROUPS if group != "cameras")  # vehicles mount these
-        for section in alone:
+        for section in implicit:
             yield from (f"{name}=" for name in schema_document(section)["properties"])
     if above == "cameras":
-        yield from (f"cameras.{name}." for name in place.cameras())
+        yield from (f"cameras.{name}." for name in selection.cameras())
         return
-    for name, (node, _) in _properties(*_found(above.split(".") if above else [], ())).items():
+    for name, (node, _) in _properties(*_schema_of(above.split(".") if above else [], ())).items():
         deeper = "properties" in node or isinstance(node.get("additionalProperties"), dict)
         yield f"{above}{dot}{name}{'.' if deeper else '='}"
 
 
-def _found(steps: Sequence[str], alone: Sequence[str]) -> tuple[dict[str, Any], str]:
-    """The schema of a key, and the name of the file that holds it; an empty one if there is no such key."""
-    home = next((section for section in alone if steps[0] in schema_document(section)["properties"]), "composed")
+def _schema_of(steps: Sequence[str], implicit: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """The schema of a key, and the name of the file that contains it; empty if there is no such key."""
+    home = next((section for section in implicit if steps[0] in schema_document(section)["properties"]), "composed")
     node = schema_document(home)
     for step in steps:
         other = node.get("additionalProperties")
-        node, home = _properties(node, home).get(step) or _followed(other if isinstance(other, dict) else {}, home)
+        node, home = _properties(node, home).get(step) or _resolved(other if isinstance(other, dict) else {}, home)
     return node, home
 
 
 def _properties(node: dict[str, Any], home: str) -> dict[str, tuple[dict[str, Any], str]]:
-    """The keys of a mapping, those included that it has only together with certain values of others."""
+    """The keys of a mapping, including those that exist only for certain values of other keys."""
     found = {}
     for part in node.get("allOf", ()):
-        found.update(_properties(*_followed(part.get("then", part), home)))
-    found |= {name: _followed(inner, home) for name, inner in node.get("properties", {}).items() if name != "defaults"}
+        found.update(_properties(*_resolved(part.get("then", part), home)))
+    found |= {name: _resolved(inner, home) for name, inner in node.get("properties", {}).items() if name != "defaults"}
     return found
 
 
-def _followed(node: dict[str, Any], home: str) -> tuple[dict[str, Any], str]:
+def _resolved(node: dict[str, Any], home: str) -> tuple[dict[str, Any], str]:
     while "$ref" in node:
         node, home = referred(node["$ref"], home)
     return node, home

@@ -1,12 +1,12 @@
 """usage: tod-runner convert FILE output=DIR [vehicle=NAME] bag=BAG [overwrite=true]
        tod-runner convert FILE output=DIR [vehicle=NAME] width_px=N height_px=N fps=N [overwrite=true]
 
-Makes a vehicle of the camera list of the paper's own implementation in ROS (sensors-camera.yaml): each camera with its
+Converts the camera list of the paper's own ROS implementation (sensors-camera.yaml) to a vehicle: each camera with its
 scaling factors, its transition bitrates as b_min and b_full, and its topic. Writes DIR/vehicle/NAME.yaml, named after
 FILE unless vehicle= is given, and DIR/cameras/NAME_CAMERA.yaml for each camera.
 
 The list states neither sizes nor frame rates: they come from the first pictures of each camera's topic in a bag, or are
-the same for all cameras. Files that exist are kept, and the verb ends with status 2, unless overwrite=true.
+the same for all cameras. Existing files are kept, and the verb ends with status 2, unless overwrite=true.
 
   tod-runner convert sensors-camera.yaml output=my_vehicles vehicle=van bag=drive.bag
   tod-runner convert sensors-camera.yaml output=my_vehicles vehicle=van width_px=1280 height_px=800 fps=30
@@ -41,7 +41,7 @@ SIZE_KEYS = ("width_px", "height_px", "fps")
 
 
 def run(arguments: Arguments) -> int:
-    file, output = _wanted(arguments)
+    file, output = _paths(arguments)
     cameras, notes = read_camera_list(file)
     name = arguments.values.get("vehicle", file.stem)
     if not (NAME.fullmatch(name) and choosable(name)):
@@ -64,22 +64,22 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
-def _wanted(arguments: Arguments) -> tuple[Path, Path]:
-    """The list, and the directory of the files."""
+def _paths(arguments: Arguments) -> tuple[Path, Path]:
+    """The camera list, and the output directory."""
     if arguments.overrides:
-        rule = "a conversion has no configuration; see --help"
+        rule = "convert reads no configuration; see --help"
         raise UserError(COMMAND_LINE, "", arguments.overrides[0], rule)
     if len(arguments.words) != 1:
         found = " ".join(arguments.words) or None
         raise UserError(COMMAND_LINE, "", found, "must name one file: the camera list, sensors-camera.yaml")
     output = arguments.path("output")
     if output is None:
-        raise UserError(COMMAND_LINE, "output", None, "must be given: the directory that the files are written to")
+        raise UserError(COMMAND_LINE, "output", None, "must be given: the directory to write the files to")
     return Path(arguments.words[0]), output
 
 
 def _size(arguments: Arguments) -> CameraSize:
-    """The size that all cameras have."""
+    """The size given for all cameras."""
     missing = [f"{key}=" for key in SIZE_KEYS if key not in arguments.values]
     if missing:
         rule = "sizes and frame rates must be given: bag=BAG with pictures of each camera, or width_px= height_px= fps="
@@ -111,7 +111,7 @@ def _sizes_of_bag(cameras: Sequence[ListedCamera], path: Path) -> list[CameraSiz
 
 
 def _check(where: str, cameras: Sequence[ListedCamera], documents: Sequence[object]) -> None:
-    """Check that each camera's file will be valid: its size and rate may not be."""
+    """Check each camera's file against its schema: size or rate may be invalid."""
     entries = [f"{camera.entry}." if where != COMMAND_LINE else "" for camera in cameras]
     problems = [
         Problem(where, f"{entry}{schema.dotted(finding.path)}", finding.found, finding.rule)

@@ -1,18 +1,18 @@
 """usage: tod-runner demo [-m] [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
 
-Both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a drive
-through a bandwidth map in mode A. Open the page that it names, http://127.0.0.1:8090/, in a browser; the table in the
-terminal shows the same. Every camera runs at 5 Hz for each core, which carries the eight cameras of tum_q7, both sides
-and a browser without a GPU; give fps_max=40, or null for the cameras' own rates.
+Runs both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a
+drive through a bandwidth map in mode A. Open the page that it prints, http://127.0.0.1:8090/, in a browser; the table
+in the terminal shows the same. Every camera runs at 5 Hz for each core, which is enough for the eight cameras of
+tum_q7, both sides and a browser without a GPU; to change this, give fps_max=40, or null for the cameras' own rates.
 
-With log=DIR both sides write their logs to DIR. With output=OUT a report is made at the end, as by the verb report
-(models= is passed to it); the drive is then stored in OUT/drive, unless log= names another directory. An experiment
-defines the drives; one with several runs makes several drives and compares them. With link= a link of limited rate
-connects both sides. keys= names the directory with everybody's keys, see the verb keys.
+With log=DIR both sides write their logs to DIR. With output=OUT a report is written at the end, as by the verb report
+(models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment
+defines the drives; one with several runs makes several drives and compares them. With link= a rate-limited link
+connects both sides. keys= names the directory with everyone's keys, see the verb keys.
 
-With -m commas and range() are sweeps: each combination of values is a run, one after the other, as if started alone
-with output=OUT/0, OUT/1, ..., and with log=DIR/0, DIR/1, ...; all are checked before the first one starts.
-OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each: its directory and its overrides.
+With -m, commas and range() define a sweep: each combination of values is a run. Runs follow one another, each as if
+started separately with output=OUT/0, OUT/1, ... and log=DIR/0, DIR/1, ...; all are checked before the first one starts.
+OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each run: its directory and its overrides.
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo duration_s=3600                             an hour
@@ -20,7 +20,7 @@ OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each: its directory and its ov
   tod-runner demo source=file source.clip=clip.mp4            every camera shows your clip
   tod-runner demo pqos.file=tum_bandwidth_map.yaml            along another map
   tod-runner demo experiment=driving_test output=OUT          the paper's driving test, with its figures
-  tod-runner demo experiment=bottleneck output=OUT            three ways to share a link that is really limited
+  tod-runner demo experiment=bottleneck output=OUT            three ways to share a rate-limited link
   tod-runner demo -m modes=paper,safe output=OUT              the same drive under other rules
   tod-runner demo link=netns link.file=uplink.csv output=OUT  an uplink of your own; as root
 """
@@ -57,11 +57,11 @@ from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
 
 FPS_PER_CORE = 5  # Hz; eight cameras are encoded, sent, decoded and shown at this rate without falling behind
-LOOK_S = 0.05  # how soon after a side's end the other is stopped
+LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
 DIRECTORIES = ("output", "log")  # arguments that get a directory for each run of a sweep
-DRIVE = "drive"  # where a drive is stored below output=
+DRIVE = "drive"  # subdirectory of output= in which a drive is stored
 
 
 class _Run(NamedTuple):
@@ -69,7 +69,7 @@ class _Run(NamedTuple):
 
     arguments   with the overrides of this one
     directory   where it is logged; None: not logged
-    document    its composed configuration
+    document    composed configuration
     duration_s  of the drive
     keys        of broker and both sides; None: nothing is encrypted
     """
@@ -98,30 +98,30 @@ def run(arguments: Arguments) -> int:
     apply = streaming()
     if arguments.sweeps:
         return _sweep(arguments, apply)
-    _carry_out(_prepared_demo(arguments, apply))
+    _run_demo(_prepare_demo(arguments, apply))
     return 0
 
 
 def _sweep(arguments: Arguments, apply: ModuleType) -> int:
     """The demos of a sweep, one after the other."""
-    from runner.verbs.sweep import prepared
+    from runner.verbs.sweep import prepare_all
 
     places = {key: path for key in DIRECTORIES if (path := arguments.path(key))}
     for key, place in places.items():
         _check_empty(key, place)
     numbers = count()
-    demos = prepared(arguments, lambda own: _prepared_demo(own.in_directory(str(next(numbers)), DIRECTORIES), apply))
+    demos = prepare_all(arguments, lambda own: _prepare_demo(own.in_directory(str(next(numbers)), DIRECTORIES), apply))
     lines = [json.dumps({"directory": str(number), "overrides": words}) for number, (words, _) in enumerate(demos)]
     for place in places.values():
         write_whole(place / "runs.jsonl", "".join(f"{line}\n" for line in lines).encode())
     for number, (words, demo) in enumerate(demos, 1):
         say(f"run {number} of {len(demos)}: {' '.join(words)}, {sum(one.duration_s for one in demo.runs):g} s")
-        _carry_out(demo)
+        _run_demo(demo)
     return 0
 
 
-def _prepared_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
-    """What a demo needs, checked before it begins."""
+def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
+    """Collect and check everything a demo needs, before it begins."""
     arguments, config = _with_rate(arguments)
     experiment, link = config.experiment(), config.link()
     output, models = arguments.path("output"), arguments.path("models")
@@ -131,13 +131,14 @@ def _prepared_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
     elif models:
         raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
     runs = [
-        _prepared(arguments, name, words, config, link, apply) for name, words in (experiment.runs or {"": ()}).items()
+        _prepare_run(arguments, name, words, config, link, apply)
+        for name, words in (experiment.runs or {"": ()}).items()
     ]
     bases = [base / "cameras" for base in conf_directories(arguments.conf)]
     return _Demo(experiment.about, runs, output, models, bases)
 
 
-def _carry_out(demo: _Demo) -> None:
+def _run_demo(demo: _Demo) -> None:
     if demo.about:
         say(demo.about)
     driven = list[Path]()
@@ -161,11 +162,12 @@ def _check_empty(key: str, directory: Path) -> None:
     except OSError as error:
         raise UserError("command line", key, repr(str(directory)), (error.strerror or str(error)).lower()) from None
     if found:
-        rule = f"must be a new or an empty directory, holds {', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
+        names = f"{', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
+        rule = f"must be a new or empty directory, but contains {names}"
         raise UserError("command line", key, repr(str(directory)), rule)
 
 
-def _prepared(
+def _prepare_run(
     arguments: Arguments,
     name: str,
     words: Sequence[str],
@@ -173,7 +175,7 @@ def _prepared(
     link: LinkSettings | None,
     apply: ModuleType,
 ) -> _Run:
-    """What a drive needs, checked before the first one begins; `config` and `link` are those of a run without words."""
+    """Check what a drive needs before the first one begins; `config` and `link` are those of a run without words."""
     own = replace(arguments, overrides=[*arguments.overrides, *words])
     directory = _directory(arguments, name)
     if words:
@@ -246,7 +248,7 @@ def _drive(run: _Run) -> None:
             for part in (broker, link, vehicle):
                 if part:
                     part.check()
-            status = operator.poll()  # asked once: it may end at any moment, and at the end that is no fault
+            status = operator.poll()  # polled once: it may end at any moment, and after duration_s that is expected
             if status == 0 and time.monotonic() >= began + run.duration_s:
                 break
             if status is not None:
@@ -287,7 +289,7 @@ def _end(sides: Iterable[VerbProcess]) -> None:
     """Ask both sides to end, and kill those that do not."""
     until = time.monotonic() + SIDE_END_S
     for side in sides:
-        side.ask()
+        side.request_end()
     for side in sides:
         if not children.end(side.process, max(0.0, until - time.monotonic())):
             say(f"{side.name} did not end within {SIDE_END_S:g} s and was killed")
@@ -311,7 +313,7 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
 
 
 def _began(directory: Path) -> float | None:
-    """When the vehicle's side began to drive, s since 1970; None: not yet."""
+    """Start time of the vehicle's side, s since 1970; None: it has not started yet."""
     try:
         with (directory / FILES["vehicle"]).open(encoding="utf-8") as file:
             return float(json.loads(file.readline())["time"])

@@ -1,8 +1,8 @@
 """usage: tod-runner doctor [VERB] [OVERRIDE ...]
 
-What this machine lacks for a verb with this configuration, and how to get it: Python packages, GStreamer and its
-bindings, elements, broker, free ports, cameras and the USB bandwidth they share, cores. The default verb is `demo`,
-which needs everything that both sides need. Ends with status 1 if something is missing.
+Lists what this machine lacks to run a verb with this configuration, and how to install it: Python packages, GStreamer
+and its bindings, elements, broker, free ports, cameras and the USB bandwidth they share, cores. The default verb is
+`demo`, which needs everything that both sides need. Ends with status 1 if something is missing.
 
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
@@ -27,8 +27,8 @@ from runner.system.ports import check_port_free
 from runner.system.usb import UsbCamera, buses
 from runner.verbs import EXTRAS, VERBS, Arguments, study_word
 
-IMPORT_S = 30  # rclpy or rospy is loaded within a second
-CORE_MPX_S = 180  # cropped, scaled and encoded by one core per second at factor 0.5, measured with h264_rtsp
+IMPORT_S = 30  # rclpy or rospy loads within a second
+CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
 STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
 NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
@@ -76,9 +76,9 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     """Everything that a verb needs with this configuration."""
     for extra in _extras(verb, vehicle, document):
         for module in EXTRAS[extra]:
-            there = find_spec(module) is not None
-            hint = "" if there else f": install the extra {extra}, see docs/install.md"
-            yield Diagnosis(there, f"Python module {module}{hint}")
+            found = find_spec(module) is not None
+            hint = "" if found else f": install the extra {extra}, see docs/install.md"
+            yield Diagnosis(found, f"Python module {module}{hint}")
     if verb in STREAMING:
         bindings = list(_bindings())
         yield from bindings
@@ -118,9 +118,9 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
 
 
 def _ros_library(settings: RosSettings) -> Diagnosis:
-    """Another Python, which must have rclpy or rospy."""
+    """The Python interpreter of the ROS node, which must have rclpy or rospy."""
     from runner.ros.node.start import LIBRARIES
-    from runner.ros.process import MAKE
+    from runner.ros.process import INSTALL_HINT
 
     library = LIBRARIES[settings.version]
     try:
@@ -129,7 +129,7 @@ def _ros_library(settings: RosSettings) -> Diagnosis:
         why = None if done.returncode == 0 else done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
     except (OSError, subprocess.TimeoutExpired) as error:
         why = str(error)
-    hint = f": {why}; {MAKE[settings.version]}, see docs/ros.md" if why is not None else ""
+    hint = f": {why}; {INSTALL_HINT[settings.version]}, see docs/ros.md" if why is not None else ""
     return Diagnosis(why is None, f"{library} for ros.python {settings.interpreter}{hint}")
 
 
@@ -144,7 +144,7 @@ def _bindings() -> Iterator[Diagnosis]:
 
 
 def _elements(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
-    """GStreamer's elements: of one side for its own verb, otherwise all."""
+    """GStreamer elements: those of one side for its own verb, otherwise all."""
     from runner.apply import missing_plugins, missing_recorders
 
     lines, missing = [], dict[str, None]()
@@ -196,8 +196,8 @@ def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
         device = camera.mount.get("device", camera.source.settings.get("device"))
         if "device" in camera.source.needs and device is not None:
             path = Path(str(device))
-            there = path.is_char_device()
-            yield Diagnosis(there, f"camera {camera.name}: {path}{'' if there else ' is no device file'}")
+            found = path.is_char_device()
+            yield Diagnosis(found, f"camera {camera.name}: {path}{'' if found else ' is not a device file'}")
             cameras.append(UsbCamera(camera.name, path, camera.capture, camera.fps))
     for bus in buses(cameras):
         need = f"about {bus.mbps:.0f} of {bus.budget_mbps:.0f} Mbit/s"
@@ -205,7 +205,7 @@ def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
         if bus.unknown:
             what += f", without {', '.join(bus.unknown)}, whose capture does not state format and size"
         fits = bus.mbps <= bus.budget_mbps
-        yield Diagnosis(fits, what if fits else f"{what}: choose mjpeg, fewer fps, or another bus")
+        yield Diagnosis(fits, what if fits else f"{what}: choose mjpeg, a lower fps, or another bus")
 
 
 def _cores(vehicle: Vehicle) -> Diagnosis:

@@ -1,18 +1,18 @@
 """usage: tod-runner export DRIVE [format=mcap] [output=FILE.mcap]
        tod-runner export DRIVE format=rosbag2 [output=DIR]
 
-Export a drive as MCAP, for Foxglove and any other reader of MCAP, or as a ROS 2 bag. DRIVE is a directory that log=DIR
+Exports a drive as MCAP, for Foxglove and any other MCAP reader, or as a ROS 2 bag. DRIVE is a directory that log=DIR
 wrote; all of its logs (vehicle, operator, link) are exported to DRIVE/drive.mcap, or DRIVE/rosbag2, unless output=
-names another one.
+names another path.
 
   /position               foxglove.LocationFix
-  /CAMERA/video           foxglove.CompressedVideo, as sent, at the times of capture (drives with log.video=true)
-  /CAMERA/video_received  the same as received
+  /CAMERA/video           foxglove.CompressedVideo, as sent, at capture times (drives with log.video=true)
+  /CAMERA/video_received  the same, as received
   /notes                  foxglove.Log
   /events/..., /decision, /telemetry, /operator/state, /operator/sample, /link    JSON with its schema
 
-In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/CompressedImage, one access unit each in the
-format h264 or h265, and everything else std_msgs/String with the line of JSON.
+In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/CompressedImage, one access unit per message in
+the format h264 or h265, and everything else is std_msgs/String with the line of JSON.
 
   tod-runner demo log=monday log.video=true
   tod-runner export monday
@@ -38,7 +38,7 @@ from runner.system.files import unfinished, unfinished_directory
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar, streaming
 
-OUTPUTS = {"mcap": "drive.mcap", "rosbag2": "rosbag2"}  # by format, the file in the drive
+OUTPUTS = {"mcap": "drive.mcap", "rosbag2": "rosbag2"}  # by format, the default path in the drive's directory
 QUIET_S = 2.0  # a shorter export shows no progress
 
 
@@ -50,18 +50,18 @@ def run(arguments: Arguments) -> int:
     directory = Path(arguments.words[0])
     output = arguments.path("output") or directory / OUTPUTS[form]
     if os.path.lexists(output):
-        rule = "already exists; remove it, or name another one by output="
+        rule = "already exists; remove it, or choose another path with output="
         raise UserError("command line", "output", repr(str(output)), rule)
     if arguments.overrides:
         raise UserError(
-            "command line", "", arguments.overrides[0], "an export has no configuration, only format= and output="
+            "command line", "", arguments.overrides[0], "export takes no overrides, only format= and output="
         )
     drive = read_drive(directory)
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
     filmed = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
-    read_video = streaming().read_video if filmed else _nothing
-    with _later(f"{output}") as progress:
+    read_video = streaming().read_video if filmed else _no_video
+    with _delayed_progress(f"{output}") as progress:
         count = WRITERS[form](drive, output, read_video, lambda what: print(what, file=sys.stderr), progress)
     size = sum(path.stat().st_size for path in (output.iterdir() if output.is_dir() else [output]))
     print(f"{output}: {count} messages, {size / 1e6:.1f} MB")
@@ -71,7 +71,7 @@ def run(arguments: Arguments) -> int:
 def _write_mcap(drive: Drive, output: Path, *more: Any) -> int:
     from runner.drive.mcap import write_mcap
 
-    with _new(output) as file:
+    with _new_file(output) as file:
         return write_mcap(drive, file, *more)
 
 
@@ -88,13 +88,13 @@ def _write_rosbag2(drive: Drive, output: Path, *more: Any) -> int:
 WRITERS = {"mcap": _write_mcap, "rosbag2": _write_rosbag2}
 
 
-def _nothing(_path: Path) -> Iterator[Any]:
+def _no_video(_path: Path) -> Iterator[Any]:
     return iter(())
 
 
 @contextmanager
-def _new(path: Path) -> Iterator[BinaryIO]:
-    """A new file, which exists only when it is complete."""
+def _new_file(path: Path) -> Iterator[BinaryIO]:
+    """A new file, which appears only when it is complete."""
     try:
         with unfinished(path) as part, _opened(part, path) as file:
             yield file
@@ -110,14 +110,14 @@ def _opened(part: Path, path: Path) -> BinaryIO:
 
 
 @contextmanager
-def _later(what: str) -> Iterator[Callable[[float], None]]:
+def _delayed_progress(what: str) -> Iterator[Callable[[float], None]]:
     """Progress of long work, shown once it has lasted `QUIET_S`."""
     began = time.monotonic()
-    with progress_bar() as tell:
+    with progress_bar() as show:
 
         def progress(done: float) -> None:
             signals.check()
             if time.monotonic() - began > QUIET_S:
-                tell(what, done)
+                show(what, done)
 
         yield progress

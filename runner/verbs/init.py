@@ -1,11 +1,11 @@
 """usage: tod-runner init DIR [files=all|schemas]
 
-A directory to start from: a vehicle with two cameras, a kind of camera, a modes file, checks for GitHub Actions and for
-pre-commit, and in DIR/.schemas the schemas by which your editor completes, explains and checks keys. It passes
-`validate` as it is. Files that exist are never overwritten: then nothing is written, and each is named. A new
-directory appears when it is complete.
+Creates a configuration directory to start from: a vehicle with two cameras, a kind of camera, a modes file, checks for
+GitHub Actions and for pre-commit, and in DIR/.schemas the schemas with which your editor completes, explains and checks
+keys. It passes `validate` unchanged. Existing files are never overwritten: if there are any, nothing is written and
+each is listed. A new directory appears only when it is complete.
 
-With files=schemas only the schemas are written: for a directory that you have, and after an update.
+With files=schemas only the schemas are written: for an existing directory, and after an update.
 
   tod-runner init my_fleet
   tod-runner validate conf=my_fleet
@@ -26,7 +26,7 @@ from runner.errors import ConfigError, Problem, UserError
 from runner.verbs import Arguments
 
 VEHICLE = "my_vehicle"
-STARTING = {  # by path in the directory, the file in static/
+TEMPLATES = {  # by path in the directory, the file in static/
     f"vehicle/{VEHICLE}.yaml": "vehicle.yaml",
     "cameras/my_camera.yaml": "camera.yaml",
     "modes/my_modes.yaml": "modes.yaml",
@@ -39,9 +39,9 @@ def run(arguments: Arguments) -> int:
     everything = arguments.choice("files") == "all"
     if len(arguments.words) != 1 or arguments.overrides:
         found = " ".join([*arguments.words, *arguments.overrides])
-        raise UserError("command line", "", found or None, "must be one directory, and nothing to compose: init DIR")
+        raise UserError("command line", "", found or None, "must be one directory and no overrides: init DIR")
     place = Path(arguments.words[0])
-    texts = {**(_starting() if everything else {}), **copies()}
+    texts = {**(_templates() if everything else {}), **copies()}
     if problems := list(dict.fromkeys(_problems(place, texts))):
         raise ConfigError(problems, "nothing was written")
     _write(place, texts)
@@ -51,24 +51,24 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
-def _starting() -> dict[str, str]:
+def _templates() -> dict[str, str]:
     static = Path(__file__).parent / "static"
-    return {name: (static / file).read_text(encoding="utf-8") for name, file in STARTING.items()}
+    return {name: (static / file).read_text(encoding="utf-8") for name, file in TEMPLATES.items()}
 
 
 def _problems(place: Path, texts: Mapping[str, str]) -> Iterator[Problem]:
-    """What stands where something is to be written."""
+    """What already exists where a file or directory must be written."""
     for name in texts:
         path = place / name
         above = [folder for folder in path.parents if os.path.lexists(folder) and not folder.is_dir()]
         if above:
             yield Problem(str(above[0]), "", None, "must be a directory")
         elif os.path.lexists(path):
-            yield Problem(str(path), "", None, "exists, and init overwrites nothing")
+            yield Problem(str(path), "", None, "already exists; init overwrites nothing")
 
 
 def _write(place: Path, texts: Mapping[str, str]) -> None:
-    """Write all files or none. A new or an empty directory is made beside its place and then put there."""
+    """Write all files or none. A new or empty directory is built under a temporary name and then renamed."""
     if place.is_dir() and any(place.iterdir()):
         _fill(place, texts)
         return
@@ -85,7 +85,7 @@ def _write(place: Path, texts: Mapping[str, str]) -> None:
 
 
 def _fill(place: Path, texts: Mapping[str, str]) -> None:
-    """Write files into a directory; if one fails, all are removed again."""
+    """Write files into a directory; if one cannot be written, remove the others again."""
     with ExitStack() as made:
         for name, text in texts.items():
             path = place / name

@@ -1,18 +1,18 @@
 """usage: tod-runner keys output=DIR [vehicle=NAME] [controller=NAME] [watcher=NAME] [predictor=NAME] [positioner=NAME]
                               [broker=HOST] [host=HOST[,HOST...]] [rotate=NAME] [revoke=NAME]
 
-Make the keys that vehicles, operators and broker need once they talk over a network: a certificate authority in
-DIR/authority, the broker's files in DIR/broker, and DIR/NAME for everybody else. Copy each directory to its machine, as
-it is; DIR/authority stays. What exists is kept, so that names can be added at any time.
+Creates the keys that vehicles, operators and the broker need to communicate over a network: a certificate authority in
+DIR/authority, the broker's files in DIR/broker, and DIR/NAME for everyone else. Copy each directory unchanged to its
+machine; DIR/authority stays where it is. Existing keys are kept, so names can be added at any time.
 
   vehicle     its `name` in the configuration     host  addresses or DNS names of that vehicle, or of an operator whose
   controller  an operator who may drive                 page is served to other machines
-  watcher     sees the pictures                   broker  address or DNS name of the machine with the MQTT broker
+  watcher     an operator who may only watch      broker  address or DNS name of the machine with the MQTT broker
   predictor   sends predicted bitrates
   positioner  sends positions and steering angles
 
-rotate=NAME replaces keys and passwords, revoke=NAME withdraws them. Both take effect where the changed directories are
-copied to; the last line of the output names these. A certificate is valid for a year.
+rotate=NAME replaces keys and passwords, revoke=NAME withdraws them. Both take effect on a machine once its changed
+directory has been copied there; the last line of the output lists these directories. A certificate is valid for a year.
 
   tod-runner keys output=keys vehicle=tum_q7 host=10.0.0.2 controller=alice broker=10.0.0.1
   tod-runner keys output=keys watcher=bob
@@ -32,10 +32,10 @@ ROLES = (Role.VEHICLE, *PEOPLE)
 
 def run(arguments: Arguments) -> int:
     if arguments.overrides:
-        raise UserError("command line", "", arguments.overrides[0], "keys need no configuration; see --help")
+        raise UserError("command line", "", arguments.overrides[0], "keys reads no configuration; see --help")
     output = arguments.path("output")
     if output is None:
-        raise UserError("command line", "output", None, "must be given, the directory of all keys")
+        raise UserError("command line", "output", None, "must be given: the directory for all keys")
     values = arguments.values
     hosts = tuple(filter(None, values.get("host", "").split(",")))
     named = [role for role in ROLES if role in values]
@@ -52,7 +52,7 @@ def run(arguments: Arguments) -> int:
                 changed.append(name)
         for issued in authority.holders():
             print(_described(issued))
-        to_copy = sorted({*changed, *(each.name for each in authority.holders() if changed)} & set(_present(authority)))
+        to_copy = sorted({*changed, *(each.name for each in authority.holders() if changed)} & set(_active(authority)))
     if changed:
         print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
     return 0
@@ -63,7 +63,7 @@ def _hosts_of(role: Role, named: list[Role], hosts: tuple[str, ...]) -> tuple[st
     return hosts if role is Role.VEHICLE or Role.VEHICLE not in named else ()
 
 
-def _present(authority: Authority) -> list[str]:
+def _active(authority: Authority) -> list[str]:
     return [issued.name for issued in authority.holders() if not issued.revoked]
 
 

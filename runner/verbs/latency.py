@@ -1,12 +1,12 @@
 """usage: tod-runner latency camera=NAME [OVERRIDE ...] [duration_s=20] [loop=false]
 
 Measures glass-to-glass latency: a camera of the vehicle films this machine's screen, on which one page shows a
-counter, and another page shows the camera's picture and reads the counter in it. Both pages use this machine's clock:
-no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, with Ctrl-C, or
-if no counter was read for five minutes.
+counter, and another page shows the camera's picture and reads the counter in it. Both pages use this machine's clock,
+so no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, with Ctrl-C,
+or if no counter was read for five minutes.
 
-Prints what was measured, what the operator's page states for the same pictures, from capture to drawing, what camera
-and screen add, which is the difference, and latency.fixed_ms for the vehicle's YAML.
+Prints the measured latency; the latency from capture to drawing that the operator's page states for the same pictures;
+the difference, which camera and screen add; and latency.fixed_ms for the vehicle's YAML.
 
 With loop=true the vehicle's side runs here, too, and its camera delivers drawn pictures of the counter. Without camera
 and screen in between, the difference shows how far the page's latency can be trusted.
@@ -49,7 +49,7 @@ MOST_READINGS = 20_000  # the newest ones count
 
 
 class _Notes(Listener):
-    """Shows what the operator's side notes."""
+    """Prints the notes of the operator's side."""
 
     def on_note(self, note: Note) -> None:
         say(note.text)
@@ -76,7 +76,7 @@ def run(arguments: Arguments) -> int:
     with ExitStack() as stack:
         if looped:
             stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None))
-            stack.enter_context(_filmed(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
+            stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
         own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
         operator = stack.enter_context(live_operator(own, arguments.conf))
         page = PageServer(operator.vehicle, operator.station, on_counter)
@@ -85,11 +85,11 @@ def run(arguments: Arguments) -> int:
         operator.station.listeners += [page, _Notes()]
         if not looped:
             say(f"show {page.url}counter on this machine's screen to camera {camera.name}")
-        say(f"open {page.url}#counter={camera.name} on this machine; a page must not be covered by another")
+        say(f"open {page.url}#counter={camera.name} on this machine; neither page may cover the other")
         operator.start(page.show)
         stop = stack.enter_context(stopping(action=operator.end))
         decoded_ms = _collect(operator, camera.name, readings, DURATION_S if duration is None else duration)
-        # Before both sides end: that takes a while, and a second signal would lose the result.
+        # Before both sides end, which takes a while: a second signal would lose the result.
         status = _show(camera.name, list(readings), decoded_ms, looped)
     return status or stop.status
 
@@ -104,8 +104,8 @@ def _camera(vehicle: Vehicle, name: str | None) -> Camera:
 
 
 @contextmanager
-def _filmed(arguments: Arguments, camera: Camera, more: Sequence[str]) -> Iterator[None]:
-    """The vehicle's side, one of whose cameras delivers pictures of the counter."""
+def _looped_vehicle(arguments: Arguments, camera: Camera, more: Sequence[str]) -> Iterator[None]:
+    """Run the vehicle's side here; one of its cameras delivers pictures of the counter."""
     from runner.vehicle.live import live_vehicle
 
     words = [*arguments.overrides, *more, f"+source@cameras.{camera.name}.source=appsrc"]
@@ -130,10 +130,10 @@ def _film(vehicle: LiveVehicle, camera: Camera, ended: threading.Event) -> None:
 
     width, height = camera.source_size
     interval = 1 / float(camera.fps)
-    following = time.monotonic()
-    while not ended.wait(max(0.0, following - time.monotonic())):
+    next_at = time.monotonic()
+    while not ended.wait(max(0.0, next_at - time.monotonic())):
         vehicle.push(camera.name, counter_frame(time.time_ns() // 1_000_000, width, height))
-        following = max(following + interval, time.monotonic())
+        next_at = max(next_at + interval, time.monotonic())
 
 
 def _collect(
@@ -146,24 +146,24 @@ def _collect(
     """
     decoded_ms: list[float] = []
     first: float | None = None
-    began = said = time.monotonic()
+    began = reported = time.monotonic()
     before = None
     while operator.runs(LOOK_S):
         now, sampled = time.monotonic(), operator.station.samples
-        if first is None and _read(readings):
-            first = said = now
+        if first is None and _count_read(readings):
+            first = reported = now
         if first and sampled is not before and (received := sampled.get(camera)) and received.latency_ms is not None:
             decoded_ms.append(received.latency_ms)
         before = sampled
-        if now - said >= SAY_S and readings:
-            said = now
-            say(f"counter read in {_read(readings)} of {len(readings)} pictures")
+        if now - reported >= SAY_S and readings:
+            reported = now
+            say(f"counter read in {_count_read(readings)} of {len(readings)} pictures")
         if now - began > SHOWN_S if first is None else now - first > duration_s:
             break
     return decoded_ms
 
 
-def _read(readings: Collection[CounterReading]) -> int:
+def _count_read(readings: Collection[CounterReading]) -> int:
     """Pictures in which the counter was found."""
     return sum(reading.elapsed_ms is not None for reading in tuple(readings))
 
@@ -193,8 +193,8 @@ def _lines(name: str, found: LightToLight, looped: bool) -> Iterator[str]:
         yield "  capture to drawing  unknown: no clocks were compared"
         return
     yield f"  capture to drawing  {found.stated:4.0f} ± {found.bound:.0f} ms, as the page states it"
-    between = "the difference; nothing is in between" if looped else "the difference"
+    between = "the difference; no camera or screen in between" if looped else "the difference"
     yield f"  camera and screen   {found.outside:4.0f} ± {found.bound:.0f} ms, {between}"
     if found.fixed is not None and not looped:
         known = f"{found.decoded:.0f} ms from capture to decoding"
-        yield f"  latency.fixed_ms={found.fixed:.0f}, as the vehicle knows of {known}"
+        yield f"  latency.fixed_ms={found.fixed:.0f}, given {known}"

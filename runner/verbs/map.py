@@ -1,11 +1,11 @@
 """usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10] [positions=BAG [topic=NAME]]
 
-Make a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
+Makes a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
 of video. Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of
 the frames of a camera arrived 50 ms later than its fastest. All others show how much was sent, not what the link can
 carry. The operator's log is needed (demo and operator with log=DIR).
 
-positions= is a bag of ROS with the vehicle's positions during the drives (sensor_msgs/NavSatFix), in place of those in
+positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
 
   tod-runner map drives/monday drives/tuesday output=maps/route.csv
@@ -29,31 +29,31 @@ PERCENTILE, CELL_M = 10.0, 10.0
 
 
 def run(arguments: Arguments) -> int:
-    output, percentile, cell_m = _wanted(arguments)
+    output, percentile, cell_m = _checked_arguments(arguments)
     read = reader(arguments.values)
     samples: list[CapacitySample] = []
-    seen, without = 0, list[str]()
+    seen, unusable = 0, list[str]()
     for word in arguments.words:
         drive = series(read(Path(word)))
         print("".join(f"{warning}\n" for warning in drive.warnings), end="", file=sys.stderr)
         if why := capacity_problem(drive):
-            without.append(f"{word} {why}")
+            unusable.append(f"{word} {why}")
             continue
         samples += limited_samples(drive)
         seen += len(drive.actual.t)
     if not samples:
         rule = "no packet was lost and no frame was late: the received bitrate does not show the link's capacity"
         reasons = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
-        raise RunError(f"no map: {'; '.join([*without, *reasons])}")
+        raise RunError(f"no map: {'; '.join([*unusable, *reasons])}")
     squares = cells(samples, percentile, cell_m)
     _write(output, squares)
-    left_out = f"; left out: {'; '.join(without)}" if without else ""
+    left_out = f"; left out: {'; '.join(unusable)}" if unusable else ""
     print(f"{output}: {len(squares)} squares of {cell_m:g} m from {len(samples)} of {seen} samples{left_out}")
     return 0
 
 
-def _wanted(arguments: Arguments) -> tuple[Path, float, float]:
-    """File, percentile and size of a square."""
+def _checked_arguments(arguments: Arguments) -> tuple[Path, float, float]:
+    """Output file, percentile, and side of a square in m."""
     if arguments.overrides:
         rule = "unknown argument; expected one of output, percentile, cell_m, positions, topic"
         raise UserError("command line", "", arguments.overrides[0], rule)
@@ -61,7 +61,7 @@ def _wanted(arguments: Arguments) -> tuple[Path, float, float]:
         raise UserError("command line", "", None, "must name a drive: a directory that log= wrote")
     output = arguments.path("output")
     if output is None:
-        raise UserError("command line", "output", None, "must be given, the map's file")
+        raise UserError("command line", "output", None, "must be given: the map's file")
     percentile, cell_m = arguments.number("percentile"), arguments.number("cell_m")
     percentile, cell_m = PERCENTILE if percentile is None else percentile, CELL_M if cell_m is None else cell_m
     if percentile > 100:

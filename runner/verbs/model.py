@@ -7,12 +7,12 @@ bitrates, decoded, scaled up again and compared with the original. Writes for ea
 conf/cameras/, DIR/CAMERA.model.json with every point, and the curves as .png and .pdf.
 
 camera= is a camera of the vehicle, or a kind in conf/cameras/; without it all cameras of the vehicle are measured,
-and sequence= is a directory with one clip for each, named after it. sequence= may also be a bag of ROS: each camera's
-topic of it is measured. Without sequence= the source's own clips are used.
-The method is defined in conf/study/paper.yaml; its keys may be given alone: metric= plan= scalings= bitrates_kbps=
-b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
+and sequence= is a directory with one clip for each, named after it. sequence= may also be a ROS bag: each camera is
+measured on its topic. Without sequence= the source's own clips are used.
+The method is defined in conf/study/paper.yaml; its keys may be given without study.: metric= plan= scalings=
+bitrates_kbps= b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
 
-Measurements are cached by content in the user's cache: an interrupted run resumes where it stopped.
+Measurements are cached by content in the user's cache directory: an interrupted run resumes where it stopped.
 
   tod-runner model camera=front_center sequence=drive.mp4 output=models
   tod-runner model camera=front_center sequence=drive.mp4 output=models metric=[mssim,psnr] plan=full
@@ -39,10 +39,10 @@ from runner.verbs import Arguments, study_word
 from runner.verbs.screen import progress_bar, say, streaming
 
 if TYPE_CHECKING:
-    from runner.rate_quality.sequence import Filmed
+    from runner.rate_quality.sequence import Footage
     from runner.rate_quality.study import Study
 
-NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # other files that may be named after a camera
+NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named after a camera
 
 
 def run(arguments: Arguments) -> int:
@@ -50,8 +50,8 @@ def run(arguments: Arguments) -> int:
     _need_libraries()
     output = arguments.path("output")
     if output is None:
-        raise UserError("command line", "output", None, "must be given: the directory that models are written to")
-    vehicle, study, names = _wanted(arguments)
+        raise UserError("command line", "output", None, "must be given: the directory to write models to")
+    vehicle, study, names = _targets(arguments)
     paths = _sequences(arguments, vehicle, names)
     from runner.rate_quality.measure import measure
 
@@ -83,24 +83,24 @@ def _need_libraries() -> None:
         raise RunError(f"the Python modules {', '.join(missing)} are not installed: extra model, see docs/install.md")
 
 
-def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
-    """The vehicle, the study, and the cameras to measure; a camera of another kind is mounted for it."""
+def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
+    """The vehicle, the study, and the cameras to measure; a kind of camera that the vehicle lacks is mounted."""
     from runner.apply import check_plan
     from runner.rate_quality.study import check_cameras
 
     words = [study_word(word) for word in arguments.overrides]
-    wanted = arguments.values.get("camera")
+    requested = arguments.values.get("camera")
     config = configuration(words, arguments.conf, runnable=False, check=check_plan)
     study, vehicle = config.study(), config.vehicle()
-    if wanted and wanted not in vehicle.cameras:
+    if requested and requested not in vehicle.cameras:
         kinds = options("cameras", conf_directories(arguments.conf))
-        if wanted not in kinds:
-            hint = suggest(wanted, [*vehicle.cameras, *kinds])
-            raise UserError("command line", "camera", repr(wanted), f"is neither mounted nor a kind of camera{hint}")
-        words.append(f"+cameras@cameras.{wanted}={wanted}")
+        if requested not in kinds:
+            hint = suggest(requested, [*vehicle.cameras, *kinds])
+            raise UserError("command line", "camera", repr(requested), f"is neither mounted nor a kind of camera{hint}")
+        words.append(f"+cameras@cameras.{requested}={requested}")
         config = configuration(words, arguments.conf, runnable=False, check=check_plan)
         study, vehicle = config.study(), config.vehicle()
-    names = [wanted] if wanted else list(vehicle.cameras)
+    names = [requested] if requested else list(vehicle.cameras)
     try:
         check_cameras(study, names)
     except ModelError as error:
@@ -108,8 +108,8 @@ def _wanted(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     return vehicle, study, names
 
 
-def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
-    """By camera, its clip, or its topic of a bag."""
+def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
+    """By camera, its clip, or its topic in a bag."""
     given = arguments.path("sequence")
     if given is None:
         return _clips_of_sources(vehicle, names)
@@ -120,30 +120,30 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
     if not given.is_dir():
         rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
         raise UserError("command line", "sequence", repr(str(given)), rule)
-    found: dict[str, Filmed] = {}
+    found: dict[str, Footage] = {}
     problems = []
     for name in names:
         clips = sorted(path for path in given.glob(f"{name}.*") if path.suffix not in NO_CLIPS)
         if len(clips) == 1:
             found[name] = clips[0]
         else:
-            rule = f"{len(clips)} files are named {name}.*, must be one"
+            rule = f"{len(clips)} files are named {name}.*, must be exactly one"
             problems.append(Problem("command line", "sequence", repr(str(given)), rule))
     if problems:
         raise ConfigError(problems)
     return found
 
 
-def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
-    """By camera, its topic of a bag: that of its mount, or the only one with pictures."""
-    found: dict[str, Filmed] = {}
+def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
+    """By camera, its topic in a bag: that of its mount, or the only one with pictures."""
+    found: dict[str, Footage] = {}
     problems = []
     for name in names:
         camera = vehicle.cameras[name]
-        wanted = camera.mount.get("topic", camera.source.settings.get("topic"))
+        named = camera.mount.get("topic", camera.source.settings.get("topic"))
         try:
             with Bag(path) as bag:
-                topic = bag.find(PICTURES, None if wanted is None else str(wanted), "pictures")
+                topic = bag.find(PICTURES, None if named is None else str(named), "pictures")
             found[name] = BagTopic(str(path), topic)
         except ModelError as error:
             at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
@@ -153,18 +153,17 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
     return found
 
 
-def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Filmed]:
-    """The clip, or the pictures of a bag, that each camera's source plays; a drive that is not rendered yet is rendered
-    first."""
+def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
+    """By camera, the clip or the bag's pictures that its source plays; missing clips are rendered first."""
     from dataclasses import replace
 
     from runner.plans import compile_plans, render_missing
 
-    wanted = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
+    measured = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
     with progress_bar() as progress:
-        render_missing(wanted, progress)
-    found: dict[str, Filmed] = {}
-    for plan in compile_plans(wanted):
+        render_missing(measured, progress)
+    found: dict[str, Footage] = {}
+    for plan in compile_plans(measured):
         if plan.bag:
             found[plan.camera.name] = plan.bag
             continue

@@ -4,13 +4,13 @@ The operator's side: receives and decodes every camera with the operator graph o
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
 bitrates and factors, charts, the drive, and why each decision was made. The terminal shows the same as a table. Ends
 with Ctrl-C or duration_s after the vehicle came online, with a summary of how well the received video followed the
-decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR all that is received is written to
+decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR everything received is written to
 DIR/operator.jsonl, for `report` and `export`. With experiment= it sends that experiment's requests at their times.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
   tod-runner operator page.serve=false     the table only
-  tod-runner operator ros.pictures=true    with decoded pictures as topics of ROS, see docs/ros.md
+  tod-runner operator ros.pictures=true    with decoded pictures as ROS topics, see docs/ros.md
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def run(arguments: Arguments) -> int:
         station.listeners.append(table)
         with _served(operator, arguments.conf) as page:
             operator.start(page.show if page else None, duration)
-            gc.freeze()  # objects loaded by now stay: collecting them again and again would delay frames
+            gc.freeze()  # objects loaded so far are permanent: rescanning them would delay frames
             with stopping(action=operator.end) as stop:
-                runs = True
-                while runs:  # once more after the end: the last notes are shown too
-                    runs = operator.runs(SHOW_S)
+                running = True
+                while running:  # once more after the end, to show the last notes
+                    running = operator.runs(SHOW_S)
                     table.show(station.rows(), station.headline())
     show_summary(station.meters, station.samples)
     return stop.status

@@ -1,19 +1,19 @@
 """usage: tod-runner print [-m] [OVERRIDE ...] [total_kbps=N] [format=text|json|yaml]
 
-Dry run: for each camera the pipeline of the vehicle and of the operator, and the rules' decision for a total of
-N kbit/s, with the reason. Starts nothing and needs no GStreamer. Each line runs as it is: in place of the live system's
-RTSP server and client, the lines have a UDP sink and the matching source, since gst-launch has neither. Passwords in
-addresses are left out: put them back to run such a line.
+Dry run: prints for each camera the pipelines of vehicle and operator, and the rules' decision for a total of N kbit/s,
+with the reason. Starts nothing and needs no GStreamer. Each line runs as printed: a UDP sink and the matching source
+replace the live system's RTSP server and client, which gst-launch does not have. Passwords in addresses are left out:
+put them back to run such a line.
 
 format=yaml shows the composed configuration instead, with the file or the override that each value comes from.
 
-With -m commas and range() are sweeps, also of total_kbps: each combination is a run, the last word changes fastest.
-Each is one line of JSON, as by format=json, with the key overrides.
+With -m, commas and range() define a sweep, also of total_kbps: each combination is a run, and the last word changes
+fastest. Each run is one line of JSON, as with format=json, with the additional key overrides.
 
   tod-runner print total_kbps=3000                              the paper's vehicle at 3 Mbit/s
   tod-runner print vehicle=delivery_robot mode=collective       another vehicle
   tod-runner print graph=openh264_rtsp format=json              for programs
-  tod-runner print vehicle=delivery_robot format=yaml           what is configured, and where
+  tod-runner print vehicle=delivery_robot format=yaml           each value and where it is set
   tod-runner print -m modes=paper,safe 'total_kbps=range(1000,9000,1000)'
   sh -c "gst-launch-1.0 $(tod-runner print source=test format=json | jq -r .cameras.front_left.vehicle)"
 """
@@ -45,16 +45,16 @@ def run(arguments: Arguments) -> int:
     if arguments.sweeps:
         return _sweep(arguments)
     if form == "yaml":
-        return _configured(arguments)
-    vehicle, plans, decision = _planned(arguments)
+        return _print_configuration(arguments)
+    vehicle, plans, decision = _plan(arguments)
     text = json.dumps(as_json(plans, decision), indent=2, ensure_ascii=False) if form == "json" else ""
     _print(text or as_text(vehicle, plans, decision), _stand_ins(plans) if form == "json" else [])
     return 0
 
 
-def _configured(arguments: Arguments) -> int:
+def _print_configuration(arguments: Arguments) -> int:
     if "total_kbps" in arguments.values:
-        raise UserError("command line", "total_kbps", None, "decides nothing with format=yaml")
+        raise UserError("command line", "total_kbps", None, "has no effect with format=yaml")
     config = configuration(arguments.overrides, arguments.conf)
     config.vehicle()
     _print(config.listing(), [])
@@ -62,9 +62,9 @@ def _configured(arguments: Arguments) -> int:
 
 
 def _sweep(arguments: Arguments) -> int:
-    from runner.verbs.sweep import prepared
+    from runner.verbs.sweep import prepare_all
 
-    runs = prepared(arguments, _planned)
+    runs = prepare_all(arguments, _plan)
     lines = [
         json.dumps({"overrides": words, **as_json(plans, decision)}, ensure_ascii=False)
         for words, (_, plans, decision) in runs
@@ -73,7 +73,7 @@ def _sweep(arguments: Arguments) -> int:
     return 0
 
 
-def _planned(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:
+def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:
     total = arguments.number("total_kbps")
     vehicle = configuration(arguments.overrides, arguments.conf).vehicle()
     return vehicle, compile_plans(vehicle), decide(vehicle, None if total is None else exact(total))

@@ -1,11 +1,11 @@
 """usage: tod-runner quality DRIVE [DRIVE ...]
 
-Measure the pictures that the operator saw: twice a second, the picture on show against the scene that the camera saw
-then (MSSIM of luma at the camera's full size). Freezes, delay and damage lower the score. Needs drives
-with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise it is
-the stream as sent, and what the encoder lost is not included.
+Measures the quality of what the operator saw: twice a second, the displayed picture is compared with the scene that the
+camera saw at that time (MSSIM of luma at the camera's full size). Freezes, delay and damage lower the score. Needs
+drives with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise
+it is the stream as sent, and losses in the encoder are not included.
 
-Writes the score of each moment to DRIVE/quality.json, which `report` shows.
+Writes the score at each of these times to DRIVE/quality.json, which `report` shows.
 
   tod-runner demo log=monday log.video=true duration_s=60
   tod-runner quality monday
@@ -32,15 +32,15 @@ SIDES = ("vehicle", "operator")
 
 def run(arguments: Arguments) -> int:
     if not arguments.words:
-        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")
+        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= wrote")
     if arguments.overrides:
         raise UserError("command line", "", arguments.overrides[0], "unknown argument; quality takes drives only")
     for word in arguments.words:
-        _one(Path(word))
+        _measure_drive(Path(word))
     return 0
 
 
-def _one(path: Path) -> None:
+def _measure_drive(path: Path) -> None:
     from runner.drive.delivered import measure
     from runner.drive.quality_file import DOCUMENT, to_json
     from runner.drive.read import read_drive
@@ -54,11 +54,11 @@ def _one(path: Path) -> None:
     apply = streaming()
     with progress_bar() as progress:
 
-        def tell(share: float) -> None:
+        def on_progress(share: float) -> None:
             signals.check()
             progress(str(path), share)
 
-        found = measure(drive, cameras, clips, apply.read_video, apply.decode_video, tell, _warn)
+        found = measure(drive, cameras, clips, apply.read_video, apply.decode_video, on_progress, _warn)
     if not found:
         raise UserError(str(path), "", None, "no camera's video was kept on both sides: drive with log.video=true")
     if not any(quality.mssim for quality in found.values()):
@@ -75,7 +75,7 @@ def _warn(what: str) -> None:
 
 
 def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
-    """The cameras of a drive, and the clips that their sources repeated."""
+    """The cameras of a drive, and the clips that their sources played."""
     from runner.configuration.config import configuration
     from runner.plans import compile_plans
 
@@ -84,7 +84,7 @@ def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
         raise UserError(str(drive.path), "", None, f"no log of the {' and the '.join(missing)}: both sides are needed")
     began = drive.sides["vehicle"].began
     vehicle = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).vehicle()
-    clips = {  # rendered ones have the shape of the camera's picture; others are cropped by their source
+    clips = {  # only rendered ones have the shape of the camera's picture; others are cropped by their source
         plan.camera.name: Path(str(plan.source[0].properties["location"]))
         for plan in compile_plans(vehicle)
         if plan.loops and plan.camera.source.render

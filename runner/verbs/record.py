@@ -1,19 +1,19 @@
 """usage: tod-runner record [OVERRIDE ...] output=DIR [duration_s=N]
 
-Record each camera without loss: the frames as its source delivers them, in native size, before crop and scale, into
-DIR/CAMERA.mkv, and a description into DIR/recording.json. Nothing is streamed. Ends after duration_s, or with Ctrl-C;
+Records each camera losslessly: the frames as its source delivers them, at native size, before crop and scale, to
+DIR/CAMERA.mkv, and a description to DIR/recording.json. Nothing is streamed. Ends after duration_s, or with Ctrl-C;
 either way the files are complete. A file gets its name only when it is complete; until then, or if its camera fails, it
 is .CAMERA.mkv.part. Nothing is overwritten. Frames that are missing because the encoder or the disk was too slow are
-counted and reported. A bag is read as fast as the encoder takes it: once, or again and again up to duration_s.
+counted and reported. A bag is read as fast as the encoder accepts it: once, or repeatedly up to duration_s.
 recording=NAME chooses the encoder, a file of conf/recording/.
 
 Before the start the disk must have room for the raw frames (width x height x 1.5 bytes x fps) times of_raw of
-conf/recording/, for duration_s or otherwise 60 s, and a margin of 64 MB and two seconds of raw frames; a recording that
-reaches the margin ends, with status 1.
+conf/recording/, for duration_s, or 60 s if it is not given, plus a margin of 64 MB and two seconds of raw frames. A
+recording that reaches the margin ends early, with status 1.
 
   tod-runner record vehicle=tum_q7 source=v4l2 output=recordings/monday duration_s=60
   tod-runner record vehicle=delivery_robot source=synthetic output=/tmp/rec duration_s=10
-  tod-runner record source=v4l2 recording=ffv1 '~cameras.rear_center' output=rec    smaller files; one camera less
+  tod-runner record source=v4l2 recording=ffv1 '~cameras.rear_center' output=rec    smaller files, one camera fewer
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class _Session:
     def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None, stop: Stop) -> None:
         self._vehicle, self._directory, self._duration_s, self._stop = vehicle, directory, duration_s, stop
         self._ended: dict[str, Recorded] = {}
-        self._finishing = False  # before the requested time
+        self._finishing = False  # ending before the requested time
         self._kept: set[str] = set()  # cameras whose files are complete and have their names
         self._problems: list[str] = []
         self._losing: set[str] = set()
@@ -108,7 +108,7 @@ class _Session:
         self._ended[name] = recorded
         unfinished = recordings.part(self._directory, name)
         if recorded.stage.value == "failed":
-            before = f"; the part before is in {unfinished}" if unfinished.stat().st_size else ""
+            before = f"; what was recorded until then is in {unfinished}" if unfinished.stat().st_size else ""
             self._fail(f"{name}: {recorded.failure}{before}")
             return
         try:
@@ -121,9 +121,9 @@ class _Session:
 
     def _check_length(self, name: str, recorded: Recorded) -> None:
         """Check that a camera was recorded for the requested time."""
-        asked = self._duration_s
-        if asked is not None and not self._finishing and recorded.seconds < asked - SAMPLE_S:
-            self._fail(f"{name}: its source ended after {recorded.seconds:.1f} of {asked:g} s")
+        requested_s = self._duration_s
+        if requested_s is not None and not self._finishing and recorded.seconds < requested_s - SAMPLE_S:
+            self._fail(f"{name}: its source ended after {recorded.seconds:.1f} of {requested_s:g} s")
 
     def _is_full(self) -> bool:
         free = shutil.disk_usage(self._directory).free
@@ -211,7 +211,7 @@ def _directory(arguments: Arguments) -> Path:
 
 
 def _check_sources(vehicle: Vehicle) -> None:
-    """Check that every source produces its frames by itself.
+    """Check that every source produces frames on its own.
 
     raises  UserError
     """
@@ -223,7 +223,7 @@ def _check_sources(vehicle: Vehicle) -> None:
         c.name for c in vehicle.cameras.values() if c.source.stand_in and not (c.source.render or c.source.plays_bags)
     ]
     if pushed:
-        rule = "its frames are pushed by a Python program, which `record` is not; choose another source"
+        rule = "its frames must be pushed by a Python program; choose another source"
         raise UserError("command line", "source", ", ".join(pushed), rule)
 
 

@@ -1,26 +1,26 @@
 """usage: tod-runner replay [-m] [OVERRIDE ...] [input=FILE|DIR] [output=FILE] [log=DIR] [link=again]
                          [positions=BAG [topic=NAME]]
 
-Events in, decisions out, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come from
-standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
-events. An invalid line ends the run with its number; earlier output stays. An event that cannot be
-accepted is answered with "accepted": false and the reason, and the run continues.
+Turns events into decisions, one line of JSON for each; no video, no GStreamer, far faster than real time. Events come
+from standard input or from input=, decisions go to standard output or to output=. schemas/event.schema.json defines
+events. An invalid line ends the run with an error that states its number; output up to then is kept. An event that
+cannot be accepted is answered with "accepted": false and the reason, and the run continues.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with its own configuration: the decisions are
 those of the drive. Overrides change that configuration and so answer "what if"; with log= the result is written as a
 new drive, for `report`, and to output= only if that is given.
 
-Predictions are those of the input. With a pqos= on the command line they are dropped and that source predicts instead,
-from the positions and times of the input; its events are marked "source": "pqos".
+Predictions are taken from the input. With a pqos= on the command line they are dropped and that source predicts
+instead, from the positions and times of the input; its events are marked "source": "pqos".
 
-Measurements of the link are those of the input. With link=again they are estimated again from the drive's reception
-reports: by the same version, to the same events.
+Link measurements are taken from the input. With link=again they are estimated again from the drive's reception reports;
+the same version estimates the same events.
 
-Positions are those of the input. With positions=BAG they are replaced by those of a bag of ROS that was recorded during
+Positions are taken from the input. With positions=BAG they are replaced by those of a ROS bag that was recorded during
 the drive (sensor_msgs/NavSatFix), marked "source": "bag"; topic= is needed if it has several such topics.
 
-With -m, which needs input=, commas and range() are sweeps: each combination of values is a run over the same events,
-one after the other. Each line then begins with the key overrides; with log=DIR the drives are DIR/0, DIR/1, ...
+With -m, which needs input=, commas and range() define a sweep: each combination of values is a run over the same
+events. Each line begins with the key overrides; with log=DIR the drives are DIR/0, DIR/1, ...
 
   echo '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}' | tod-runner replay modes=paper
   tod-runner replay input=drive output=decisions.jsonl
@@ -68,7 +68,7 @@ _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
 
 class _Prepared(NamedTuple):
-    """What a run needs beside the events. pqos: predicts in place of the events' own predictions"""
+    """Everything a run needs apart from the events. pqos: its predictions replace those of the events"""
 
     arguments: Arguments
     config: Mapping[str, Any]
@@ -81,49 +81,49 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
-        one = _prepared(arguments, name, began)
+        one = _prepare(arguments, name, began)
         with _output(arguments) as output:
-            output.writelines(_answered(one, lines, name, began))
+            output.writelines(_output_lines(one, lines, name, began))
     return 0
 
 
 def _sweep(arguments: Arguments) -> int:
-    from runner.verbs.sweep import prepared
+    from runner.verbs.sweep import prepare_all
 
     if arguments.path("input") is None:
         raise UserError("command line", "-m", None, "reads the events once for each run: give input=FILE")
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
-    runs = prepared(arguments, lambda own: _prepared(own, name, began))
+    runs = prepare_all(arguments, lambda own: _prepare(own, name, began))
     with _output(arguments) as output:
         for number, (words, one) in enumerate(runs):
             own = one._replace(arguments=one.arguments.in_directory(str(number), ["log"]))
             with _input(arguments) as (_, text):
                 lines, _ = _begin(text, name)
                 output.writelines(
-                    f'{{"overrides": {_encode(words)}, {line[1:]}' for line in _answered(own, lines, name, began)
+                    f'{{"overrides": {_encode(words)}, {line[1:]}' for line in _output_lines(own, lines, name, began)
                 )
     return 0
 
 
-def _prepared(arguments: Arguments, name: str, began: Began | None) -> _Prepared:
+def _prepare(arguments: Arguments, name: str, began: Began | None) -> _Prepared:
     config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
     chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
     pqos = config.pqos()[0] if chosen else None
     return _Prepared(arguments, config.document, config.vehicle(), pqos)
 
 
-def _answered(run: _Prepared, lines: Iterable[str], name: str, began: Began | None) -> Iterator[str]:
-    """The lines of a run, which is logged if requested."""
+def _output_lines(run: _Prepared, lines: Iterable[str], name: str, began: Began | None) -> Iterator[str]:
+    """The output lines of a run, which is logged if requested."""
     inputs = events(lines, name, _uplink(run.arguments, run.vehicle))
     if not run.arguments.values.keys().isdisjoint(("positions", "topic")):
-        inputs = _positioned(inputs, run.arguments, began)
+        inputs = _with_positions(inputs, run.arguments, began)
     with _log(run.arguments, run.config, began) as log:
         yield from replay(run.vehicle, inputs, run.pqos, log)
 
 
 def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
-    """What measures the link again; None: it was measured by the vehicle."""
+    """The estimator that measures the link again; None: the logged measurements are used."""
     if arguments.choice("link") == "logged":
         return None
     from runner.vehicle.uplink import MeasuredUplink
@@ -132,7 +132,7 @@ def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
 
 
 def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]:
-    """All lines again, and the first line of their drive; None: they are only events."""
+    """All lines, and the first record of their drive; None: they are events only."""
     lines = iter(text)
     first = list(islice(lines, 1))
     line, problem = read_line(first[0]) if first else ({}, "")
@@ -173,20 +173,20 @@ def replay(
 ) -> Iterator[str]:
     """One line of JSON per event, in order.
 
-    pqos  predicts in place of the events' own predictions
+    pqos  its predictions replace those of the events
     log   written as the vehicle would have written it
     """
     now, answers = start(vehicle), _Answers()
-    for document, event in inputs if pqos is None else _predicted(inputs, pqos):
+    for document, event in inputs if pqos is None else _with_predictions(inputs, pqos):
         before, now = now, step(vehicle, now, event)
         if log:
             log_run(log, event, before, now)
         yield answers.line(document, now)
 
 
-def _positioned(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
+def _with_positions(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
     """The events with the positions of a bag in place of their own."""
-    from runner.drive.positions import given_positions, spanned
+    from runner.drive.positions import given_positions, time_span
 
     recorded = given_positions(arguments.values)
     if began is None:
@@ -201,10 +201,10 @@ def _positioned(inputs: Iterable[InputEvent], arguments: Arguments, began: Began
         if not isinstance(event, PositionReported):
             yield document, event
     if not found:
-        raise recorded.refuse(f"the input: {spanned(began.time, began.time + last)}")
+        raise recorded.no_overlap(f"the input: {time_span(began.time, began.time + last)}")
 
 
-def _predicted(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
+def _with_predictions(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
     """The events with the predictions of another source in place of their own."""
     for document, event in inputs:
         if not isinstance(event, BitratePredicted):
@@ -219,29 +219,29 @@ class _Answers:
 
     def __init__(self) -> None:
         self._decision: Decision | None = None
-        self._text = ""  # of that decision, set once an event changes nothing, as most do
+        self._text = ""  # of that decision; encoded only once an event leaves it unchanged, as most do
 
     def line(self, document: dict[str, Any], now: Run) -> str:
-        heard = _heard(document, now)
+        acknowledged = _acknowledgement(document, now)
         commands = [command.to_json() for command in now.commands]
         if self._decision is None or not now.decision.equals_with_reasons(self._decision):
             self._decision, self._text = now.decision, ""
-            return f"{_encode(heard | decision_to_json(now.decision) | {'commands': commands})}\n"
+            return f"{_encode(acknowledged | decision_to_json(now.decision) | {'commands': commands})}\n"
         self._text = self._text or _encode(decision_to_json(self._decision))[1:-1]
-        return f'{_encode(heard)[:-1]}, {self._text}, "commands": {_encode(commands)}}}\n'
+        return f'{_encode(acknowledged)[:-1]}, {self._text}, "commands": {_encode(commands)}}}\n'
 
 
-def _heard(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
+def _acknowledgement(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
     """The event, and whether it was accepted."""
-    heard = {"t": document["t"], "event": document["event"]}
+    acknowledged = {"t": document["t"], "event": document["event"]}
     if "source" in document:
-        heard["source"] = document["source"]
-    heard["accepted"] = not now.refused
+        acknowledged["source"] = document["source"]
+    acknowledged["accepted"] = not now.refused
     if now.refused:
-        heard["reason"] = now.refused
+        acknowledged["reason"] = now.refused
     if now.fault:
-        heard["fault"] = now.fault
-    return heard
+        acknowledged["fault"] = now.fault
+    return acknowledged
 
 
 def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None) -> Iterator[InputEvent]:
@@ -277,7 +277,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
         return
     try:
         path = path / FILES["vehicle"] if path.is_dir() else path
-        _keep(path, arguments.path("output"))
+        _check_not_input(path, arguments.path("output"))
         file = path.open(encoding="utf-8", errors="replace")
     except OSError as error:
         raise UserError("command line", "input", repr(str(path)), (error.strerror or "").lower()) from None
@@ -285,7 +285,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
         yield str(path), text_lines(file)
 
 
-def _keep(path: Path, output: Path | None) -> None:
+def _check_not_input(path: Path, output: Path | None) -> None:
     """raises UserError if the input would be overwritten"""
     if output and output.is_file() and path.exists() and output.samefile(path):
         raise UserError("command line", "output", repr(str(output)), "is the input, choose another file")
@@ -293,9 +293,9 @@ def _keep(path: Path, output: Path | None) -> None:
 
 @contextmanager
 def _output(arguments: Arguments) -> Iterator[TextIO]:
-    """Standard output line by line, or a file that exists only when the run has ended.
+    """Standard output line by line, or a file that appears only when the run has ended.
 
-    With log= the result is a drive: it contains the decisions; another file does so only if it is named.
+    With log= the result is a drive, which contains the decisions; they go to another file only if output= names it.
     """
     path = arguments.path("output")
     if path is None and arguments.path("log"):

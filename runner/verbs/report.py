@@ -1,16 +1,16 @@
 """usage: tod-runner report DRIVE [DRIVE ...] output=DIR [models=DIR] [positions=BAG [topic=NAME]] [conf=DIR]
 
-The figures of the paper's driving test from logged drives (log= of vehicle, operator and demo): a DRIVE is a
+Draws the figures of the paper's driving test from logged drives (log= of vehicle, operator and demo): a DRIVE is a
 directory with drive.jsonl, operator.jsonl or both. Several drives are compared, on the same axes.
 
 Writes DIR/index.html, one self-contained page that needs no network; each figure as .png and .pdf at column width;
 and DIR/report.json with all statistics (schemas/report.schema.json), for CI.
 
-models= is a directory with CAMERA.model.json, as `tod-runner model` writes them: quality is then estimated. Without it
-the models named by the drive's configuration are used, if they are beside conf/cameras/. Quality that the verb quality
-has measured on the pictures of a drive is shown, too.
+models= is a directory with CAMERA.model.json files, as `tod-runner model` writes them, from which quality is estimated.
+Without it, the models named by the drive's configuration are used if they are in conf/cameras/. Quality that the verb
+quality has measured on the pictures of a drive is shown, too.
 
-positions= is a bag of ROS with the vehicle's positions during the drives (sensor_msgs/NavSatFix), in place of those in
+positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
 
   tod-runner demo log=drive duration_s=100; tod-runner report drive output=report
@@ -36,7 +36,7 @@ DOCUMENT = "report.json"
 
 
 def run(arguments: Arguments) -> int:
-    paths, output = _wanted(arguments)
+    paths, output = _paths(arguments)
     from runner.drive.positions import reader
 
     bases = [base / "cameras" for base in conf_directories(arguments.conf)]
@@ -52,9 +52,9 @@ def report(
     bases: Sequence[Path] = (),
     read: Callable[[Path], Drive] | None = None,
 ) -> Path:
-    """Read, measure, draw, write; show the table of the cameras. The claims of a drive's experiment are checked.
+    """Read, measure, draw and write; print the tables. The claims of a drive's experiment are checked.
 
-    read     reads a drive; None: as it was logged
+    read     reads a drive; None: reads it as logged
     returns  the page
     raises   UserError for a drive or model that cannot be read, RunError for a file that cannot be written
     """
@@ -69,14 +69,14 @@ def report(
 
     with progress_bar() as progress:
         drives = _measured(paths, models, bases, read, lambda share: progress("drives", share))
-        held = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
+        checks_by_label = {drive.series.label: checks for drive in drives if (checks := claims(drive.series))}
         made, left_out = figures(drives)
         write_figures(made, output, progress)
-        summary = document.to_json(drives, held, [figure.name for figure in made], left_out)
+        summary = document.to_json(drives, checks_by_label, [figure.name for figure in made], left_out)
         write_whole(output / DOCUMENT, dumps(summary))
         index = output / "index.html"
-        write_whole(index, page(drives, held, made, left_out).encode())
-    show(drives, held, left_out)
+        write_whole(index, page(drives, checks_by_label, made, left_out).encode())
+    show(drives, checks_by_label, left_out)
     return index
 
 
@@ -87,21 +87,21 @@ def check_report(output: Path, models: Path | None) -> None:
     """
     above = next((path for path in (output, *output.parents) if path.exists()), Path())
     if not above.is_dir():
-        raise UserError("command line", "output", repr(str(output)), f"must be a directory, {above} is a file")
+        raise UserError("command line", "output", repr(str(output)), f"must be a directory, but {above} is a file")
     if models and not models.is_dir():
         raise UserError("command line", "models", repr(str(models)), "no such directory")
     _need_libraries()
 
 
-def _wanted(arguments: Arguments) -> tuple[list[Path], Path]:
+def _paths(arguments: Arguments) -> tuple[list[Path], Path]:
     if arguments.overrides:
         rule = f"unknown argument; expected one of {', '.join((*_own(), 'conf'))}"
         raise UserError("command line", "", arguments.overrides[0], rule)
     if not arguments.words:
-        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= was given to")
+        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= wrote")
     output = arguments.path("output")
     if output is None:
-        raise UserError("command line", "output", None, "must be given: the directory that the report is written to")
+        raise UserError("command line", "output", None, "must be given: the directory to write the report to")
     check_report(output, arguments.path("models"))
     return [Path(word) for word in arguments.words], output
 

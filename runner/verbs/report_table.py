@@ -14,14 +14,14 @@ from runner.drive.checks import ClaimCheck
 from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import VERDICTS, camera_rows, drive_rows
 
-ROOMY = 1000  # columns of a pipe or a file: no table is wider, so nothing is cut off
+WIDE = 1000  # columns assumed for a pipe or a file: no table is wider, so nothing is cut off
 
 
 def show(
     drives: Sequence[DriveStatistics], checks: Mapping[str, Sequence[ClaimCheck]], left_out: Sequence[str]
 ) -> None:
     """The cameras of each drive, the drives compared, claims, and notes."""
-    console = Console(width=None if sys.stdout.isatty() else ROOMY)
+    console = Console(width=None if sys.stdout.isatty() else WIDE)
     for drive in drives:
         console.print(_table(drive.series.label, *camera_rows(drive)))
         for note in (*drive.series.warnings, *drive.notes):

@@ -1,17 +1,17 @@
 """usage: tod-runner ros [OVERRIDE ...] [duration_s=N]
 
-The vehicle's control link as topics and services of ROS, by a node in a process of its own, on either side. Needs an
+Bridges the vehicle's control link to ROS topics and services, by a node in its own process, on either side. Needs an
 MQTT broker at control.host, and rclpy for ros.python: `make ros2`. With ros.version=1 it needs rospy, `make ros1`, and
 a ROS master. Ends with Ctrl-C or after duration_s.
 
-All texts are std_msgs/String. Out: ~/state and ~/telemetry as the vehicle publishes them (schemas/control.schema.json),
-and the RTSP address of each camera in ~/url/CAMERA, kept for late subscribers such as rtsp_image_transport. In:
-~/request, an event of schemas/event.schema.json with `id`; each is answered in ~/reply as applied, refused, expired or
-timed out. Operator inputs for interfaces that use no JSON: services ~/mode/MODE (std_srvs/Trigger) and
+All text messages are std_msgs/String. Outputs: ~/state and ~/telemetry as the vehicle publishes them
+(schemas/control.schema.json), and the RTSP address of each camera on ~/url/CAMERA, latched for late subscribers such as
+rtsp_image_transport. Inputs: ~/request, an event of schemas/event.schema.json with `id`; each is answered on ~/reply as
+applied, refused, expired or timed out. Operator inputs without JSON: services ~/mode/MODE (std_srvs/Trigger) and
 ~/camera/CAMERA/switch (SetBool), topics ~/total_kbps, ~/camera/CAMERA/kbps, scaling (std_msgs/Float64) and roi
 (sensor_msgs/RegionOfInterest), and ~/operator_connected (std_msgs/Empty) while somebody operates the vehicle.
-With ros.position, a topic of sensor_msgs/NavSatFix tells the vehicle where it is; with ros.prediction, a topic of
-std_msgs/Float64 predicts the bitrate, kbit/s, if the named node alone publishes it. docs/ros.md says more.
+With ros.position, a topic of sensor_msgs/NavSatFix provides the vehicle's position; with ros.prediction, a topic of
+std_msgs/Float64 predicts the bitrate, kbit/s, provided that only the named node publishes it. See docs/ros.md.
 
   tod-runner ros vehicle=delivery_robot
   tod-runner ros vehicle=delivery_robot ros.version=1

@@ -13,7 +13,7 @@ from runner.errors import MissingBindings, RunError
 from runner.redact import redacted
 from runner.system import signals
 
-SWITCH_S = 0.0005  # a thread with a frame or a message to pass on waits no longer than this for a computing one
+SWITCH_S = 0.0005  # the longest that a thread with a frame or a message to pass on waits for one that computes
 
 
 def streaming() -> ModuleType:
@@ -31,7 +31,7 @@ def streaming() -> ModuleType:
 
 
 def say(what: str) -> None:
-    """One line for the user, with the time of day."""
+    """Print one line to standard error, with the time of day."""
     now = time.time()
     clock = time.strftime("%H:%M:%S", time.localtime(now))
     print(f"{clock}.{int(now * 1000) % 1000:03d} {redacted(what)}", file=sys.stderr, flush=True)
@@ -39,9 +39,9 @@ def say(what: str) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Shows the progress of long work, if there is any. Without a terminal, a line for each tenth.
+    """Shows the progress of long work once it is reported. Without a terminal, prints a line for each tenth.
 
-    Work that reports its progress from the main thread is interrupted there by a signal.
+    A signal interrupts work in the main thread when it reports its progress.
     """
     if not sys.stderr.isatty():
         yield _progress_lines()

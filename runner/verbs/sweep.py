@@ -1,4 +1,4 @@
-"""The runs of a sweep, prepared before the first one starts."""
+"""The runs of a sweep, prepare_all before the first one starts."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from runner.verbs import Arguments
 Prepared = TypeVar("Prepared")
 
 
-def prepared(arguments: Arguments, prepare: Callable[[Arguments], Prepared]) -> list[tuple[tuple[str, ...], Prepared]]:
-    """The words of each run, and what `prepare` makes of its arguments.
+def prepare_all(
+    arguments: Arguments, prepare: Callable[[Arguments], Prepared]
+) -> list[tuple[tuple[str, ...], Prepared]]:
+    """The overrides of each run, and what `prepare` returns for its arguments.
 
     raises  ConfigError with the problems of all runs
     """
-    made, problems = [], []
+    results, problems = [], []
     for words, own in arguments.runs():
         try:
-            made.append((words, prepare(own)))
+            results.append((words, prepare(own)))
         except ConfigError as error:
             problems += error.problems
     if problems:
         raise ConfigError(problems)
-    return made
+    return results

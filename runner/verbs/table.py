@@ -25,7 +25,7 @@ from runner.system.signals import urgent
 
 PLAIN_EVERY_S = 5.0
 NOTES = 4
-KEPT_NEWS = 1000
+MAX_PENDING = 1000
 
 
 class LiveTable(Listener):
@@ -34,7 +34,7 @@ class LiveTable(Listener):
     def __init__(self) -> None:
         self._console = Console(width=None if sys.stdout.isatty() else 150)
         self._live = Live(console=self._console, auto_refresh=False) if sys.stdout.isatty() else None
-        self._news: deque[str] = deque(maxlen=KEPT_NEWS)  # not shown yet
+        self._pending: deque[str] = deque(maxlen=MAX_PENDING)  # notes not shown yet
         self._notes: deque[str] = deque(maxlen=NOTES)
         self._shown = 0.0
         self._stack = ExitStack()
@@ -49,12 +49,12 @@ class LiveTable(Listener):
         self._stack.__exit__(kind, error, at)
 
     def on_note(self, note: Note) -> None:
-        """From any thread: add one line below the table, shown with its next update."""
-        self._news.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {note.text}")
+        """Add one line below the table, shown with its next update. May be called from any thread."""
+        self._pending.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {note.text}")
 
     def show(self, rows: Sequence[CameraRow], headline: str) -> None:
-        while self._news:
-            line = self._news.popleft()
+        while self._pending:
+            line = self._pending.popleft()
             self._notes.append(line)
             if not self._live:
                 self._console.print(line, markup=False, highlight=False)
@@ -97,7 +97,7 @@ def _table(rows: Sequence[CameraRow], headline: str) -> RichTable:
 
 
 def _size_style(row: CameraRow) -> str:
-    """Marks a picture that does not have the decided size (yet)."""
+    """Highlights a picture that does not have the decided size (yet)."""
     decided, received = row.state, row.received
     wrong = decided and decided.sending and (decided.width, decided.height) != (received.width, received.height)
     return "bold yellow" if wrong else ""
@@ -111,12 +111,12 @@ def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, An
     for heading in (*headings, "sizes\nseen", "latency ms\nmedian", "p95", "packets\nlost", "rebuilt"):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, meter in meters.items():
-        got = received.get(name)
-        if got is None:
+        sample = received.get(name)
+        if sample is None:
             continue
         table.add_row(
             name,
-            str(got.frames),
+            str(sample.frames),
             f"{meter.fps:g}",
             f"{meter.short} of {meter.windows}",
             _share(middle(meter.followed)),
@@ -124,8 +124,8 @@ def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, An
             str(len(meter.sizes)),
             _number(middle(meter.latencies_ms)),
             _number(percentile(meter.latencies_ms, 0.95)),
-            str(got.lost),
-            str(got.rebuilt),
+            str(sample.lost),
+            str(sample.rebuilt),
         )
     Console(width=None if sys.stdout.isatty() else 150).print(table)
 

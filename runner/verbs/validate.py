@@ -1,22 +1,22 @@
 """usage: tod-runner validate [OVERRIDE ...] [FILE ...] [conf=DIR] [all=true]
 
-Check the files of your directory against their schemas, then the configurations composed from them: each file once with
-the choices of the command line, otherwise the defaults; each vehicle also with each of your graphs and sources. Without
-a directory the packaged files are checked, and the one configuration that the command line names. With all=true every
-vehicle is combined with every graph and source, every other file is composed once, and a file that refers to another
-group, or chooses from it, is combined with each file of that group. Packaged experiments, with all their runs, and
-links are composed as they are.
+Checks the files of your directory against their schemas, then the configurations composed from them: each file once
+with the choices of the command line, otherwise the defaults; each vehicle also with each of your graphs and sources.
+Without a directory the packaged files are checked, and the one configuration that the command line names. With all=true
+every vehicle is combined with every graph and source, every other file is composed once, and a file that refers to
+another group, or chooses from it, is combined with each file of that group. Packaged experiments, with all their runs,
+and links are composed unchanged.
 
 FILE, a word that ends in .yaml or .yml, limits the check to that file and the files that build on it. Its directory is
 conf=DIR, otherwise the nearest one above it that has folders of groups.
 
 If GStreamer is installed, configurations are also checked against its registry: elements, properties, types, ranges,
-and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. Ends
-with status 2 and reports all problems at once. If DIR/.schemas, by which your editor checks, is of another version than
-this tod-runner, standard error says so.
+and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. If
+there are problems, all of them are reported and the verb ends with status 2. If DIR/.schemas, which your editor uses,
+comes from another version of tod-runner, a warning is printed to standard error.
 
-  tod-runner validate conf=my_vehicles                       your files, the step for your CI
-  tod-runner validate my_vehicles/vehicle/van.yaml           one of them, as before a commit
+  tod-runner validate conf=my_vehicles                       your files, for example in CI
+  tod-runner validate my_vehicles/vehicle/van.yaml           one of them, for example before a commit
   tod-runner validate conf=my_vehicles vehicle=van           one of your vehicles with your graphs and sources
   tod-runner validate vehicle=tum_q7 pqos.file=yard.csv      one configuration
   tod-runner validate all=true                               everything that is packaged
@@ -50,7 +50,7 @@ from runner.verbs import Arguments
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
-STANDING_ALONE = ("experiment", "link")  # packaged ones are never combined with choices of the command line
+STANDALONE = ("experiment", "link")  # packaged ones are never combined with choices of the command line
 ConfigReader = Callable[[Configuration], object]
 READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
@@ -68,7 +68,7 @@ class ExperimentRun(NamedTuple):
     words: tuple[str, ...]
 
     def attributed(self, problem: Problem) -> Problem:
-        """A problem of the command line, attributed to the run if the word is from there."""
+        """The problem; one of the command line is attributed to the run if the run added the word."""
         word = next((word for word in self.words if word.lstrip("+~").startswith(problem.path)), None)
         if problem.file != COMMAND_LINE or word is None:
             return problem
@@ -204,7 +204,7 @@ def check_file(path: Path, relative: Path) -> Iterator[Problem]:
     inherits = bool(bases_of(path))
     for finding in schema.findings(content, {"": "config", "cameras": "camera"}.get(group, group)):
         if inherits and finding.found == "missing":
-            continue  # a file that it builds on may have it; the combinations show whether
+            continue  # a base file may provide it; the combinations show whether one does
         yield Problem(name, schema.dotted(finding.path), finding.found, finding.rule)
 
 
@@ -212,7 +212,7 @@ def _misplaced(group: str, relative: Path) -> str | None:
     """Why Hydra would not find a file; None if it would."""
     first = relative.parts[0]
     if group and group not in FOLDERS:
-        nested = f"files stand in {first}/ itself, not in folders below" if first in FOLDERS else ""
+        nested = f"files must be directly in {first}/, not in subfolders" if first in FOLDERS else ""
         return f"would be ignored: {nested or f'no such group as {group}/{suggest(group, GROUPS)}'}"
     if group == LAYOUT:
         return _misplaced_layout(relative)
@@ -249,17 +249,17 @@ class _Tasks:
         self._overrides, self._user, self._everything, self._named = overrides, user, everything, named
         self._directories = conf_directories(user)
         searched = self._directories if everything else self._directories[:-1]
-        settled = _settled(overrides)
-        self._files = {group: options(group, searched) for group in GROUPS if group not in settled}
-        self._vehicle_settled = "vehicle" in settled
-        self._tasks = list(dict.fromkeys(filter(self._concerned, self._all())))
+        fixed = _fixed_groups(overrides)
+        self._files = {group: options(group, searched) for group in GROUPS if group not in fixed}
+        self._vehicle_fixed = "vehicle" in fixed
+        self._tasks = list(dict.fromkeys(filter(self._is_selected, self._all())))
 
     def __iter__(self) -> Iterator[ValidationTask]:
         return iter(self._tasks)
 
     @property
     def choices(self) -> list[tuple[str, str]]:
-        """Groups and files that are chosen by any of them."""
+        """Groups and files that any of the tasks chooses."""
         return list(dict.fromkeys(choice for task in self._tasks for choice in task.choices))
 
     def _all(self) -> Iterator[ValidationTask]:
@@ -270,10 +270,10 @@ class _Tasks:
                 yield from self._of_one_file(group, name)
         vehicles: Sequence[str | None] = self._files.get("vehicle", [])
         others: list[Sequence[str | None]] = [self._files.get(group) or [None] for group in CROSSED[1:]]
-        if self._vehicle_settled or not (vehicles or self._everything):
+        if self._vehicle_fixed or not (vehicles or self._everything):
             vehicles = [None]
-        for met in product(vehicles, *others):
-            chosen = zip(CROSSED, met, strict=True)
+        for combination in product(vehicles, *others):
+            chosen = zip(CROSSED, combination, strict=True)
             yield ValidationTask(self._overrides, tuple((group, one) for group, one in chosen if one))
         if self._everything:
             yield from self._reached()
@@ -281,7 +281,7 @@ class _Tasks:
     def _of_one_file(self, group: str, name: str) -> Iterator[ValidationTask]:
         """A file with the choices of the command line; an experiment also with each of its runs."""
         packaged = name not in options(group, self._directories[:-1])
-        overrides = () if packaged and group in STANDING_ALONE else self._overrides
+        overrides = () if packaged and group in STANDALONE else self._overrides
         task = ValidationTask(overrides, ((group, name),))
         yield task
         if group == "experiment":
@@ -290,13 +290,13 @@ class _Tasks:
     def _reached(self) -> Iterator[ValidationTask]:
         """Files that refer to other groups or choose from them, with every choice of those."""
         for group, names in self._files.items():
-            for name in names if group not in STANDING_ALONE else ():
+            for name in names if group not in STANDALONE else ():
                 with suppress(ConfigError):  # reported for the file alone
                     for other in reaches(find_file(self._directories, group, name)):
                         for choice in self._files.get(other, ()):
                             yield ValidationTask(self._overrides, ((group, name), (other, choice)))
 
-    def _concerned(self, task: ValidationTask) -> bool:
+    def _is_selected(self, task: ValidationTask) -> bool:
         if self._named is None:
             return True
         chosen = (find_file(self._directories, group, name) for group, name in task.choices)
@@ -308,13 +308,13 @@ class _Tasks:
         return find_file(self._directories, "", "config")
 
 
-def _settled(words: Iterable[str]) -> set[str]:
-    """Groups from which the command line chooses, or whose values it changes; such a value is for the file in force."""
+def _fixed_groups(words: Iterable[str]) -> set[str]:
+    """Groups from which the command line chooses, or whose values it overrides: those apply to the chosen file only."""
     keys = {word.lstrip("+~").partition("=")[0].partition("@")[0].partition(".")[0].lstrip("/") for word in words}
     return keys | ({"vehicle"} if "cameras" in keys else set())
 
 
-_composed = lru_cache(maxsize=32)(compose)  # experiments are composed to see their runs, too
+_composed = lru_cache(maxsize=32)(compose)  # experiments are also composed to list their runs
 
 
 def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[ExperimentRun]:
@@ -334,7 +334,7 @@ def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Ite
 class _Checker:
     """Checks configurations one after the other.
 
-    broken  files that cannot be composed or are wrong: combinations with them are not checked
+    broken  files that are invalid or cannot be composed: combinations with them are not checked
     fine    sections that the schemas accept, by key and identity
     """
 
@@ -353,7 +353,7 @@ class _Checker:
             self._check_composed(task)
 
     def _is_fine_assembled(self, task: ValidationTask) -> bool:
-        """Whether a configuration assembled from sections is valid; an invalid one is checked again composed."""
+        """Whether a configuration assembled from sections is valid; an invalid one is composed and checked again."""
         if task.run or task.overrides != self.combinations.overrides:
             return False
         assembled = self.combinations.assembled(dict(task.choices))

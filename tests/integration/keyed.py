@@ -1,4 +1,4 @@
-"""Keys of everybody for the parts, where the environment asks for them by KEYS=1."""
+"""Keys of everyone for the parts, if the environment requests them with KEYS=1."""
 
 from __future__ import annotations
 
@@ -37,6 +37,6 @@ def keys() -> Path | None:
 
 
 def words(holder: str = "") -> list[str]:
-    """The override that gives a side its keys, or a demo those of everybody; none without keys."""
+    """The override that gives a side its keys, or a demo those of everyone; none without keys."""
     directory = keys()
     return [f"keys={directory / holder}"] if directory else []

@@ -7,9 +7,8 @@ input is JSON with topic and one of these:
             to be published once somebody has subscribed to the topic
     call    the argument of std_srvs/SetBool, or null for std_srvs/Trigger: a call of that service, once it is offered
 
-Topics that end in /image and /camera_info are of sensor_msgs. Each message is told on standard output as JSON: topic,
-text, or a mapping with what matters; each answer: service, [success, message]. Ends with its
-input.
+Topics that end in /image and /camera_info are of sensor_msgs. Each message is printed to standard output as JSON:
+topic, text, or a mapping of the relevant fields; each answer: service, [success, message]. Ends with its input.
 """
 
 from __future__ import annotations

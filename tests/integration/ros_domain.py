@@ -1,4 +1,4 @@
-"""What the tests with ROS share: both versions, each apart from other nodes of this machine, and nodes that obey."""
+"""Shared by the tests with ROS: both versions, isolated from other nodes of this machine, and nodes to control."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Ros:
             monkeypatch.setenv("ROS_LOG_DIR", str(logs))
 
     def type(self, package, name):
-        """As ROS writes the name of a type of messages."""
+        """The name of a message type, as ROS writes it."""
         return f"{package}/{name}" if self.version == 1 else f"{package}/msg/{name}"
 
     def simulated(self):
-        """Words by which the node's clock is that of a simulation, which nobody publishes: it stands at 0."""
+        """Overrides for a simulated clock that nobody publishes: it stays at 0."""
         if self.version == 2:
             return ["ros.use_sim_time=true"]
         self.master.call("setParam", "/use_sim_time", True)
@@ -86,7 +86,7 @@ class Ros:
 
 
 class Master:
-    """The master of ROS 1, on a port of its own, which can end and start again."""
+    """The ROS 1 master, on a port of its own, which can end and start again."""
 
     def __init__(self, logs):
         self.port, self._logs = free_port(), logs
@@ -117,7 +117,7 @@ class Master:
 
 @contextmanager
 def running(version, logs):
-    """A version of ROS, with its master, for as long as this lasts."""
+    """A version of ROS, with its master, for the duration of the block."""
     if MISSING[version]:
         pytest.skip(MISSING[version])
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -132,7 +132,7 @@ def running(version, logs):
 
 
 def whole(name):
-    """The whole name of a topic or service of the bridge."""
+    """The full name of a topic or service of the bridge."""
     return name if name.startswith("/") else f"{NODE}/{name}"
 
 
@@ -141,19 +141,19 @@ class RosClient:
 
     def __init__(self, process):
         self.process = process
-        self.heard = []  # topic, text
+        self.messages = []  # topic, text
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self):
         for line in self.process.stdout:
-            self.heard.append(tuple(json.loads(line)))
+            self.messages.append(tuple(json.loads(line)))
 
     def publish(self, topic, **value):
         self.process.stdin.write(json.dumps({"topic": topic, **value}) + "\n")
         self.process.stdin.flush()
 
     def texts(self, topic):
-        return [text for name, text in tuple(self.heard) if name == whole(topic)]
+        return [text for name, text in tuple(self.messages) if name == whole(topic)]
 
     def newest(self, topic):
         return json.loads(until(lambda: self.texts(topic))[-1])

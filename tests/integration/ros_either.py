@@ -1,4 +1,4 @@
-"""A node of either version of ROS for the scripts that tests start, by the library that their Python has."""
+"""A node of either ROS version for the scripts that tests start, with the library that their Python has."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Ros2Node:
 
 
 class Ros1Node:
-    """Its timers are by the machine's clock, also where ROS simulates one."""
+    """Its timers use the machine's clock, even if ROS simulates one."""
 
     def __init__(self, name: str) -> None:
         rospy.init_node(name, disable_signals=True)
@@ -129,7 +129,7 @@ Node = Ros2Node if "rclpy" in sys.modules else Ros1Node
 
 
 def as_data(data: bytes) -> Any:
-    """The data of an Image, as the library takes it without a look at each byte."""
+    """The data of an Image, in the form that the library accepts without checking each byte."""
     return data if Node is Ros1Node else array("B", data)
 
 

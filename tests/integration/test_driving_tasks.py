@@ -48,7 +48,7 @@ RED, AMBER = (224, 27, 36), (255, 176, 0)  # of the marks: overlay.js
 
 
 class Drive:
-    """A vehicle whose cameras fail when told to, and the link between it and an operator's page."""
+    """A vehicle whose cameras fail on command, and the link between it and an operator's page."""
 
     def __init__(self, url, vehicle, fed, shaper):
         self.url, self.vehicle, self._fed, self._shaper = url, vehicle, fed, shaper
@@ -65,7 +65,7 @@ class Drive:
         return self._shaper.limit(Rates(kbps, None))
 
     def stall(self, stopped_ms, then_kbps):
-        """Stop the link for a while; then what has queued up lasts, if it carries little more than is sent."""
+        """Stop the link for a while; the backlog then persists if the link carries little more than is sent."""
         began = 1000 * time.time()
         self.limit(STOPPED)
         time.sleep(max(0.0, (began + stopped_ms) / 1000 - time.time()))
@@ -161,7 +161,7 @@ def driver(request, page, drive):
 
 @pytest.fixture
 def typist(page, drive):
-    """Whoever drives with the keyboard: what buttons do is up to the configuration."""
+    """A driver with a keyboard: the configuration defines what buttons do."""
     return Driver(page, drive.vehicle.inputs, "keys")
 
 
@@ -244,7 +244,7 @@ def test_open_the_map_in_the_drawer(typist, page):
 
 
 def test_take_control_back_from_another_page(typist, page, chromium, drive):
-    """It asks first: who drives may sit there."""
+    """It asks first: the driver may be there."""
     with opened(chromium, drive.url) as other:
         take_control(other)
         until(lambda: page.evaluate("tod.control") == "another")
@@ -323,7 +323,7 @@ def test_notice_a_frozen_rear_view(page, drive):
 
 
 def test_notice_a_lost_front_view(page, drive):
-    """It is marked as frozen first, and as lost once it has been gone for as long as that means."""
+    """It is marked as frozen first, and as lost once it has been missing for long enough."""
     frozen, lost = [], []
     for number in range(ROUNDS):
         settled(page)
@@ -352,7 +352,7 @@ def test_notice_a_picture_that_is_repeated_as_new(page, drive):
 
 
 def test_notice_a_late_picture(page, drive):
-    """The link stops for little longer than a picture may take, and then carries little more than is sent."""
+    """The link stops for slightly longer than a picture may take, then carries little more than is sent."""
     sent, late_ms = drive.sent_kbps(), drive.vehicle.page.late_ms
     assert sent > 0.5 * TOTAL_KBPS, "what is sent is less than what a full queue lasts for"
     drive.stall(2 * late_ms, 1.05 * sent)

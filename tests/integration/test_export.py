@@ -225,7 +225,7 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
 
 
 @pytest.mark.alone
-def test_what_was_received_has_the_times_at_which_it_was_sent(filmed, tmp_path):
+def test_received_pictures_get_the_times_at_which_they_were_sent(filmed, tmp_path):
     drive, _ = filmed
     run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
     topics = messages(tmp_path / "out.mcap")
@@ -360,7 +360,7 @@ def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_drive_that_was_cut_off_is_reported_and_exported(tmp_path):
+def test_a_truncated_drive_is_reported_and_exported(tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, end='\n{"t": 1.6, "ev')
     done = run("export", str(drive))
@@ -387,12 +387,12 @@ def test_an_invalid_drive_is_reported_in_one_line(tmp_path, lines, expected):
     assert [path.name for path in tmp_path.iterdir()] == ["drive.jsonl"]
 
 
-def test_words_that_are_no_export(tmp_path):
+def test_invalid_exports(tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     (tmp_path / "empty").mkdir()
     (tmp_path / "there.mcap").write_text("precious")
-    there = "already exists; remove it, or name another one by output="
+    there = "already exists; remove it, or choose another path with output="
     name = "must name one drive: a directory that log= wrote"
     for words, expected in (
         ([], f"command line: {name}"),
@@ -401,7 +401,7 @@ def test_words_that_are_no_export(tmp_path):
         ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
         (
             [str(drive), "mode=single"],
-            "command line: mode=single: an export has no configuration, only format= and output=",
+            "command line: mode=single: export takes no overrides, only format= and output=",
         ),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],
@@ -442,7 +442,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd
 
 
 def bag_messages(path):
-    """By topic: type, and time and content of its messages, as another program reads them."""
+    """By topic: type, and time and content of its messages, as an independent program reads them."""
     from rosbags.highlevel import AnyReader
 
     topics = {}
@@ -457,7 +457,7 @@ def stamped(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def test_a_ros_2_bag_holds_what_the_mcap_file_holds(filmed, tmp_path):
+def test_a_ros_2_bag_has_the_same_content_as_the_mcap_file(filmed, tmp_path):
     pytest.importorskip("rosbags")
     drive = tmp_path / "drive"
     shutil.copytree(filmed[0], drive)
@@ -490,7 +490,7 @@ def test_a_ros_2_bag_holds_what_the_mcap_file_holds(filmed, tmp_path):
             assert [m.data.encode() for _, m in found] == [message.data for message in same[topic][2]]
     assert ros.stdout.startswith(f"{drive}/rosbag2: {sum(len(found) for _, found in topics.values())} messages, ")
     again = run("export", str(drive), "format=rosbag2")
-    rule = "already exists; remove it, or name another one by output="
+    rule = "already exists; remove it, or choose another path with output="
     assert (again.returncode, again.stderr) == (2, f"command line: output: '{drive}/rosbag2': {rule}\n")
     assert sorted(path.name for path in drive.iterdir() if path.name.startswith(".")) == []
 

@@ -1,4 +1,4 @@
-"""Latency between two machines whose clocks differ: always known, and right to within its bound."""
+"""Latency between two machines whose clocks differ: always known, and correct within its bound."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
 
 
 def check_stages(received, bound_ms):
-    """The stages of one camera add up to its latency, and the delay of the link is found in the link's."""
+    """The stages of one camera add up to its latency, and the link's delay is in the link's stage."""
     whole = [camera for camera in received if camera.stages_ms.link is not None]
     assert len(whole) >= 0.8 * len(received)
     for camera in whole:
@@ -137,7 +137,7 @@ def test_without_the_fixed_part_no_speed_is_advised(broker):
 
 @needs_compiler
 def test_latencies_are_right_or_unknown_while_the_vehicles_clock_is_set(tmp_path):
-    """By 5 s in either direction, again and again. Of every latency that is shown, or that advises the speed."""
+    """By 5 s in either direction, repeatedly. Checks every latency that is shown or that advises the speed."""
     clock, path = tmp_path / "clock", tmp_path / "drive"
     env = clock_ahead(clock, 0.0)
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")

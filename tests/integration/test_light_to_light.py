@@ -17,7 +17,7 @@ RESULT = re.compile(
     r"rear: counter read in (\d+) of (\d+) pictures\n"
     r"  glass to glass +(\d+) ms median, \d+ ms p95\n"
     r"  capture to drawing +(\d+) ± (\d+) ms, as the page states it\n"
-    r"  camera and screen +(-?\d+) ± \d+ ms, the difference; nothing is in between\n"
+    r"  camera and screen +(-?\d+) ± \d+ ms, the difference; no camera or screen in between\n"
 )
 
 
@@ -70,7 +70,7 @@ def readings(elapsed: list[float | None], age: float | None = 40.0) -> list[Coun
 
 
 def test_the_fixed_part_is_what_the_reported_latency_lacks() -> None:
-    """Camera and screen add 50 ms to the 40 of which the page knows; the vehicle knows of 25 of those."""
+    """Camera and screen add 50 ms to the 40 known to the page, 25 of which are known to the vehicle."""
     found = light_to_light(readings([*[90.0] * 18, 130.0, None]), [25.0, 20.0, 30.0])
     assert found
     assert (found.pictures, found.read, found.median, found.stated, found.bound) == (20, 19, 90.0, 40.0, 2.0)
@@ -94,5 +94,5 @@ def test_few_readings_say_nothing_and_misread_ones_do_not_count() -> None:
         {"camera": "rear", "elapsed_ms": True, "age_ms": 1, "bound_ms": 1},
     ],
 )
-def test_a_message_that_is_no_reading(message: dict[str, object]) -> None:
+def test_messages_that_are_not_a_reading(message: dict[str, object]) -> None:
     assert counter_reading(message) is None

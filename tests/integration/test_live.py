@@ -271,7 +271,7 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
     assert "equal" in page and "paper" in page
     again = run("demo", *words)
     assert again.returncode == 2
-    assert again.stderr.startswith(f"command line: output: '{tmp_path / 'out'}': must be a new or an empty directory")
+    assert again.stderr.startswith(f"command line: output: '{tmp_path / 'out'}': must be a new or empty directory")
 
 
 @pytest.mark.soak

@@ -1,4 +1,4 @@
-"""Both sides' figures for Prometheus while they drive."""
+"""Metrics of both sides for Prometheus during a drive."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from runner.__main__ import main
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.rate_quality.artefact import read_model
-from runner.rate_quality.curves import Point, along, draw_curves, mean_score
+from runner.rate_quality.curves import Point, draw_curves, ladder_quality, mean_score
 from runner.rate_quality.metrics import find_metric
 
 pytestmark = pytest.mark.gst
@@ -36,7 +36,7 @@ TINY = ("scalings=[0.5,1.0]", "bitrates_kbps=[100,400]")  # when any points will
 
 
 def picture(number: int, texture: np.ndarray) -> np.ndarray:
-    """A street of sorts: a texture that slides, faster below, and a car that crosses."""
+    """A simple street: a texture that slides, faster at the bottom, and a crossing car."""
     rows = np.arange(HEIGHT)[:, None]
     columns = (np.arange(WIDTH)[None, :] + number * (rows // 24)) % texture.shape[1]
     shown = texture[rows % texture.shape[0], columns].copy()
@@ -64,7 +64,7 @@ def cache(tmp_path: Path) -> dict[str, str]:
 
 
 def model(*words: str, cache: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """The verb in this process, which has loaded the libraries already."""
+    """The verb in this process, which has already loaded the libraries."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         for name, value in cache.items():
@@ -267,7 +267,7 @@ def watch():
         sys._current_frames()
         time.sleep(0.002)
 
-gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # other threads run meanwhile
+gc.callbacks.append(lambda phase, info: time.sleep(0.0005))  # other threads run during this time
 gc.set_threshold(50)
 threading.Thread(target=watch, daemon=True).start()
 sys.exit(without_cycle_collection(main, sys.argv[1:]))
@@ -276,7 +276,7 @@ sys.exit(without_cycle_collection(main, sys.argv[1:]))
 
 @pytest.mark.soak
 def test_measuring_works_while_a_dask_worker_inspects_its_threads(clip, measured, tmp_path, cache):
-    """As in a worker, but all the time: threads are inspected, and cycles collected meanwhile."""
+    """As in a worker, but continuously: threads are inspected while cycles are collected."""
     words = ("model", "camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *SMALL)
     environment = {**os.environ, **cache, "PYTHONPATH": str(CHECKOUT)}
     command = [sys.executable, "-c", WATCHED, *words, "metric=[mssim,psnr]"]
@@ -310,7 +310,7 @@ def lost(full: dict, other: dict) -> float:
     ]
     curves = draw_curves(points, mean_score("mssim"))
     best, mine = (
-        along(curves, [Fraction(factor) for factor in m["scaling"]], [c["kbps"] for c in m["crossings"]])
+        ladder_quality(curves, [Fraction(factor) for factor in m["scaling"]], [c["kbps"] for c in m["crossings"]])
         for m in (full, other)
     )
     return float(np.max((best - mine)[curves.kbps < full["b_full_kbps"]]))
@@ -463,7 +463,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(clip, tmp_path, cache):
 
 
 @pytest.mark.soak
-@pytest.mark.skipif(not CLIPS, reason="no recorded clips beside the project")
+@pytest.mark.skipif(not CLIPS, reason="no recorded clips next to the project")
 def test_on_a_recorded_drive_each_factor_wins_a_range(tmp_path, cache):
     whole = next(path for path in CLIPS if path.name == "forward_highway_day_540p25_A.mp4")
     clip = tmp_path / "highway.mp4"

@@ -1,4 +1,4 @@
-"""Looking at a buffer now and then: what is read is what GStreamer's own binding reads, and no memory is kept."""
+"""Reading single buffers: the same as GStreamer's own binding reads, without keeping memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def running(line):
 
 @pytest.fixture
 def playing():
-    """One that makes pictures as fast as it can."""
+    """A pipeline that produces pictures as fast as it can."""
     with running(MADE) as parts:
         yield parts
 
@@ -56,7 +56,7 @@ def fed_buffers():
         yield buffer
 
 
-def test_it_reads_what_the_binding_reads():
+def test_it_reads_the_same_as_the_binding():
     stated, read, both = [], [], threading.Event()
 
     def on_binding(_pad, info):
@@ -87,7 +87,7 @@ def test_it_reads_what_the_binding_reads():
     assert read[0][2:4] == (bytes(range(16)), bytes(range(32, 40)))  # there are no more bytes
 
 
-def test_looking_keeps_no_memory(playing):
+def test_reading_keeps_no_memory(playing):
     pipeline, pad = playing
     looks = [0]
 
@@ -132,7 +132,7 @@ def counting(made, name, function):
 
 
 def test_sides_that_are_sampled_make_no_callback(monkeypatch):
-    """Each would be kept for good."""
+    """Each would be kept forever."""
     made = Counter()
     for owner, name in ((Gst.Pad, "add_probe"), (GLib, "idle_add"), (GLib, "timeout_add")):
         monkeypatch.setattr(owner, name, counting(made, name, getattr(owner, name)))

@@ -1,4 +1,4 @@
-"""Quality of delivered pictures: measured on a real drive, and lower where pictures came late."""
+"""Quality of delivered pictures: measured on a real drive, and lower if pictures were late."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OTHERS += [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """One camera with a clip that repeats, at a bitrate that leaves little to be desired."""
+    """One camera with a clip that repeats, at a more than sufficient bitrate."""
     path = tmp_path_factory.mktemp("quality") / "drive"
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     words = (*OTHERS, *SIZE, "source.render.seconds=4", "fps_max=10", "page.serve=false", "modes=open_loop")
@@ -29,7 +29,7 @@ def drive(tmp_path_factory):
 
 
 def in_time(camera):
-    """As if each picture had come after 30 ms: on a busy machine some are late."""
+    """As if each picture had arrived after 30 ms: on a busy machine some are late."""
     camera["arrivals"] = [[t - ms / 1000 + 0.03, 30] for t, ms in camera["arrivals"] if ms is not None]
 
 
@@ -51,7 +51,7 @@ def changed(path, to, change):
     return to
 
 
-def test_pictures_that_came_in_time_are_as_good_as_their_encoding(tod, drive):
+def test_pictures_in_time_are_as_good_as_their_encoding(tod, drive):
     found = measured(tod, drive)
     camera = found["cameras"]["front_center"]
     assert camera["clip"] is True
@@ -60,7 +60,7 @@ def test_pictures_that_came_in_time_are_as_good_as_their_encoding(tod, drive):
     assert found["worst"] == "front_center"
 
 
-def test_pictures_that_came_a_second_late_show_an_old_scene(tod, drive, tmp_path):
+def test_pictures_a_second_late_show_an_old_scene(tod, drive, tmp_path):
     def late(camera):
         camera["arrivals"] = [[t + 1, ms and ms + 1000] for t, ms in camera["arrivals"]]
 

@@ -50,7 +50,7 @@ def conf(tmp_path: Path) -> Path:
 
 
 def frames(line: str, limit: int = 10_000) -> list[tuple[int, str]]:
-    """Time in ns and digest of each frame that a pipeline makes."""
+    """Time in ns and digest of each frame that a pipeline produces."""
     from runner.gst import Gst
 
     pipeline = Gst.parse_launch(f"{line} ! appsink name=frames sync=false max-buffers=4")
@@ -167,7 +167,7 @@ def test_the_others_continue_if_a_source_fails(tmp_path, conf):
     done = run("record", *words, *mounted)
     assert done.returncode == 1
     part = output / ".rear.mkv.part"
-    assert f"rear: Failed after iterations as requested.; the part before is in {part}" in done.stderr
+    assert f"rear: Failed after iterations as requested.; what was recorded until then is in {part}" in done.stderr
     assert "mast: Cannot identify device '/dev/none'.\n" in done.stderr
     assert sorted(path.name for path in output.iterdir()) == [part.name, "front.mkv", "recording.json"]
     assert len(recorded(output / "front.mkv")) == 60
@@ -260,10 +260,10 @@ def test_nothing_is_overwritten(tmp_path):
     assert all((tmp_path / name).read_text() == "mine" for name in names)
 
 
-def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
+def test_a_name_taken_during_the_recording_is_not_overwritten(tmp_path):
     recordings.claim_files(tmp_path, ["rear"])["rear"].write_text("new")
     (tmp_path / "rear.mkv").write_text("old")
-    with pytest.raises(RunError, match=r"rear.mkv was created meanwhile; the recording is .*/\.rear\.mkv\.part"):
+    with pytest.raises(RunError, match=r"rear.mkv was created in the meantime; the recording is .*/\.rear\.mkv\.part"):
         recordings.keep(tmp_path, "rear")
     assert (tmp_path / "rear.mkv").read_text() == "old"
 
@@ -280,7 +280,7 @@ def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
         (
             ["output=/tmp/x", "source=appsrc"],
             2,
-            "command line: source: rear: its frames are pushed by a Python program",
+            "command line: source: rear: its frames must be pushed by a Python program",
         ),
     ],
 )

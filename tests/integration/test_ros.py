@@ -1,4 +1,4 @@
-"""Topics of ROS as sources of a real vehicle, against real rclpy and rospy: pixels, capture times, faults, recovery."""
+"""ROS topics as sources of a real vehicle, with real rclpy and rospy: pixels, capture times, faults, recovery."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ class Publisher:
         for line in self.process.stdout:
             self.sent.append(json.loads(line))
 
-    def publish(self, topic, fps=RATE, **wishes):
-        self.process.stdin.write(json.dumps({"topic": topic, "fps": fps, **wishes}) + "\n")
+    def publish(self, topic, fps=RATE, **settings):
+        self.process.stdin.write(json.dumps({"topic": topic, "fps": fps, **settings}) + "\n")
         self.process.stdin.flush()
 
 
 @contextmanager
 def publishing(ros, publisher=None, **cameras):
-    """A publisher, with one topic /NAME/image for each camera, whose value are its wishes."""
+    """A publisher with one topic /NAME/image for each camera; the values are its settings."""
     publisher = publisher or Publisher(ros)
     try:
-        for name, wishes in cameras.items():
-            publisher.publish(f"/{name}/image", **wishes)
+        for name, settings in cameras.items():
+            publisher.publish(f"/{name}/image", **settings)
         yield publisher
     finally:
         publisher.process.stdin.close()
@@ -90,19 +90,19 @@ def subscribing(ros, *words):
             cameras.close()
 
 
-def told(reported, part):
+def matching(reported, part):
     return [line for line in reported if part in line]
 
 
 def calm(reported):
-    """Without what a busy machine adds."""
+    """The lines without those that a busy machine adds."""
     return [line for line in reported if not re.search("a second|pictures were lost|pictures are lost", line)]
 
 
 @contextmanager
 def watched(plans, reported):
-    """Viewers of both cameras, once these have pictures."""
-    until(lambda: len(told(reported, ": pictures are ")) == 2)
+    """Viewers of both cameras, once both have pictures."""
+    until(lambda: len(matching(reported, ": pictures are ")) == 2)
     with watching(plans[0]) as front, watching(plans[1]) as rear:
         until(lambda: min(front.insist(), rear.insist()) > 10)
         yield front, rear
@@ -112,7 +112,7 @@ def watched(plans, reported):
 
 
 def shown(picture):
-    """What GStreamer makes of a shared picture, as RGB."""
+    """A shared picture as GStreamer converts it, as RGB."""
     from runner.gst import Gst
     from runner.gst.shared import push_shared
 
@@ -137,7 +137,7 @@ def road():
 
 
 def published(tmp_path, encoding, padding, big=False):
-    """Wishes for a publisher of a road in an encoding, and the RGB that it stands for."""
+    """Settings for a publisher of a road in an encoding, and the RGB that it represents."""
     data, rgb = encoded(road(), encoding)
     rows = data.reshape(54, -1)
     if big:
@@ -156,11 +156,11 @@ def test_pixels_of_each_encoding(ros, tmp_path):
     wanted = {}
     with publishing(ros) as publisher:
         for number, encoding in enumerate(FORMATS):
-            wishes, rgb = published(tmp_path, encoding, padding=number % 4 * 3)
+            settings, rgb = published(tmp_path, encoding, padding=number % 4 * 3)
             wanted[encoding] = rgb
-            publisher.publish(f"/{encoding}/image", fps=5, **wishes)
-        wishes, wanted["big"] = published(tmp_path, "mono16", 0, big=True)
-        publisher.publish("/big/image", fps=5, **wishes)
+            publisher.publish(f"/{encoding}/image", fps=5, **settings)
+        settings, wanted["big"] = published(tmp_path, "mono16", 0, big=True)
+        publisher.publish("/big/image", fps=5, **settings)
         for kind in ("png", "jpg"):
             (tmp_path / kind).write_bytes(cv2.imencode(f".{kind}", road())[1].tobytes())
             wanted[kind] = road()[..., ::-1]
@@ -212,7 +212,7 @@ def test_pictures_arrive_in_order_with_the_times_of_their_stamps(ros):
     }
 
 
-def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
+def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
     unknown, size = "encoding 'bayer_rggb8' is not supported", "pictures are BGR 192x108"
     with (
         publishing(ros, front={}, rear={}) as publisher,
@@ -220,30 +220,30 @@ def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
         watched(plans, reported) as (front, rear),
     ):
         publisher.publish("/front/image", encoding="bayer_rggb8")
-        until(lambda: told(reported, unknown))
+        until(lambda: matching(reported, unknown))
         before = len(rear.sizes)
         until(lambda: len(rear.sizes) > before + 2 * RATE)
         publisher.publish("/front/image")
         goes_on(front)
         publisher.publish("/front/image", half=True)
-        until(lambda: told(reported, size))
+        until(lambda: matching(reported, size))
         goes_on(front)
         publisher.publish("/front/image", late_s=3)
-        until(lambda: told(reported, "a stamp is 3.0"))
+        until(lambda: matching(reported, "a stamp is 3.0"))
         goes_on(front)
         publisher.publish("/front/image", late_s=-3)  # stays in doubt: not told again
         goes_on(front)
         publisher.publish("/front/image", late_s=None)
         goes_on(front)
         publisher.publish("/front/image")
-        until(lambda: told(reported, "stamps are right again"))
+        until(lambda: matching(reported, "stamps are correct again"))
         publisher.publish("/front/image", reliability="best_effort")
         goes_on(front)
         publisher.publish("/front/image", fps=0)
-        until(lambda: told(reported, "/front/image: no publisher for 5 s"))
-        until(lambda: told(reported, "front: source: no frame for 1 s"))
+        until(lambda: matching(reported, "/front/image: no publisher for 5 s"))
+        until(lambda: matching(reported, "front: source: no frame for 1 s"))
         publisher.publish("/front/image")
-        until(lambda: told(reported, "/front/image: pictures come again, after "))
+        until(lambda: matching(reported, "/front/image: pictures arrive again, after "))
         goes_on(front)
     lines = [line.removeprefix("front: /front/image: ") for line in reported if "/front/image" in line]
     assert [re.sub(r"[0-9.]+ s", "N s", line) for line in calm(lines)] == [
@@ -252,11 +252,11 @@ def test_what_a_topic_may_do_wrong_is_told_once_and_others_go_on(ros):
         f"{size}, scaled up to the camera's 384x216; they were BGR 384x216",
         "a stamp is N s old: the latency of these pictures is unknown",
         "pictures are BGR 384x216; they were BGR 192x108",
-        "stamps are right again",
+        "stamps are correct again",
         "no publisher for N s",
-        "pictures come again, after N s",
+        "pictures arrive again, after N s",
     ]
-    assert calm(told(reported, "/rear/image")) == ["rear: /rear/image: pictures are BGR 384x216"]
+    assert calm(matching(reported, "/rear/image")) == ["rear: /rear/image: pictures are BGR 384x216"]
 
 
 def goes_on(client):
@@ -264,7 +264,7 @@ def goes_on(client):
     until(lambda: len(client.sizes) > before + RATE)
 
 
-def test_a_node_that_dies_is_started_again(ros):
+def test_a_killed_node_is_restarted(ros):
     with (
         publishing(ros, front={}, rear={}),
         subscribing(ros) as (_, plans, reported),
@@ -272,8 +272,8 @@ def test_a_node_that_dies_is_started_again(ros):
     ):
         (node,) = children_named(os.getpid(), SCRIPT)
         os.kill(node, signal.SIGKILL)
-        until(lambda: told(reported, "the ROS node ended: killed by SIGKILL; starting it again"))
-        until(lambda: told(reported, "the ROS node works again"))
+        until(lambda: matching(reported, "the ROS node ended: killed by SIGKILL; starting it again"))
+        until(lambda: matching(reported, "the ROS node works again"))
         goes_on(front)
         (again,) = children_named(os.getpid(), SCRIPT)
         assert again != node
@@ -297,23 +297,23 @@ def test_a_topic_of_another_type(ros):
     with publishing(ros), subscribing(ros, *topics) as (_, _, reported):
         image, compressed = (ros.type("sensor_msgs", name) for name in ("Image", "CompressedImage"))
         until(lambda: f"front: /rosout: has messages of type {log}, must be {image} or {compressed}" in reported)
-        until(lambda: told(reported, "rear: /never: no publisher for 5 s"))
+        until(lambda: matching(reported, "rear: /never: no publisher for 5 s"))
         assert len(reported) == 2
 
 
 def test_names_are_those_of_the_node_and_ages_are_by_its_clock(ros):
-    """A clock of a simulation that nobody publishes stands at 0."""
+    """A simulated clock that nobody publishes stays at 0."""
     words = ("ros.namespace=/front", "cameras.front.topic=image", "ros.remap={/seen: /rear/image}")
     simulated = ("cameras.rear.topic=/seen", *ros.simulated())
     with publishing(ros, front={}, rear={}), subscribing(ros, *words, *simulated) as (_, _, reported):
         for name in ("front: image", "rear: /seen"):
             until(lambda line=f"{name}: pictures are BGR 384x216": line in reported)
-            (line,) = told(reported, f"{name}: a stamp is ")
+            (line,) = matching(reported, f"{name}: a stamp is ")
             assert line.endswith(" s in the future: the latency of these pictures is unknown")
 
 
 def test_both_versions_one_after_the_other(tmp_path):
-    """One key chooses."""
+    """A single key selects the version."""
     for version in (1, 2):
         with running(version, tmp_path) as ros, publishing(ros, front={}, rear={}):
             ros.words = [f"ros.version={version}"]
@@ -329,28 +329,28 @@ def test_both_versions_one_after_the_other(tmp_path):
 
 
 def test_a_master_that_dies_and_returns(ros1):
-    """Pictures go on without it; with the next one come topics of publishers that register there."""
-    absent, there = (f"the ROS master at {ros1.master.uri} {what}" for what in ("does not answer", "answers"))
+    """Pictures continue without it; the next one brings topics of publishers that register there."""
+    down, up = (f"the ROS master at {ros1.master.uri} {what}" for what in ("does not answer", "answers"))
     with subscribing(ros1) as (_, plans, reported):
         with publishing(ros1, front={}, rear={}), watched(plans, reported) as (front, rear):
             (node,) = children_named(os.getpid(), SCRIPT)
             for times in (1, 2):
                 ros1.master.kill()
-                until(lambda times=times: len(told(reported, absent)) == times)
+                until(lambda times=times: len(matching(reported, down)) == times)
                 goes_on(front)
                 goes_on(rear)
                 ros1.master.start()
-                until(lambda times=times: len(told(reported, there)) == times)
+                until(lambda times=times: len(matching(reported, up)) == times)
             known = until(lambda: {"/front/image", "/rear/image"} <= subscribed(ros1) and subscribed(ros1))
             assert "/clock" not in known
-            assert told(reported, "no publisher") == []
-        until(lambda: len(told(reported, "/image: no publisher for 5 s")) == 2)
+            assert matching(reported, "no publisher") == []
+        until(lambda: len(matching(reported, "/image: no publisher for 5 s")) == 2)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: len(told(reported, "/image: pictures come again")) == 2)
+            until(lambda: len(matching(reported, "/image: pictures arrive again")) == 2)
             with watching(plans[0]) as front:
                 goes_on(front)
         assert children_named(os.getpid(), SCRIPT) == [node]
-    assert told(reported, "the ROS node") == []
+    assert matching(reported, "the ROS node") == []
 
 
 def subscribed(ros1):
@@ -358,14 +358,14 @@ def subscribed(ros1):
     return {topic for topic, nodes in ros1.master.call("getSystemState")[1] if "/tod_runner" in nodes}
 
 
-def test_a_master_that_comes_late(ros1):
+def test_a_master_that_starts_late(ros1):
     ros1.master.kill()
     with subscribing(ros1) as (_, plans, reported):
         until(lambda: f"the ROS master at {ros1.master.uri} does not answer" in reported)
         ros1.master.start()
         with publishing(ros1, front={}, rear={}), watched(plans, reported) as (front, _):
             goes_on(front)
-    assert len(told(reported, "the ROS master")) == 2
+    assert len(matching(reported, "the ROS master")) == 2
 
 
 def test_a_master_that_hangs(ros1):
@@ -375,25 +375,25 @@ def test_a_master_that_hangs(ros1):
         watched(plans, reported) as (front, _),
     ):
         ros1.master.process.send_signal(signal.SIGSTOP)
-        until(lambda: told(reported, "does not answer"))
+        until(lambda: matching(reported, "does not answer"))
         goes_on(front)
         ros1.master.process.send_signal(signal.SIGCONT)
-        until(lambda: told(reported, f"the ROS master at {ros1.master.uri} answers"))
+        until(lambda: matching(reported, f"the ROS master at {ros1.master.uri} answers"))
         goes_on(front)
 
 
-def test_a_publisher_that_dies_without_a_word(ros1):
-    """The master still names it."""
+def test_a_publisher_that_is_killed(ros1):
+    """The master still lists it."""
     publisher = Publisher(ros1)
     with subscribing(ros1) as (_, plans, reported):
         for name in ("front", "rear"):
             publisher.publish(f"/{name}/image")
-        until(lambda: len(told(reported, ": pictures are ")) == 2)
+        until(lambda: len(matching(reported, ": pictures are ")) == 2)
         publisher.process.kill()
         publisher.process.wait(20)
-        until(lambda: "front: /front/image: its publisher cannot be reached for 5 s" in reported)
+        until(lambda: "front: /front/image: its publisher has been unreachable for 5 s" in reported)
         with publishing(ros1, front={}, rear={}):
-            until(lambda: told(reported, "front: /front/image: pictures come again, after "))
+            until(lambda: matching(reported, "front: /front/image: pictures arrive again, after "))
             with watching(plans[0]) as front:
                 goes_on(front)
 
@@ -404,23 +404,23 @@ def test_a_master_that_any_machine_can_reach_is_refused(ros1):
     status, lines = refused(ros1)
     assert (status, lines[-1]) == (
         1,
-        f"the ROS node does not start: the ROS master at {ros1.master.uri} admits any node of the network: "
+        f"the ROS node does not start: the ROS master at {ros1.master.uri} admits any node on the network: "
         "start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true",
     )
 
 
 def test_a_name_that_is_taken_is_refused(ros1):
-    """The master would end the node that has it."""
+    """The master would shut down the running node."""
     with publishing(ros1, front={}), subscribing(ros1) as (_, _, reported):
-        until(lambda: told(reported, "pictures are"))
+        until(lambda: matching(reported, "pictures are"))
         status, lines = refused(ros1)
-        why = "the ROS node does not start: a node of the name /tod_runner runs already, at http://127.0.0.1:"
+        why = "the ROS node does not start: a node named /tod_runner is already running at http://127.0.0.1:"
         assert (status, lines[-1][: len(why)]) == (1, why)
         assert lines[-1].endswith(": give another ros.node")
-        assert told(reported, "the ROS node") == []
+        assert matching(reported, "the ROS node") == []
 
 
-def test_a_node_that_is_ended_over_ros_is_started_again(ros1):
+def test_a_node_that_is_shut_down_over_ros_is_restarted(ros1):
     with (
         publishing(ros1, front={}, rear={}),
         subscribing(ros1) as (_, plans, reported),
@@ -428,9 +428,9 @@ def test_a_node_that_is_ended_over_ros_is_started_again(ros1):
     ):
         with suppress(OSError, HTTPException):  # it may end before it answers
             ServerProxy(ros1.master.call("lookupNode", "/tod_runner")).shutdown("/test", "as rosnode kill does")
-        why = "another node of the same name has come, or it was ended over ROS"
+        why = "another node of the same name has started, or it was shut down over ROS"
         until(lambda: f"the ROS node ended: {why}; starting it again" in reported)
-        until(lambda: told(reported, "the ROS node works again"))
+        until(lambda: matching(reported, "the ROS node works again"))
         goes_on(both[0])
 
 
@@ -438,7 +438,7 @@ def test_a_node_of_ros_1_leaves_no_files(ros1, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.delenv("ROS_LOG_DIR")
     with subscribing(ros1) as (_, _, reported):
-        until(lambda: told(reported, "/front/image: no publisher for 5 s"))
+        until(lambda: matching(reported, "/front/image: no publisher for 5 s"))
     assert not (tmp_path / "home/.ros").exists()
 
 
@@ -463,7 +463,7 @@ def camera_feed(ros, names, push):
 
 @contextmanager
 def counted(ros, publisher, names):
-    """Topics of a publisher. Yields how late their pictures came, s, by name, and what was reported."""
+    """Topics of a publisher. Yields by name how late their pictures arrived, s, and what was reported."""
     late_s = {name: [] for name in names}
 
     def push(name, picture):
@@ -475,7 +475,7 @@ def counted(ros, publisher, names):
 
 
 def test_eight_topics_arrive(ros2):
-    """480x270 at 10 Hz from one process, which is what the middleware's own settings lose pictures of."""
+    """480x270 at 10 Hz from one process, of which the middleware's default settings lose pictures."""
     names, fps, seconds = [f"camera_{number}" for number in range(8)], 10, 30
     publisher = Publisher(ros2, (480, 270))
     with counted(ros2, publisher, names) as (late_s, reported):
@@ -490,11 +490,11 @@ def test_eight_topics_arrive(ros2):
         until(lambda: sum(map(len, late_s.values())) - came >= 0.99 * sent)
     late = sorted(late for every in late_s.values() for late in every)
     print(f"{sent} pictures, p95 {1e3 * late[len(late) * 95 // 100]:.1f} ms")
-    assert [line for line in told(reported, "were lost") if " lost, 0 between publisher and node" not in line] == []
+    assert [line for line in matching(reported, "were lost") if " lost, 0 between publisher and node" not in line] == []
 
 
 def losses(ros, large=True):
-    """What is reported on pictures that were lost while the node did not run: in all, between, and here."""
+    """The report on pictures lost while the node was stopped: in total, in transport, and in the node."""
     publisher = Publisher(ros, large=large)
     with counted(ros, publisher, ["front", "rear"]) as (late_s, reported):
         for name in late_s:
@@ -505,8 +505,8 @@ def losses(ros, large=True):
         before = len(publisher.sent)
         until(lambda: len(publisher.sent) - before >= 14)
         os.kill(node, signal.SIGCONT)
-        line = until(lambda: told(reported, "pictures were lost"))[0]
-        until(lambda: told(reported, "no pictures are lost any more"))
+        line = until(lambda: matching(reported, "pictures were lost"))[0]
+        until(lambda: matching(reported, "no more pictures are lost"))
     assert max(late for every in late_s.values() for late in every) < 2
     return map(int, re.search(r": (\d+) of .* lost, (\d+) between .*, (\d+) since", line).groups())
 
@@ -518,7 +518,7 @@ def test_pictures_that_were_lost_since_the_node_ran_late_are_reported(ros):
 
 
 def test_pictures_that_a_small_segment_of_shared_memory_lost_are_reported(ros2):
-    """It is overwritten while the node does not run."""
+    """It is overwritten while the node is stopped."""
     lost, between, here = losses(ros2, large=False)
     assert lost == between + here
     assert between > lost / 2
@@ -533,7 +533,7 @@ def refused(ros, *words):
 
 
 def test_a_vehicle_without_the_library_does_not_start(ros):
-    remedy = {1: "`make ros1` installs it", 2: "`make ros2` makes .venv-ros2"}[ros.version]
+    remedy = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}[ros.version]
     assert refused(ros, "ros.python=no/python") == (1, [f"ros.python: no/python: no such program; {remedy}"])
     library, other = {1: ("rospy", ROS2_PYTHON), 2: ("rclpy", "/usr/bin/python3")}[ros.version]
     status, lines = refused(ros, f"ros.python={other}")
@@ -543,10 +543,10 @@ def test_a_vehicle_without_the_library_does_not_start(ros):
     assert lines[-1].endswith(f": No module named '{library}'")
 
 
-def test_nodes_of_other_machines_are_not_found_unless_they_prove_who_they_are(ros2):
+def test_unauthenticated_nodes_of_other_machines_are_not_discovered(ros2):
     status, (line,) = refused(ros2, "ros.discovery=subnet")
     assert status == 2
-    assert line.startswith("command line: ros.discovery: subnet: admits any node of the network: set up SROS 2 ")
+    assert line.startswith("command line: ros.discovery: subnet: admits any node on the network: set up SROS 2 ")
 
 
 def test_a_camera_without_a_topic(ros):

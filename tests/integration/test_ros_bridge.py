@@ -1,4 +1,4 @@
-"""The control link as topics of ROS: `tod-runner ros` between a real vehicle and nodes of real rclpy and rospy."""
+"""The control link as ROS topics: `tod-runner ros` between a real vehicle and nodes of real rclpy and rospy."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def bridged(ros, lines, *words, keys=None):
     ):
         for side in (vehicle, bridge):
             threading.Thread(target=lambda side=side: lines.extend(side.stdout), daemon=True).start()
-        until(lambda: told(lines, "requests have the id"))
+        until(lambda: matching(lines, "requests have the id"))
         yield both, broker, (vehicle, bridge)
 
 
-def told(lines, part):
+def matching(lines, part):
     return [line for line in tuple(lines) if part in line]
 
 
@@ -77,11 +77,11 @@ def test_requests_are_answered_and_a_late_subscriber_knows_all(ros, lines):
         until(lambda: operator.texts("state")[-1] == '{"online": false}')
         reply = until(lambda: offline(operator))
         assert reply["result"] == "refused"
-    assert told(lines, "Traceback") == []
+    assert matching(lines, "Traceback") == []
 
 
 def test_operator_inputs_are_topics_and_services(ros, lines):
-    """Of an interface that knows nothing of this project's JSON."""
+    """Inputs of an interface that does not use this project's JSON."""
     remap = f"ros.remap={{{NODE}/camera/front/kbps: /operator/bitrate, {NODE}/mode/single: /operator/manual}}"
     with bridged(ros, lines, remap) as (_, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         until(lambda: operator.texts("telemetry"))
@@ -104,23 +104,23 @@ def test_operator_inputs_are_topics_and_services(ros, lines):
             reply = operator.set("/operator/bitrate", number=number)
             assert reply["result"] == "refused"
             assert reason in reply["reason"]
-        until(lambda: [operator.publish(f"{NODE}/operator_connected", empty=True), told(lines, "is present")][-1])
-        until(lambda: told(lines, "has been silent for 1 s"))  # nobody else speaks for it
+        until(lambda: [operator.publish(f"{NODE}/operator_connected", empty=True), matching(lines, "is present")][-1])
+        until(lambda: matching(lines, "has been silent for 1 s"))  # nobody else speaks for it
 
         vehicle.terminate()
         until(lambda: operator.texts("state")[-1] == '{"online": false}')
         until(lambda: operator.call("/operator/manual") == [False, "refused: the vehicle is offline"])
-    assert told(lines, "Traceback") == []
+    assert matching(lines, "Traceback") == []
 
 
-def test_an_input_of_another_type_is_told_once(ros, lines):
+def test_an_input_of_another_type_is_reported_once(ros, lines):
     with bridged(ros, lines), ros.client("interface", *HEARD) as operator:
         operator.publish(f"{NODE}/total_kbps", text="no number")
         found, expected = (ros.type("std_msgs", name) for name in ("String", "Float64"))
-        until(lambda: told(lines, f"~/total_kbps: has messages of type {found}, must be {expected}"))
+        until(lambda: matching(lines, f"~/total_kbps: has messages of type {found}, must be {expected}"))
         until(lambda: operator.texts("telemetry"))
         assert operator.call("mode/collective") == [True, "applied"]
-    assert len(told(lines, "has messages of type")) == 1
+    assert len(matching(lines, "has messages of type")) == 1
 
 
 def with_roi(operator, roi):
@@ -141,16 +141,16 @@ def test_a_request_that_the_vehicle_does_not_answer_times_out(ros, lines):
         reply = operator.ask(id="two", event="mode_selected", mode="single")
         vehicle.send_signal(signal.SIGCONT)
         assert (reply["id"], reply["result"]) == ("two", "timed out")
-        assert reply["reason"] == "the vehicle has not answered within 3 s"
+        assert reply["reason"] == "the vehicle did not answer within 3 s"
 
 
-def test_a_node_that_dies_is_started_again_with_what_late_subscribers_need(ros, lines):
+def test_a_killed_node_is_restarted_with_its_latched_texts(ros, lines):
     with bridged(ros, lines) as (_, _, (_, bridge)), ros.client("interface", *HEARD) as operator:
         until(lambda: operator.texts("url/front") and operator.texts("telemetry"))
         (node,) = children_named(bridge.pid, SCRIPT)
         os.kill(node, signal.SIGKILL)
-        until(lambda: told(lines, "the ROS node works again"))
-        assert len(told(lines, "the ROS node ended: killed by SIGKILL; starting it again")) == 1
+        until(lambda: matching(lines, "the ROS node works again"))
+        assert len(matching(lines, "the ROS node ended: killed by SIGKILL; starting it again")) == 1
         with ros.client("late", *HEARD) as late:
             assert late.newest("state")["mode"] == "automatic"
             until(lambda: late.texts("url/front") and late.texts("url/rear"))
@@ -162,16 +162,16 @@ def test_a_new_master_knows_all_topics_and_services(ros1, lines):
     with bridged(ros1, lines) as (_, _, (_, bridge)):
         (node,) = children_named(bridge.pid, SCRIPT)
         ros1.master.kill()
-        until(lambda: told(lines, f"the ROS master at {ros1.master.uri} does not answer"))
+        until(lambda: matching(lines, f"the ROS master at {ros1.master.uri} does not answer"))
         ros1.master.start()
-        until(lambda: told(lines, f"the ROS master at {ros1.master.uri} answers"))
+        until(lambda: matching(lines, f"the ROS master at {ros1.master.uri} answers"))
         with ros1.client("late", *HEARD) as late:
             assert late.newest("state")["mode"] == "automatic"
             until(lambda: late.texts("url/front") and late.texts("url/rear") and late.texts("telemetry"))
             assert late.call("mode/collective") == [True, "applied"]
             assert late.set("total_kbps", number=2500.0)["result"] == "applied"
         assert children_named(bridge.pid, SCRIPT) == [node]
-    assert len(told(lines, "the ROS ")) == 2
+    assert len(matching(lines, "the ROS ")) == 2
 
 
 def test_requests_have_the_role_of_their_keys(ros, lines, tmp_path):
@@ -184,7 +184,7 @@ def test_requests_have_the_role_of_their_keys(ros, lines, tmp_path):
         )
         assert operator.ask(id="two", event="operator_connected")["result"] == "applied"
         assert operator.texts("url/front")[0].startswith("rtsps://")
-    assert told(lines, f"requests have the id {WATCHER}")
+    assert matching(lines, f"requests have the id {WATCHER}")
 
 
 def position(reader):
@@ -213,9 +213,9 @@ def test_positions_and_predictions_of_one_named_node(ros, lines):
         until(lambda: [pqos.publish("/pqos/kbps", number=2345.0), predicted(reader) == 2345][-1], every_s=0.1)
         with ros.client("impostor") as other:
             why = "is published by /impostor, must be by /pqos alone: predictions are left out"
-            until(lambda: [other.publish("/pqos/kbps", number=9.0), told(lines, why)][-1], every_s=0.1)
+            until(lambda: [other.publish("/pqos/kbps", number=9.0), matching(lines, why)][-1], every_s=0.1)
             asker = Operator(broker)
             assert asker.ask("x", event="mode_selected", mode="automatic")["result"] == "applied"
             asker.link.close()
             assert predicted(reader) == 2345
-    assert len(told(lines, "is published by")) == 1
+    assert len(matching(lines, "is published by")) == 1

@@ -1,4 +1,4 @@
-"""Decoded pictures as topics of ROS: of a real vehicle, through a real operator's side, with real rclpy and rospy."""
+"""Decoded pictures as ROS topics: of a real vehicle, through a real operator's side, with real rclpy and rospy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ WORDS = (
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
 def test_a_point_is_where_camera_info_says(ros, lens):
-    """After the crop of the native picture, and then with a region of interest and a factor, too."""
+    """After the crop of the native picture, and also with a region of interest and a factor."""
     broker = Endpoint("127.0.0.1", free_port())
     words = [*WORDS, f"cameras.front.lens={lens}", f"control.port={broker.port}", f"media.port={free_port()}"]
     asker = None

@@ -1,4 +1,4 @@
-"""Keys: who holds them drives and sees; who does not is refused, by real GStreamer, mosquitto and OpenSSL."""
+"""Keys: holders can drive and watch, others are refused, by real GStreamer, mosquitto and OpenSSL."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def operating(keys, common, name):
         yield operator
 
 
-def asked(operator, event):
+def answer_to(operator, event):
     """The vehicle's answer to a request."""
     answers = []
     operator.station.ask(event, answers.append)
@@ -98,18 +98,18 @@ def test_video_and_control_pass_and_each_role_may_do_what_it_is_for(keys):
         until(lambda: alice.station.state)
         until(lambda: frames(alice) and min(frames(alice).values()) > 10)
         assert alice.station.identity == "alice"
-        assert asked(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+        assert answer_to(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
         with operating(keys, common, "bob") as bob:
             until(lambda: bob.station.state)
-            refused = asked(bob, {"event": "total_set", "kbps": 10})
+            refused = answer_to(bob, {"event": "total_set", "kbps": 10})
             assert (refused.result, refused.reason) == (
                 "refused",
                 "a watcher may not request total_set; only controller may",
             )
-            assert asked(bob, {"event": "operator_connected"}).result == "applied"
+            assert answer_to(bob, {"event": "operator_connected"}).result == "applied"
         with operating(keys, common, "carol") as carol:
             until(lambda: carol.station.state)
-            refused = asked(carol, {"event": "total_set", "kbps": 10})
+            refused = answer_to(carol, {"event": "total_set", "kbps": 10})
             assert (refused.result, refused.reason) == ("refused", "alice is in control")
         state = alice.station.state
         assert state.mode == "collective"
@@ -160,7 +160,7 @@ def published(endpoint, holder, topic, **how):
         (NAME, "tod/another/reply/alice", False),
     ],
 )
-def test_nobody_speaks_for_another(keys, broker, holder, topic, allowed):
+def test_nobody_can_impersonate_another(keys, broker, holder, topic, allowed):
     status, output = published(broker, keys / holder, topic)
     assert (status, "failed: Not authorized" in output) == (0, not allowed), output
 
@@ -182,7 +182,7 @@ def test_the_broker_refuses_intruders(keys, broker, tmp_path):
     assert published(broker, keys / "alice", topic) == (0, "")
 
 
-def test_what_is_revoked_is_disconnected_and_stays_out(keys):
+def test_revoked_holders_are_disconnected_and_stay_out(keys):
     old = keys.parent / "old"
     shutil.copytree(keys / "alice", old)
     with (
@@ -202,7 +202,7 @@ def test_what_is_revoked_is_disconnected_and_stays_out(keys):
         assert published(broker_of(common), old, f"tod/{NAME}/request/alice")[0] != 0
 
 
-def test_a_vehicle_whose_keys_are_withdrawn_is_seen_no_more(keys):
+def test_a_vehicle_with_revoked_keys_is_disconnected(keys):
     old = keys.parent / "old"
     shutil.copytree(keys / NAME, old)
     with sending(keys, vehicle_keys=old) as (plans, _), watching(plans, keys / "alice") as (seen, messages):
@@ -217,8 +217,8 @@ def test_a_vehicle_whose_keys_are_withdrawn_is_seen_no_more(keys):
         assert seen() == before
 
 
-def test_what_is_connected_stays_connected_when_certificates_expire(keys):
-    """Of both sides, while they stream; nobody new is admitted."""
+def test_connections_survive_the_expiry_of_certificates(keys):
+    """Certificates of both sides expire while they stream; nobody new is admitted."""
     ends = datetime.now(UTC) + timedelta(seconds=8)
     for name in (NAME, "alice"):
         changed(keys, "rotate", name, lambda: ends - timedelta(days=365))
@@ -234,7 +234,7 @@ def test_what_is_connected_stays_connected_when_certificates_expire(keys):
 
 
 def test_rotated_keys_take_effect_without_a_restart(keys):
-    """Of everybody, while the vehicle streams."""
+    """Keys of everyone, while the vehicle streams."""
     with driving(keys) as (broker, common), operating(keys, common, "alice") as alice:
         until(lambda: alice.station.state and min(frames(alice).values(), default=0) > 10)
         for name in ("broker", NAME, "alice"):
@@ -245,7 +245,7 @@ def test_rotated_keys_take_effect_without_a_restart(keys):
             until(lambda: alice.station.state)
             before = frames(alice)
             until(lambda: min(frames(alice).values()) > max(before.values()) + 20)
-            assert asked(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+            assert answer_to(alice, {"event": "mode_selected", "mode": "collective"}).result == "applied"
 
 
 def broker_of(common):
@@ -299,7 +299,7 @@ def watching(plans, holder, vehicle=NAME):
 
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
-def test_pictures_come_to_who_has_keys(keys, graph):
+def test_only_key_holders_receive_pictures(keys, graph):
     with (
         sending(keys, f"graph={graph}", f"graph.first_port={free_port(3)}") as (plans, _),
         watching(plans, keys / "bob") as (seen, messages),
@@ -346,8 +346,8 @@ def test_an_operator_knows_its_vehicle(keys):
             time.sleep(0.2)
 
 
-def test_clients_that_say_nothing_keep_nobody_out(keys):
-    """Neither those that only connect, nor those that stop in the middle of a handshake."""
+def test_silent_clients_do_not_block_others(keys):
+    """Neither clients that only connect, nor those that stop in the middle of a handshake."""
     with ExitStack() as stack, sending(keys) as (plans, _):
         port = plans[0].operator[0].properties["location"].rpartition(":")[2].partition("/")[0]
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", int(port)))) for _ in range(60)]
@@ -440,7 +440,7 @@ def test_nothing_on_the_wire_can_be_read(keys, encrypted, graph, tmp_path):
     ):
         operator.start()
         until(lambda: operator.station.state and min(frames(operator).values(), default=0) > 20)
-        assert asked(operator, {"event": "mode_selected", "mode": "collective"}).result == "applied"
+        assert answer_to(operator, {"event": "mode_selected", "mode": "collective"}).result == "applied"
     everything = b"".join(packets)
     assert len(packets) > 200
     legible = [text for text in (*LEGIBLE, *START_CODES) if text in everything]

@@ -1,4 +1,4 @@
-"""Both sides under a service manager: it hears that they work, and nothing once they hang."""
+"""Both sides under a service manager: it is notified while they work, and no longer once they hang."""
 
 from __future__ import annotations
 

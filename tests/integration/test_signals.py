@@ -47,7 +47,7 @@ def started(body: str, **options: object) -> subprocess.Popen[str]:
 
 
 def ended(child: subprocess.Popen[str]) -> tuple[int, str, float]:
-    """Exit status, standard error, seconds until then."""
+    """Exit status, standard error, and seconds until the end."""
     began = time.monotonic()
     _, errors = child.communicate(timeout=20)
     return child.returncode, errors, time.monotonic() - began
@@ -60,7 +60,7 @@ def test_a_signal_interrupts_the_main_thread(number: signal.Signals) -> None:
     assert ended(child)[:2] == (128 + number, "")
 
 
-def test_a_library_that_makes_another_error_of_it_changes_nothing() -> None:
+def test_an_interrupt_that_a_library_turns_into_another_error() -> None:
     child = started(
         """\
         ready()
@@ -99,7 +99,7 @@ def test_a_main_thread_in_a_c_library_is_ended_by_force(mode: str) -> None:
     assert seconds > END_S / 2
 
 
-def test_a_second_signal_ends_at_once_and_leaves_no_half_file(tmp_path: Path) -> None:
+def test_a_second_signal_ends_immediately_and_leaves_no_partial_file(tmp_path: Path) -> None:
     child = started(
         f"""\
         with signals.stopping(limit_s=None) as stop, unfinished(Path({str(tmp_path / "file")!r})) as part:
@@ -118,7 +118,7 @@ def test_a_second_signal_ends_at_once_and_leaves_no_half_file(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cleaning_up_that_hangs_delays_nothing_for_long() -> None:
+def test_hanging_cleanup_does_not_delay_the_end_for_long() -> None:
     child = started("with signals.urgent(lambda: time.sleep(60)):\n    ready(); time.sleep(0.1); time.sleep(60)")
     child.send_signal(signal.SIGSTOP)  # both signals are pending when it resumes
     child.send_signal(signal.SIGINT)
@@ -138,7 +138,7 @@ def test_a_full_pipe_of_standard_error_does_not_delay_the_end() -> None:
     assert child.wait(10) in BY_SIGNALS
 
 
-def test_a_verb_whose_parent_ends_its_lifeline_ends_as_by_sigterm() -> None:
+def test_a_verb_whose_lifeline_closes_ends_as_by_sigterm() -> None:
     read, write = os.pipe()
     child = started(
         "with signals.stopping() as stop:\n    ready(); stop.wait(60)\nsys.exit(stop.status)",
@@ -150,7 +150,7 @@ def test_a_verb_whose_parent_ends_its_lifeline_ends_as_by_sigterm() -> None:
     assert ended(child)[:2] == (0, "")
 
 
-def test_a_parent_that_ended_before_the_verb_looked_is_noticed() -> None:
+def test_a_parent_that_ended_before_the_verb_started_is_noticed() -> None:
     read, write = os.pipe()
     os.close(write)
     words = [sys.executable, "-m", "runner", "replay", "modes=paper", "source=test"]

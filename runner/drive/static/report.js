@@ -2,7 +2,7 @@
 "use strict";
 
 /** An element of the page; the page has every element that is looked up. */
-const by = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
+const byId = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 /**
  * The charts as runner/drive/figures.py describes them, converted to plotly's traces.
  * @typedef {{title: string, low: number, high: number, marks: number[], log: boolean, percent: boolean}} Axis
@@ -15,16 +15,16 @@ const by = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
  *   strip: {bars: Bars[], none: string}|null, track: Track|null}} Chart
  * @type {{day: string[], night: string[], charts: Chart[]}}
  */
-const data = JSON.parse(by("data").textContent ?? "");
+const data = JSON.parse(byId("data").textContent ?? "");
 const KEY = "tod-report-theme";
 const DASHES = ["solid", "6px,2px", "2px,2px", "7px,2px,2px,2px"];
-const SEEN = 0.004; // of the axis: the smallest visible width of a freeze
+const MIN_VISIBLE = 0.004; // of the axis: the smallest visible width of a freeze
 const VIRIDIS = ["#440154", "#482878", "#3e4a89", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
 
 const root = document.documentElement;
 const isDay = () => root.dataset.theme === "day";
 const themed = (name) => getComputedStyle(root).getPropertyValue(`--${name}`).trim();
-// Texts of the drive are shown in plotly's labels, which interpret some HTML.
+// Escapes texts of the drive for plotly's labels, which interpret some HTML.
 const plain = (text) => String(text).replace(/[&<>]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[c] ?? c).replaceAll("\n", "<br>");
 
 /** Colour of a camera's index in the palette, or of a name in the style sheet. */
@@ -34,7 +34,7 @@ function colourOf(colour) {
   return colours[colour % colours.length];
 }
 
-/** Colours that the background would hide are left out: the lightest by day, the darkest by night. */
+/** The scale without colours too close to the background: the lightest by day, the darkest by night. */
 function viridis() {
   const shown = isDay() ? VIRIDIS.slice(0, -1) : VIRIDIS.slice(2);
   return shown.map((colour, i) => [i / (shown.length - 1), colour]);
@@ -61,7 +61,7 @@ function traces(curve, hover) {
 
 /** @param {Bars} bars  @param {Axis} x  @param {number} unit_s */
 function freezes({ label, colour, spans }, x, unit_s) {
-  const least = SEEN * (x.high - x.low);
+  const least = MIN_VISIBLE * (x.high - x.low);
   const name = plain(label);
   return {
     type: "bar", orientation: "h", yaxis: "y2", name, showlegend: false, base: spans.map(([t]) => t), x: spans.map(([, s]) => Math.max(s, least)),
@@ -70,8 +70,8 @@ function freezes({ label, colour, spans }, x, unit_s) {
   };
 }
 
-/** The way, the bitrate on it, arrows, its ends, and the position pointed at. @param {Track} track */
-function mapped({ way: [x, y], t, east, north, kbps, low, high, title, arrows }) {
+/** The track, the bitrate on it, arrows, its ends, and the position at the pointer. @param {Track} track */
+function mapTraces({ way: [x, y], t, east, north, kbps, low, high, title, arrows }) {
   const bar = { title: { text: title, side: "right", font: { size: 13 } }, thickness: 12, outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
   const markers = { type: "scatter", mode: "markers", hoverinfo: "skip" };
   const outlined = { color: themed("panel"), line: { width: 2.5, color: themed("text") } };
@@ -85,7 +85,7 @@ function mapped({ way: [x, y], t, east, north, kbps, low, high, title, arrows })
     { ...markers, x: arrows.map(([each]) => each), y: arrows.map(([, each]) => each), name: "direction", showlegend: false,
       marker: { ...outlined, symbol: "triangle-up", size: 11, angle, line: { ...outlined.line, width: 1.5 } } },
     end(0, "circle", "start"), end(-1, "square", "end"),
-    { ...markers, x: [], y: [], name: "where you point at", showlegend: false, marker: { symbol: "circle-open", size: 22, color: themed("text"), line: { width: 4 } } },
+    { ...markers, x: [], y: [], name: "position at the pointer", showlegend: false, marker: { symbol: "circle-open", size: 22, color: themed("text"), line: { width: 4 } } },
   ];
 }
 
@@ -100,7 +100,7 @@ function axisOf({ title, low, high, marks, log, percent }) {
   };
 }
 
-/** Freezes have their own rows below the curves. @param {Chart} chart */
+/** Layout of the freezes, which have their own rows below the curves. @param {Chart} chart */
 function stripOf({ strip, x, y }) {
   if (!strip) return {};
   const rows = strip.bars.length;
@@ -124,7 +124,7 @@ function draw(element) {
   const chart = data.charts[charts.indexOf(element)];
   const { x, y, hover, curves, strip, track, unit_s } = chart;
   const drawn = [
-    ...(track ? mapped(track) : []),
+    ...(track ? mapTraces(track) : []),
     ...curves.flatMap((curve) => traces(curve, hover)),
     ...(strip?.bars ?? []).map((bars) => freezes(bars, x, unit_s)),
   ];
@@ -141,11 +141,11 @@ function draw(element) {
   Plotly.react(element, drawn, layout, config);
   if (element.dataset.drawn) return;
   element.dataset.drawn = "yes";
-  if (overTime) element.on("plotly_hover", ({ points }) => point(chart, points[0].x));
+  if (overTime) element.on("plotly_hover", ({ points }) => markPosition(chart, points[0].x));
 }
 
 /** Marks the vehicle's position on the map at a time of a chart. */
-function point({ drive, unit_s }, at) {
+function markPosition({ drive, unit_s }, at) {
   const index = data.charts.findIndex((each) => each.track && each.drive === drive);
   const track = data.charts[index]?.track;
   const map = charts[index];
@@ -155,7 +155,7 @@ function point({ drive, unit_s }, at) {
   Plotly.restyle(map, { x: [[track.east[now]]], y: [[track.north[now]]] }, [map.data.length - 1]);
 }
 
-/** One after the other, so that the page is never blocked. */
+/** Draw one chart after the other, so that the page is never blocked. */
 function drawAll() {
   for (const [i, element] of charts.entries()) setTimeout(draw, i * 5, element);
 }
@@ -163,10 +163,10 @@ function drawAll() {
 // --- day and night ----------------------------------------------------------------------------------------------------
 
 const light = matchMedia("(prefers-color-scheme: light)");
-const button = by("theme");
+const button = byId("theme");
 
-/** A page opened from a file may have no storage. */
-function kept(value) {
+/** Read the stored theme, or store one; a page opened from a file may have no storage. */
+function storedTheme(value) {
   try {
     if (value) localStorage.setItem(KEY, value);
     return localStorage.getItem(KEY);
@@ -183,9 +183,9 @@ function show(theme) {
 
 button.addEventListener("click", () => {
   const theme = isDay() ? "night" : "day";
-  kept(theme);
+  storedTheme(theme);
   show(theme);
 });
-light.addEventListener("change", () => show(kept() ?? (light.matches ? "day" : "night")));
+light.addEventListener("change", () => show(storedTheme() ?? (light.matches ? "day" : "night")));
 addEventListener("beforeprint", () => show("day"));
-show(kept() ?? (light.matches ? "day" : "night"));
+show(storedTheme() ?? (light.matches ? "day" : "night"));

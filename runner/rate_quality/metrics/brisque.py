@@ -1,7 +1,7 @@
 """BRISQUE of luma (A. Mittal, A. K. Moorthy, A. C. Bovik, "No-reference image quality assessment in the spatial
 domain", IEEE Trans. Image Processing 21(12), 2012): 36 features of natural scenes, and a regression from the user.
 
-Statistics of natural pictures, so a picture is judged by itself, without a reference; scores need not rise with the
+It compares a picture with statistics of natural scenes, without a reference; scores need not rise with the
 bitrate. Equation numbers are those of the paper.
 """
 
@@ -40,7 +40,7 @@ def metric(model: Path | None, ranges: Path | None) -> Metric:
         ("brisque_range", ranges, "the ranges of the features as svm-scale's text or OpenCV's brisque_range_live.yml"),
     ):
         if path is None:
-            raise UserError("", key, None, f"brisque needs a file of yours, {what}")
+            raise UserError("", key, None, f"brisque needs a file that you provide, {what}")
     assert model is not None and ranges is not None
     regression = load(model, ranges, FEATURES)
     return Metric(
@@ -58,12 +58,12 @@ def metric(model: Path | None, ranges: Path | None) -> Metric:
 
 
 def meter(regression: Regression, size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> FrameMeter:
-    """Meter of one lane. It supports no mask, as the metric states."""
+    """Meter of one lane. Masks are not supported, as the metric states."""
     return FrameMeter(size, lambda _, picture: score(picture, regression))
 
 
 def score(picture: Luma, regression: Regression) -> float:
-    """0 best to 100 worst; values of the regression beyond are clipped."""
+    """0 best to 100 worst; predictions outside are clipped."""
     return min(100.0, max(0.0, regression(features(picture))))
 
 
@@ -90,9 +90,9 @@ def normalise(plane: Plane) -> Plane:
 
         (I - mu) / (sigma + 1),  mu and sigma under a 7x7 Gaussian of sigma 7/6           (Eq. 1 to 3, C = 1)
 
-    The picture's border is replicated outward, which the paper leaves open.
+    The picture's border is replicated outward; the paper leaves this open.
     """
-    centred = plane - 128  # squares stay small, and float32 exact enough
+    centred = plane - 128  # keeps squares small, so that float32 is exact enough
     mean = _blur(centred)
     variance = np.maximum(_blur(centred * centred) - mean * mean, 0)
     coefficients: Plane = (centred - mean) / (np.sqrt(variance) + 1)
@@ -115,7 +115,7 @@ def fit_ggd(values: Plane) -> tuple[float, float]:
 
 
 class ProductSums(NamedTuple):
-    """Of a set of values: their number in all, below 0 and above; sums of squares and of absolute values."""
+    """Sums over a set of values: counts in total, below 0 and above; squares and absolute values."""
 
     total: int
     below: int
@@ -126,7 +126,7 @@ class ProductSums(NamedTuple):
 
 
 def statistics(mscn: Plane, down: int, right: int) -> ProductSums:
-    """Of the products of neighbours that both lie in the picture (Eq. 7 to 10)."""
+    """Sums over the products of neighbours within the picture (Eq. 7 to 10)."""
     rows, columns = mscn.shape[0] - down, mscn.shape[1] - abs(right)
     return ProductSums(rows * columns, *sum_products(mscn, down, right))
 

@@ -21,7 +21,7 @@ class QualityMeter(Protocol):
     """Scores the pictures of one lane, given in frame order, from one thread."""
 
     def add(self, frame: int, reference: Luma, picture: Luma) -> None:
-        """Take one picture and its reference, both of the meter's size; neither is kept.
+        """Score one picture against its reference, both of the meter's size; neither is kept.
 
         raises  ValueError if shape or type differ, RunError if a tool fails
         """
@@ -45,7 +45,7 @@ class Metric:
     tolerance    a loss below it is not worth a scaling factor
     good         quality for which b_full is chosen by default
     build        makes a meter from size, frame rate, stride and mask; call `meter`
-    every_frame  its meters must see every frame; otherwise only those to be scored
+    every_frame  whether its meters must see every frame, not only those to be scored
     """
 
     name: str
@@ -65,7 +65,7 @@ class Metric:
 
         size    width and height in px of every picture
         fps     frames per second of the lane
-        stride  for a metric that sees every frame: score each stride-th, from the first on; the others score all given
+        stride  for a metric that sees every frame: score every stride-th, from the first on; others score all
         mask    which pixels count (of windows: their centres); None for all
         raises  UserError for pictures that are too small, a mask that the metric cannot use, a mask without a pixel
         """

@@ -26,7 +26,7 @@ SIDE, SIGMA = 11, 1.5  # of the window, px
 MARGIN = SIDE // 2
 C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
 ONE = np.float32(1)
-GREY = np.float32(128)  # subtracted first: squares stay small, and float32 exact enough
+GREY = np.float32(128)  # subtracted first: keeps squares small, so that float32 is exact enough
 
 PixelRow = NDArray[np.float32]
 PixelRows = np.ndarray[Any, np.dtype[np.float32]]
@@ -58,7 +58,7 @@ def meter(size: PictureSize, fps: Fraction, stride: int, mask: Mask | None) -> F
     weights = gaussian()
 
     def score(reference: Luma, picture: Luma) -> float:
-        # A crop of a larger picture has gaps between its rows, which the machine code does not handle.
+        # A crop of a larger picture is not contiguous, which the compiled code requires.
         return total(np.ascontiguousarray(reference), np.ascontiguousarray(picture), weights, counts) / windows
 
     return FrameMeter(size, score)
@@ -77,7 +77,7 @@ def total(x: Luma, y: Luma, weights: PixelRow, counts: NDArray[np.uint8]) -> flo
     """Sum of SSIM over the windows that count.
 
     weights  one side of the window
-    counts   [window], 1 for those that count, else 0
+    counts   [window], 1 for those that count, otherwise 0
 
     One pass over the rows: a ring holds the last 11 of each moment, smoothed along the row.
     """

@@ -65,7 +65,7 @@ class Regression:
 
 
 def scale(features: Vector, ranges: Ranges) -> Vector:
-    """Features scaled as in training; one that was constant there is 0, as svm-scale leaves it out."""
+    """Features scaled as in training; one that was constant there is 0, since svm-scale omits it."""
     span = ranges.most - ranges.least
     share = (features - ranges.least) / np.where(span > 0, span, 1)
     return np.where(span > 0, ranges.lower + (ranges.upper - ranges.lower) * share, 0.0)
@@ -74,7 +74,7 @@ def scale(features: Vector, ranges: Ranges) -> Vector:
 def load(model: Path, ranges: Path, features: int) -> Regression:
     """Read a regression of this many features, each file in either form.
 
-    raises  UserError that names file, place and rule
+    raises  UserError that names file, location and rule
     """
     found, spans = _read(model), _read(ranges)
     kernels = (_opencv_kernels if _is_opencv(found) else _libsvm_kernels)(model, found, features)
@@ -113,7 +113,7 @@ def _libsvm_kernels(path: Path, text: str, features: int) -> Kernels:
     rho, gamma = (_number(path, name, settings.get(name, "")) for name in ("rho", "gamma"))
     rows = [line.split() for line in body.splitlines() if line.strip()]
     total = int(_number(path, "total_sv", settings.get("total_sv", "")))
-    _expect(path, "SV", len(rows), f"must have {total} lines, as total_sv says", len(rows) == total > 0)
+    _expect(path, "SV", len(rows), f"must have {total} lines, as total_sv states", len(rows) == total > 0)
     vectors = np.zeros((total, features))
     alpha = np.zeros(total)
     for i, (weight, *cells) in enumerate(rows):
@@ -205,7 +205,7 @@ def _document(path: Path, text: str) -> dict[str, Any]:
         document = yaml.load(text.partition("\n")[2], _OpenCvLoader)
     except yaml.YAMLError:
         raise UserError(str(path), "", None, "is not what OpenCV writes") from None
-    _expect(path, "", text[:20], "holds nothing", isinstance(document, dict) and bool(document))
+    _expect(path, "", text[:20], "is empty", isinstance(document, dict) and bool(document))
     return dict(document)
 
 

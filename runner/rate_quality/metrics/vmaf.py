@@ -23,9 +23,9 @@ import numpy as np
 from runner.errors import RunError, UserError
 from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
 
-PATIENCE_S = 120.0  # even a busy machine scores a picture faster
+TIMEOUT_S = 120.0  # even a busy machine scores a picture faster
 PIPE_BYTES = 1 << 20  # the most that a user may request; fewer, larger writes
-SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more, and say so
+SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more and report it
 GREY = 128  # chroma, which VMAF ignores
 LOG, STDERR_FILE = "scores.json", "stderr"
 
@@ -60,7 +60,7 @@ class VmafLog(msgspec.Struct):
     pictures: list[LoggedPicture] = msgspec.field(name="frames")
 
 
-READER = msgspec.json.Decoder(VmafLog)  # made by one thread: msgspec 0.22 crashes where several make it
+READER = msgspec.json.Decoder(VmafLog)  # created once: msgspec 0.22 crashes if several threads create it
 
 
 def metric(model: str) -> Metric:
@@ -91,12 +91,12 @@ def meter(tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int,
 
 
 def find_tool() -> Tool:
-    """The ffmpeg of TOD_FFMPEG, otherwise the first with libvmaf: that of imageio-ffmpeg, then that on the PATH.
+    """The ffmpeg of TOD_FFMPEG, otherwise the first with libvmaf: that of imageio-ffmpeg or that on the PATH.
 
     raises  RunError if none has libvmaf; the one that TOD_FFMPEG names is never silently replaced by another
     """
     named = os.environ.get("TOD_FFMPEG")
-    for name in [named] if named else _known():
+    for name in [named] if named else _candidates():
         exe = os.path.abspath(shutil.which(name) or name)  # it will run in another directory
         if version := _version(exe):
             return Tool(exe, version)
@@ -104,7 +104,7 @@ def find_tool() -> Tool:
     raise RunError(f"{what}: install the extra vmaf, see docs/install.md")
 
 
-def _known() -> Iterator[str]:
+def _candidates() -> Iterator[str]:
     # The module raises RuntimeError if its wheel came without a binary.
     with suppress(ModuleNotFoundError, RuntimeError):
         import imageio_ffmpeg
@@ -119,14 +119,14 @@ def _version(exe: str) -> str:
     try:
         texts = [
             subprocess.run(
-                [exe, "-hide_banner", question],
+                [exe, "-hide_banner", option],
                 check=False,
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=PATIENCE_S,
+                timeout=TIMEOUT_S,
             ).stdout
-            for question in ("-filters", "-version")
+            for option in ("-filters", "-version")
         ]
     except (OSError, subprocess.TimeoutExpired):
         return ""
@@ -170,18 +170,18 @@ def picture_format(size: PictureSize, pixel_format: str, fps: Fraction) -> list[
 
 
 def read_log(directory: Path, status: int) -> Scores:
-    """The output of libvmaf. Raises RunError if there is none: ffmpeg may end with status 0 all the same."""
+    """The output of libvmaf. Raises RunError if there is none: ffmpeg may fail with status 0."""
     if status:
-        raise complaint(directory, status)
+        raise ffmpeg_error(directory, status)
     try:
         log = READER.decode((directory / LOG).read_bytes())
         return Scores(log.version, {picture.number: picture.metrics.vmaf for picture in log.pictures})
     except (OSError, msgspec.ValidationError, msgspec.DecodeError):
-        raise complaint(directory, status) from None
+        raise ffmpeg_error(directory, status) from None
 
 
-def complaint(directory: Path, status: int) -> RunError:
-    """An unexpected end of ffmpeg, with its first message: the last ones do not name the cause."""
+def ffmpeg_error(directory: Path, status: int) -> RunError:
+    """The error for an unexpected end of ffmpeg, with its first message: later ones do not name the cause."""
     lines = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
     why = re.sub(r"^\[[^]]*\] ", "", lines[0]) if lines else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
@@ -196,9 +196,9 @@ def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format:
     tool = find_tool()
     layout = picture_format(size, pixel_format, Fraction(25))
     inputs = [[*layout, "-i", str(path.resolve())] for path in (picture, reference)]
-    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / STDERR_FILE).open("w") as complaints:
+    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / STDERR_FILE).open("w") as stderr:
         words = command(tool.exe, inputs, model, 1)
-        status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=complaints).returncode
+        status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=stderr).returncode
         return list(read_log(Path(name), status).by_picture.values())
 
 
@@ -208,8 +208,8 @@ def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format:
 class VmafMeter:
     """Pipes pictures to a process and reads the scores from its log.
 
-    No call waits forever: whichever pipe has room is written to, the end of the process is noticed at once, and a
-    stalled one is abandoned after `PATIENCE_S`.
+    No call waits forever: whichever pipe has room is written to, the end of the process is noticed immediately, and a
+    stalled one is abandoned after `TIMEOUT_S`.
     """
 
     version = ""  # of libvmaf, known at the end
@@ -217,7 +217,7 @@ class VmafMeter:
     def __init__(self, tool: Tool, model: str, size: PictureSize, fps: Fraction, stride: int) -> None:
         self._size = size
         self._frames: list[int] = []
-        self._sound = True  # no picture was written only in part
+        self._intact = True  # no picture was written only in part
         self._scores: dict[int, float] | None = None
         luma, chroma = math.prod(size), 2 * math.prod((side + 1) // 2 for side in size)
         self._pictures = [np.full(luma + chroma, GREY, np.uint8) for _ in range(2)]
@@ -239,17 +239,17 @@ class VmafMeter:
                 theirs.append(read)
                 self._pipes.append(write)
                 os.set_blocking(write, False)
-                # Not on every system, and not when this user's pipes hold too much already.
+                # Unsupported on some systems, and refused if this user's pipes already use too much memory.
                 with suppress(OSError, AttributeError):
                     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
             words = command(exe, [[*layout, "-i", f"pipe:{pipe}"] for pipe in theirs], model, stride)
-            with (self._path / STDERR_FILE).open("wb") as complaints:
+            with (self._path / STDERR_FILE).open("wb") as stderr:
                 return subprocess.Popen(
                     words,
                     cwd=self._path,
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    stderr=complaints,
+                    stderr=stderr,
                     pass_fds=theirs,
                 )
         finally:
@@ -258,17 +258,17 @@ class VmafMeter:
 
     def add(self, frame: int, reference: Luma, picture: Luma) -> None:
         check(self._size, reference, picture)
-        if self._scores is not None or not self._sound:
+        if self._scores is not None or not self._intact:
             raise ValueError("this meter has ended")
         for whole, luma in zip(self._pictures, (picture, reference), strict=True):
             whole[: luma.size] = luma.ravel()
         self._frames.append(frame)
-        self._sound = False
+        self._intact = False
         try:
             self._write()
         except BrokenPipeError:
-            raise complaint(self._path, self._wait()) from None
-        self._sound = True
+            raise ffmpeg_error(self._path, self._wait()) from None
+        self._intact = True
 
     def _write(self) -> None:
         """One picture into each pipe. Raises BrokenPipeError when the process has ended, RunError when it stalls."""
@@ -277,9 +277,9 @@ class VmafMeter:
         for pipe in left:
             room.register(pipe, select.POLLOUT)
         while left:
-            ready = room.poll(PATIENCE_S * 1000)
+            ready = room.poll(TIMEOUT_S * 1000)
             if not ready:
-                raise RunError(f"ffmpeg has taken no picture for {PATIENCE_S:g} s")
+                raise RunError(f"ffmpeg has accepted no picture for {TIMEOUT_S:g} s")
             for pipe, _ in ready:
                 left[pipe] = left[pipe][os.write(pipe, left[pipe]) :]
                 if not left[pipe]:
@@ -290,7 +290,7 @@ class VmafMeter:
         if self._scores is None:
             self._scores = {}  # a failure is raised once
             try:
-                if self._frames and self._sound:
+                if self._frames and self._intact:
                     self._scores = self._finish()
             finally:
                 self._process.kill()
@@ -306,11 +306,11 @@ class VmafMeter:
         return {self._frames[number]: score for number, score in scores.by_picture.items()}
 
     def _wait(self) -> int:
-        """Exit status of the process, which was asked to end or is about to."""
+        """Exit status of the process, which is about to end."""
         try:
-            return self._process.wait(PATIENCE_S)
+            return self._process.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise RunError(f"ffmpeg has not ended for {PATIENCE_S:g} s") from None
+            raise RunError(f"ffmpeg has not ended for {TIMEOUT_S:g} s") from None
 
     def _close_pipes(self) -> None:
         while self._pipes:

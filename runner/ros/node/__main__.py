@@ -1,6 +1,6 @@
 """usage: python -P __main__.py SOCKET
 
-The node of ROS: see `start`. SOCKET is the number of an open socket (AF_UNIX, SOCK_SEQPACKET).
+The ROS node: see `start`. SOCKET is the number of an open socket (AF_UNIX, SOCK_SEQPACKET).
 """
 
 import os
@@ -12,10 +12,10 @@ from pathlib import Path
 PACKAGE = "tod_runner_node"
 
 if __name__ == "__main__":
-    # By its place: on the path its modules might hide others of the same names.
+    # Loaded by location: on the path, its modules might shadow others of the same names.
     here = Path(__file__).parent
     spec = spec_from_file_location(PACKAGE, here / "__init__.py", submodule_search_locations=[str(here)])
     assert spec
     sys.modules[PACKAGE] = module_from_spec(spec)
     status = import_module(f"{PACKAGE}.start").start(int(sys.argv[1]))
-    os._exit(status)  # threads of rospy that wait for other nodes would keep the process
+    os._exit(status)  # rospy threads that wait for other nodes would keep the process alive

@@ -1,4 +1,4 @@
-"""Topics whose messages are passed on as they come."""
+"""Topics whose messages are passed on unchanged."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .port import Port
 
 MAX_TEXT = 20_000  # characters, which JSON may write as six bytes each
 
-# By kind of an input, package and name of its type. All messages of EACH count, of NEWEST only the newest.
+# By kind of input, package and name of its type. Every message of EACH is passed on, of NEWEST only the newest.
 REGION = ("sensor_msgs", "RegionOfInterest")
 EACH = {"text": ("std_msgs", "String"), "number": ("std_msgs", "Float64"), "region": REGION}
 NEWEST = {"fix": ("sensor_msgs", "NavSatFix"), "newest_number": ("std_msgs", "Float64"), "sign": ("std_msgs", "Empty")}
@@ -18,25 +18,25 @@ SERVICES = {"trigger": ("std_srvs", "Trigger"), "switch": ("std_srvs", "SetBool"
 
 
 class InputTopic:
-    """A topic that is subscribed to for as long as the node is there.
+    """A topic that is subscribed to while the node runs.
 
     kind  of its messages, see TYPES
     """
 
     def __init__(self, port: Port, name: str, kind: str) -> None:
         self._port, self.name, self.kind = port, name, kind
-        self._wrong: list[str] = []
+        self._unexpected: list[str] = []
 
     def publishing_nodes(self, message: Any) -> list[str]:
-        """Names of all nodes that publish the topic, when a message comes; none as long as one is unknown."""
+        """Names of all nodes that publish the topic when a message arrives; empty while one is unknown."""
         raise NotImplementedError
 
     def check_types(self, found: Iterable[str], expected: str) -> None:
-        """Report types of publishers that are not the expected one, once each time they change."""
-        wrong = sorted(set(found) - {expected})
-        if wrong and wrong != self._wrong:
-            self._port.report(f"has messages of type {', '.join(wrong)}, must be {expected}", self.name)
-        self._wrong = wrong
+        """Report unexpected types of publishers, once each time they change."""
+        unexpected = sorted(set(found) - {expected})
+        if unexpected and unexpected != self._unexpected:
+            self._port.report(f"has messages of type {', '.join(unexpected)}, must be {expected}", self.name)
+        self._unexpected = unexpected
 
     def on_message(self, message: Any) -> None:
         match self.kind:
@@ -54,7 +54,7 @@ class InputTopic:
             case _ if len(message.data) <= MAX_TEXT:
                 self._pass_on(text=message.data)
             case _:
-                self._port.report(f"a text is longer than {MAX_TEXT}: left out", self.name)
+                self._port.report(f"a text is longer than {MAX_TEXT} characters and was left out", self.name)
 
     def _pass_on(self, **values: Any) -> None:
-        self._port.say(self.kind, topic=self.name, **values)
+        self._port.send(self.kind, topic=self.name, **values)

@@ -27,18 +27,18 @@ class Port:
         task: dict[str, Any] = json.loads(self._socket.recv(MAX_MESSAGE_BYTES))
         return task
 
-    def say(self, kind: str, **values: Any) -> None:
+    def send(self, kind: str, **values: Any) -> None:
         """Send a message, from any thread."""
         self._socket.send(json.dumps({"kind": kind, **values}).encode())
 
     def report(self, text: str, topic: str = "") -> None:
-        """Say what people are to know about a topic; "" stands for the node itself."""
-        self.say("report", topic=topic, text=text)
+        """Report something to the user about a topic; "" stands for the node itself."""
+        self.send("report", topic=topic, text=text)
 
     def send_picture(self, data: memoryview, **values: Any) -> None:
-        """Copy a picture into memory of its own, and pass that on. The other side frees it, however it ends.
+        """Copy a picture into memory of its own and pass that on. It is freed even if the other side is killed.
 
-        If the other side is behind, the picture is lost: later ones count more.
+        If the other side lags behind, the picture is dropped in favour of later ones.
         """
         memory = shared_memory(data)
         try:
@@ -50,9 +50,9 @@ class Port:
             os.close(memory)
 
     def orders(self) -> Iterator[tuple[dict[str, Any], int]]:
-        """What is to be published or answered, until the other side closes the connection, or is gone.
+        """Texts and pictures to publish, and answers, until the other side closes the connection or ends.
 
-        yields  with the memory of a picture, to be closed; -1: it is none
+        yields  an order, and the memory of its picture, which the caller must close; -1: none
         """
         with suppress(OSError):
             while True:
@@ -61,7 +61,7 @@ class Port:
                     return
                 yield json.loads(order), memory[0] if memory else -1
 
-    def closes(self, within_s: float) -> bool:
+    def wait_closed(self, within_s: float) -> bool:
         """Wait; returns True as soon as the other side has closed the connection."""
         poll = select.poll()
         poll.register(self._socket, select.POLLRDHUP)
@@ -69,7 +69,7 @@ class Port:
 
 
 def shared_memory(data: memoryview | bytes) -> int:
-    """The file descriptor of new memory without a name that holds some data.
+    """The file descriptor of new anonymous memory that contains the data.
 
     raises  OSError
     """

@@ -1,7 +1,7 @@
-"""The node of ROS 1, by rospy.
+"""The ROS 1 node, based on rospy.
 
-rospy asks the ROS master without a limit in time, and asks again until it answers. So what needs the master happens in
-the main thread alone, after the master has answered within a limit; all else happens in others, and goes on without it.
+rospy calls the ROS master without a timeout, and repeats the call until it answers. So everything that needs the master
+happens in the main thread, once the master has answered within a timeout; other threads work on without it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from xml.parsers.expat import ExpatError
 from xmlrpc.client import Error, ServerProxy, Transport
 
 from .inputs import NEWEST, SERVICES, TYPES, InputTopic
-from .pictures import LATE_NS, LOOK_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
+from .pictures import LATE_NS, POLL_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
 from .port import NodeError, Port
 
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
-DEPTH = 10  # pictures of a topic that wait to be passed on, of which the oldest go first
-BUFFER_BYTES = 1 << 24  # read at once: all that has come, so that the newest is seen
-ANSWER_S = 5.0  # for a master or node on a busy machine
+DEPTH = 10  # pictures of a topic that wait to be passed on; the oldest are dropped first
+BUFFER_BYTES = 1 << 24  # large enough to read everything that has arrived, including the newest
+ANSWER_S = 5.0  # timeout for a master or node on a busy machine
 RECONNECT_S = 2.0  # between two attempts to reach a publisher, which rospy makes once
-CALL_S = 30.0  # within which the other side of the port has answered any call
-ABSENT = (OSError, Error, HTTPException, ExpatError)  # from whoever does not answer, or not as ROS does
-ANY_LOOPBACK = "127.255.255.254"  # where only a server on all addresses answers
+CALL_S = 30.0  # timeout for the answer of the other side of the port to a service call
+UNREACHABLE = (OSError, Error, HTTPException, ExpatError)  # raised if a peer does not answer, or not as ROS does
+ANY_LOOPBACK = "127.255.255.254"  # answered only by a server that listens on all addresses
 
 
 class Registrations(NamedTuple):
-    """What a ROS master knows: names of nodes by topic or service, and the types of topics."""
+    """The registrations of a ROS master: names of nodes by topic or service, and the types of topics."""
 
     publishers: dict[str, list[str]]
     subscribers: dict[str, list[str]]
@@ -55,38 +55,38 @@ class _LimitedTransport(Transport):
 
 
 class RosMaster:
-    """The ROS master, which may be absent, and may come back without any registration. Used in one thread.
+    """The ROS master, which may be unreachable, and may restart without registrations. Used in one thread.
 
-    node       whole name of this node
-    admit_all  whether it may be one that any node of the network can register with
+    node       full name of this node
+    admit_all  whether it may admit any node on the network
     raises     NodeError
     """
 
     def __init__(self, port: Port, uri: str, node: str, admit_all: bool) -> None:
         self._port, self._uri, self._node, self._admit_all = port, uri, node, admit_all
         self._proxy = _proxy(uri)
-        self._is_absent = False  # as reported
+        self._is_down = False  # as reported
 
-    def look(self) -> Registrations | None:
-        """What it knows; None: it does not answer, which is reported once."""
+    def query(self) -> Registrations | None:
+        """Its registrations; None: it does not answer, which is reported once."""
         known = None
-        with suppress(*ABSENT):
+        with suppress(*UNREACHABLE):
             publishers, subscribers, services = (dict(pairs) for pairs in self._call("getSystemState"))
             known = Registrations(publishers, subscribers, services, dict(self._call("getTopicTypes")))
-        if (known is None) != self._is_absent:
-            self._is_absent = known is None
-            self._port.report(f"the ROS master at {self._uri} {'does not answer' if self._is_absent else 'answers'}")
+        if (known is None) != self._is_down:
+            self._is_down = known is None
+            self._port.report(f"the ROS master at {self._uri} {'does not answer' if self._is_down else 'answers'}")
         return known
 
     def _call(self, method: str, *words: Any) -> Any:
-        """raises  one of ABSENT, also if the master refuses"""
+        """raises  one of UNREACHABLE, also if the master refuses"""
         code, text, value = getattr(self._proxy, method)(self._node, *words)
         if code != 1:
             raise ConnectionError(text)
         return value
 
     def check(self) -> None:
-        """Refuse a master that admits any node of the network.
+        """Refuse a master that admits any node on the network.
 
         raises  NodeError
         """
@@ -96,23 +96,23 @@ class RosMaster:
             socket.create_connection((ANY_LOOPBACK, urlsplit(self._uri).port or 80), ANSWER_S).close()
         except OSError:
             return
-        rule = "admits any node of the network: start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true"
+        rule = "admits any node on the network: start it with ROS_HOSTNAME=127.0.0.1, or give insecure=true"
         raise NodeError(f"the ROS master at {self._uri} {rule}")
 
     def check_name(self) -> None:
-        """Refuse the name of a node that runs: the master would end that one.
+        """Refuse the name of a running node, which the master would shut down.
 
         raises  NodeError
         """
         try:
             uri = self._call("lookupNode", self._node)
             _proxy(uri).getPid(self._node)
-        except ABSENT:
+        except UNREACHABLE:
             return
-        raise NodeError(f"a node of the name {self._node} runs already, at {uri}: give another ros.node")
+        raise NodeError(f"a node named {self._node} is already running at {uri}: give another ros.node")
 
     def register(self, known: Registrations) -> None:
-        """Register what rospy has registered before and the master does not know: it has been started anew.
+        """Repeat registrations that the master does not have, since it has been restarted.
 
         raises  NodeError
         """
@@ -141,12 +141,12 @@ class RosMaster:
 def _proxy(uri: str) -> ServerProxy:
     try:
         return ServerProxy(uri, transport=_LimitedTransport())
-    except OSError as error:  # another protocol than HTTP
+    except OSError as error:  # not an HTTP address
         raise NodeError(f"{uri}: {error}") from error
 
 
 class Worker:
-    """A thread that does one thing after another."""
+    """A thread that runs tasks one after the other."""
 
     def __init__(self) -> None:
         self._tasks: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
@@ -154,11 +154,11 @@ class Worker:
         threading.Thread(target=self._work, daemon=True).start()
 
     def add(self, task: Callable[..., object], *arguments: object) -> None:
-        """From any thread."""
+        """Add a task, from any thread."""
         self._tasks.put(partial(task, *arguments))
 
     def check(self) -> None:
-        """raises what a task has raised; nothing is done after that"""
+        """raises what a task has raised; no task runs after that"""
         if self._failed:
             raise self._failed
 
@@ -171,7 +171,7 @@ class Worker:
 
 
 class Ros1PictureTopic(PictureTopic):
-    """Subscribes once the topic has a publisher. Pictures and reports are the worker's."""
+    """Subscribes once the topic has a publisher. The worker handles pictures and reports."""
 
     def __init__(self, port: Port, name: str, worker: Worker) -> None:
         import rospy
@@ -182,20 +182,22 @@ class Ros1PictureTopic(PictureTopic):
         self._kind, self._began = "", 0.0  # of the subscription
         self._lock = threading.Lock()
         self._waiting: deque[Any] = deque()  # pictures
-        self._dropped: list[Any] = []  # headers of pictures that have waited too long
+        self._dropped: list[Any] = []  # identities of pictures that have waited too long
 
-    def look(self, known: Registrations | None) -> None:
-        """To be called every LOOK_S by the main thread with what the master knows, if it answers."""
+    def update(self, known: Registrations | None) -> None:
+        """To be called every POLL_S by the main thread with the master's registrations, if it answers."""
         import rospy
 
-        name = rospy.resolve_name(own_name(self.name))
+        name = rospy.resolve_name(ros1_name(self.name))
         publishers = known.publishers.get(name, []) if known else []
         if known and publishers:
             self._check_type(known.types.get(name, ""))
         if self._is_connected():
-            self._worker.add(self.judge, "its publisher sends no picture")
+            self._worker.add(self.check_arrivals, "its publisher has sent no picture")
         elif known:  # otherwise it is reported that the master does not answer
-            self._worker.add(self.judge, "its publisher cannot be reached" if publishers else "no publisher")
+            self._worker.add(
+                self.check_arrivals, "its publisher has been unreachable" if publishers else "no publisher"
+            )
 
     def _check_type(self, kind: str) -> None:
         if kind in (IMAGE, COMPRESSED):
@@ -207,7 +209,7 @@ class Ros1PictureTopic(PictureTopic):
         return self._subscriber is not None and self._subscriber.get_num_connections() > 0
 
     def _subscribe(self, kind: str) -> None:
-        """Subscribe, again for another type, and where there is no connection."""
+        """Subscribe; again if the type has changed or there is no connection."""
         is_lost = not self._is_connected() and time.monotonic() - self._began > RECONNECT_S
         if self._kind == kind and not is_lost:
             return
@@ -217,12 +219,12 @@ class Ros1PictureTopic(PictureTopic):
         if self._subscriber:
             self._subscriber.unregister()
         message = Image if kind == IMAGE else CompressedImage
-        own, options = own_name(self.name), {"buff_size": BUFFER_BYTES, "tcp_nodelay": True}
+        own, options = ros1_name(self.name), {"buff_size": BUFFER_BYTES, "tcp_nodelay": True}
         self._subscriber = rospy.Subscriber(own, message, self._on_message, **options)
         self._kind, self._began = kind, time.monotonic()
 
     def _on_message(self, message: Any) -> None:
-        """In a thread of the connection, which reads on whatever becomes of this picture."""
+        """Called in a thread of the connection, which must not be blocked."""
         with self._lock:
             self._waiting.append(message)
             is_first = len(self._waiting) == 1
@@ -232,7 +234,7 @@ class Ros1PictureTopic(PictureTopic):
             self._worker.add(self._take)
 
     def _take(self) -> None:
-        """Pass on the pictures that wait. Where this node runs late, the newest win."""
+        """Pass on the pictures that wait. If this node runs late, late ones are left out."""
         with self._lock:
             dropped, waiting = tuple(self._dropped), tuple(self._waiting)
             self._dropped.clear()
@@ -250,17 +252,17 @@ class Ros1PictureTopic(PictureTopic):
                 self.pass_on(message, stamp)
 
     def _count(self, publisher: str, number: int) -> None:
-        # TCP loses nothing: what is missing has been replaced by newer pictures where it was published.
-        self.losses.untransported += self.losses.add(publisher, number)
+        # TCP loses nothing: the publisher has replaced missing pictures by newer ones.
+        self.losses.lost_in_transport += self.losses.add(publisher, number)
 
 
 def identity_of(message: Any) -> tuple[str, int]:
-    """The publisher of a picture, and its number, which every publisher's library counts."""
+    """The publisher of a picture, and the sequence number that the publisher's library gave it."""
     return message._connection_header.get("callerid", ""), message.header.seq
 
 
-def own_name(name: str) -> str:
-    """A name as rospy has it: ROS 1 writes ~name where ROS 2 writes ~/name."""
+def ros1_name(name: str) -> str:
+    """A name in ROS 1, which writes ~name where ROS 2 writes ~/name."""
     return f"~{name[2:]}" if name.startswith("~/") else name
 
 
@@ -271,13 +273,15 @@ class Ros1InputTopic(InputTopic):
         super().__init__(port, name, kind)
         package, type_name = TYPES[kind]
         self._type = f"{package}/{type_name}"
-        self._publishers: list[str] = []  # names of nodes, as the master knew them last
+        self._publishers: list[str] = []  # names of nodes, as last reported by the master
         message = getattr(import_module(f"{package}.msg"), type_name)
         size = 1 if kind in NEWEST else None
-        self._subscriber = rospy.Subscriber(own_name(name), message, self.on_message, queue_size=size, tcp_nodelay=True)
+        self._subscriber = rospy.Subscriber(
+            ros1_name(name), message, self.on_message, queue_size=size, tcp_nodelay=True
+        )
 
-    def look(self, known: Registrations) -> None:
-        """To be called every LOOK_S with what the master knows."""
+    def update(self, known: Registrations) -> None:
+        """To be called every POLL_S with the master's registrations."""
         name = self._subscriber.resolved_name
         self._publishers = known.publishers.get(name, [])
         self.check_types([known.types.get(name, self._type)] if self._publishers else [], self._type)
@@ -300,21 +304,21 @@ class Ros1Services:
         for name, kind in kinds.items():
             package, type_name = SERVICES[kind]
             service = getattr(import_module(f"{package}.srv"), type_name)
-            rospy.Service(own_name(name), service, partial(self._call, name))
+            rospy.Service(ros1_name(name), service, partial(self._call, name))
 
     def _call(self, name: str, request: Any) -> tuple[bool, str]:
-        """In a thread of the call."""
+        """Called in a thread of the call."""
         call = uuid.uuid4().hex
         answer: Future[tuple[bool, str]] = Future()
         self._waiting[call] = answer
-        self._port.say("call", topic=name, call=call, value=getattr(request, "data", None))
+        self._port.send("call", topic=name, call=call, value=getattr(request, "data", None))
         try:
             return answer.result(CALL_S)
         finally:
             self._waiting.pop(call, None)
 
     def answer(self, order: dict[str, Any]) -> None:
-        """Calls that nobody waits for any more are left out."""
+        """Answer a call, unless it has timed out."""
         if answer := self._waiting.pop(order["call"], None):
             answer.set_result((order["success"], order["text"]))
 
@@ -322,15 +326,16 @@ class Ros1Services:
 class Ros1Outputs:
     """Publishers of std_msgs/String.
 
-    kept  by topic, whether the newest text is kept for subscribers that come later
+    latched  by topic, whether the newest text is latched for late subscribers
     """
 
-    def __init__(self, kept: dict[str, bool]) -> None:
+    def __init__(self, latched: dict[str, bool]) -> None:
         import rospy
         from std_msgs.msg import String
 
         self._publishers = {
-            topic: rospy.Publisher(own_name(topic), String, queue_size=10, latch=keep) for topic, keep in kept.items()
+            topic: rospy.Publisher(ros1_name(topic), String, queue_size=10, latch=latch)
+            for topic, latch in latched.items()
         }
 
     def publish(self, order: dict[str, Any]) -> None:
@@ -363,7 +368,7 @@ class Ros1Pictures(PictureQueue):
 
         if topic not in self._publishers:
             image, info = (
-                rospy.Publisher(own_name(f"{topic}/{name}"), kind, queue_size=2, tcp_nodelay=True)
+                rospy.Publisher(ros1_name(f"{topic}/{name}"), kind, queue_size=2, tcp_nodelay=True)
                 for kind, name in ((Image, "image"), (CameraInfo, "camera_info"))
             )
             self._publishers[topic] = image, info
@@ -386,12 +391,12 @@ def run(port: Port, task: dict[str, Any]) -> None:
     master = RosMaster(
         port, os.environ["ROS_MASTER_URI"], f"{task['namespace'].rstrip('/')}/{task['node']}", task["admit_all"]
     )
-    while not master.look():
-        if port.closes(LOOK_S):
+    while not master.query():
+        if port.wait_closed(POLL_S):
             return
     master.check()
     master.check_name()
-    rospy.core.configure_logging = lambda *_: None  # would write below ~/.ros; what people are to know is reported
+    rospy.core.configure_logging = lambda *_: None  # would write to ~/.ros; the node reports what matters
     rospy.init_node(task["node"], argv=remappings(task["remap"]), disable_signals=True, disable_rosout=True)
     worker = Worker()
     topics = [Ros1PictureTopic(port, name, worker) for name in task["pictures"]]
@@ -399,34 +404,34 @@ def run(port: Port, task: dict[str, Any]) -> None:
     outputs, pictures = Ros1Outputs(task["outputs"]), Ros1Pictures()
     services = Ros1Services(port, task["services"])
 
-    def obey() -> None:
+    def serve_orders() -> None:
         for order, memory in port.orders():
             if memory < 0:
                 worker.add(services.answer if "call" in order else outputs.publish, order)
             elif pictures.put(order, memory):
                 worker.add(pictures.publish, order["picture"])
 
-    port.say("ready")
-    threading.Thread(target=obey, daemon=True).start()
-    while not port.closes(LOOK_S):
+    port.send("ready")
+    threading.Thread(target=serve_orders, daemon=True).start()
+    while not port.wait_closed(POLL_S):
         worker.check()
         if rospy.is_shutdown():
-            raise NodeError("another node of the same name has come, or it was ended over ROS")
-        look(master, topics, inputs)
+            raise NodeError("another node of the same name has started, or it was shut down over ROS")
+        update_all(master, topics, inputs)
     rospy.signal_shutdown("closed")
 
 
-def look(master: RosMaster, topics: list[Ros1PictureTopic], inputs: list[Ros1InputTopic]) -> None:
-    known = master.look()
+def update_all(master: RosMaster, topics: list[Ros1PictureTopic], inputs: list[Ros1InputTopic]) -> None:
+    known = master.query()
     if known:
-        with suppress(*ABSENT):  # it has gone meanwhile: the next look reports it
+        with suppress(*UNREACHABLE):  # the next update reports it
             master.register(known)
         for one in inputs:
-            one.look(known)
+            one.update(known)
     for topic in topics:
-        topic.look(known)
+        topic.update(known)
 
 
 def remappings(remap: dict[str, str]) -> list[str]:
-    """As on the command line of a node."""
-    return [f"{own_name(name)}:={own_name(used)}" for name, used in remap.items()]
+    """Remappings as on the command line of a node."""
+    return [f"{ros1_name(name)}:={ros1_name(used)}" for name, used in remap.items()]

@@ -1,4 +1,4 @@
-"""The node of ROS 2, by rclpy."""
+"""The ROS 2 node, based on rclpy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from .inputs import NEWEST, SERVICES, TYPES, InputTopic
-from .pictures import LATE_NS, LOOK_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
+from .pictures import LATE_NS, POLL_S, SECOND_NS, PictureQueue, PictureTopic, image_fields, info_fields
 from .port import Port
 
 if TYPE_CHECKING:
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, its node not yet
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of rmw: the topic has been discovered, but not yet its node
 
 
 class Ros2PictureTopic(PictureTopic):
     """Subscribes once the topic has a publisher, and again if its publishers offer something else.
 
-    asked  what to ask for: reliability, durability, depth; None: what the publishers offer
+    requested  reliability, durability, depth to request; None: what the publishers offer
     """
 
-    def __init__(self, node: Node, port: Port, name: str, asked: dict[str, Any]) -> None:
+    def __init__(self, node: Node, port: Port, name: str, requested: dict[str, Any]) -> None:
         super().__init__(port, name, lambda: int(node.get_clock().now().nanoseconds))
-        self._node, self._asked = node, asked
+        self._node, self._requested = node, requested
         self._subscribed: tuple[str, QoSProfile] | None = None
         self._subscription: Any = None
 
-    def look(self) -> None:
-        """To be called every LOOK_S."""
+    def update(self) -> None:
+        """To be called every POLL_S."""
         publishers = self._node.get_publishers_info_by_topic(self.name)
         kinds = sorted({publisher.topic_type for publisher in publishers})
         kind = next((kind for kind in (IMAGE, COMPRESSED) if kind in kinds), None)
@@ -44,17 +44,17 @@ class Ros2PictureTopic(PictureTopic):
             self._subscribe(kind, self._profile([p for p in publishers if p.topic_type == kind]))
         elif kinds:
             self.fail(f"has messages of type {', '.join(kinds)}, must be {IMAGE} or {COMPRESSED}")
-        self.judge("its publisher sends no picture" if publishers else "no publisher")
+        self.check_arrivals("its publisher has sent no picture" if publishers else "no publisher")
 
     def _profile(self, publishers: list[Any]) -> QoSProfile:
-        """What is asked for, otherwise what all publishers can serve."""
+        """The requested profile; where nothing is requested, what all publishers offer."""
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
         offered = {publisher.qos_profile.reliability for publisher in publishers}
         best = ReliabilityPolicy.RELIABLE if offered == {ReliabilityPolicy.RELIABLE} else ReliabilityPolicy.BEST_EFFORT
-        reliability, durability = self._asked["reliability"], self._asked["durability"]
+        reliability, durability = self._requested["reliability"], self._requested["durability"]
         return QoSProfile(
-            depth=self._asked["depth"],
+            depth=self._requested["depth"],
             reliability=ReliabilityPolicy[reliability.upper()] if reliability else best,
             durability=DurabilityPolicy[(durability or "volatile").upper()],
         )
@@ -78,17 +78,17 @@ class Ros2PictureTopic(PictureTopic):
         from rclpy.qos import qos_policy_name_from_kind
 
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
-        if asked := self._asked.get(policy):  # otherwise the next look subscribes with what is offered now
-            self.fail(f"incompatible QoS: ros.qos asks for {policy} {asked}, its publisher offers less")
+        if requested := self._requested.get(policy):  # otherwise the next update subscribes with the new offer
+            self.fail(f"incompatible QoS: ros.qos asks for {policy} {requested}, its publisher offers less")
 
     def _on_lost(self, event: Any) -> None:
-        self.losses.untransported += event.total_count_change
+        self.losses.lost_in_transport += event.total_count_change
 
     def _take(self, message: Any, info: dict[str, Any]) -> None:
-        """Pass on a picture and those that wait behind it. Where this node runs late, the newest win."""
+        """Pass on a picture and those that wait behind it. If this node runs late, late ones are left out."""
         waiting, handle = [(message, info)], self._subscription.handle
         with handle:
-            while len(waiting) < self._asked["depth"] and (newer := handle.take_message(type(message), False)):
+            while len(waiting) < self._requested["depth"] and (newer := handle.take_message(type(message), False)):
                 waiting.append(newer)
         newest = waiting[-1][1]["source_timestamp"]
         for picture, about in waiting:
@@ -110,12 +110,12 @@ class Ros2InputTopic(InputTopic):
         package, type_name = TYPES[kind]
         self._type = f"{package}/msg/{type_name}"
         each = QoSProfile(depth=10)
-        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # is compatible with any publisher
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # compatible with any publisher
         message = getattr(import_module(f"{package}.msg"), type_name)
         node.create_subscription(message, name, self.on_message, newest if kind in NEWEST else each)
 
-    def look(self) -> None:
-        """To be called every LOOK_S."""
+    def update(self) -> None:
+        """To be called every POLL_S."""
         publishers = self._node.get_publishers_info_by_topic(self.name)
         self.check_types((publisher.topic_type for publisher in publishers), self._type)
 
@@ -144,12 +144,12 @@ class Ros2Services:
 
         call = uuid.uuid4().hex
         self._waiting[call] = answer = Future()
-        self._port.say("call", topic=name, call=call, value=getattr(request, "data", None))
+        self._port.send("call", topic=name, call=call, value=getattr(request, "data", None))
         response.success, response.message = await answer
         return response
 
     def answer(self, order: dict[str, Any]) -> None:
-        """Calls of a node that ended since are left out."""
+        """Answer a call, unless it came from an earlier node process."""
         if answer := self._waiting.pop(order["call"], None):
             answer.set_result((order["success"], order["text"]))
 
@@ -157,17 +157,18 @@ class Ros2Services:
 class Ros2Outputs:
     """Publishers of std_msgs/String.
 
-    kept  by topic, whether the newest text is kept for subscribers that come later
+    latched  by topic, whether the newest text is latched for late subscribers
     """
 
-    def __init__(self, node: Node, kept: dict[str, bool]) -> None:
+    def __init__(self, node: Node, latched: dict[str, bool]) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from std_msgs.msg import String
 
         volatile = QoSProfile(depth=10)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        transient_local = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publishers = {
-            topic: node.create_publisher(String, topic, latched if keep else volatile) for topic, keep in kept.items()
+            topic: node.create_publisher(String, topic, transient_local if latch else volatile)
+            for topic, latch in latched.items()
         }
 
     def publish(self, order: dict[str, Any]) -> None:
@@ -224,21 +225,21 @@ def run(port: Port, task: dict[str, Any]) -> None:
     from rclpy.executors import SingleThreadedExecutor
 
     node = new_node(task)
-    topics = [Ros2PictureTopic(node, port, name, asked) for name, asked in task["pictures"].items()]
+    topics = [Ros2PictureTopic(node, port, name, requested) for name, requested in task["pictures"].items()]
     inputs = [Ros2InputTopic(node, port, name, kind) for name, kind in task["inputs"].items()]
     outputs, pictures = Ros2Outputs(node, task["outputs"]), Ros2Pictures(node)
     services = Ros2Services(node, port, task["services"])
     every: Iterable[Ros2PictureTopic | Ros2InputTopic] = (*topics, *inputs)
 
-    def look() -> None:
+    def update_topics() -> None:
         for topic in every:
-            topic.look()
+            topic.update()
 
-    node.create_timer(LOOK_S, look, clock=rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME))
+    node.create_timer(POLL_S, update_topics, clock=rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME))
     executor, closed = SingleThreadedExecutor(), threading.Event()
     executor.add_node(node)
 
-    def obey() -> None:
+    def serve_orders() -> None:
         for order, memory in port.orders():
             if memory < 0:
                 executor.create_task(services.answer if "call" in order else outputs.publish, order)
@@ -247,11 +248,11 @@ def run(port: Port, task: dict[str, Any]) -> None:
         closed.set()
         executor.wake()
 
-    port.say("ready")
-    threading.Thread(target=obey, daemon=True).start()
-    look()
+    port.send("ready")
+    threading.Thread(target=serve_orders, daemon=True).start()
+    update_topics()
     while not closed.is_set():
-        executor.spin_once(timeout_sec=LOOK_S)
+        executor.spin_once(timeout_sec=POLL_S)
     node.destroy_node()
     rclpy.try_shutdown()
 

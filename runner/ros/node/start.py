@@ -1,4 +1,4 @@
-"""Run the node of a version of ROS, and report why it cannot."""
+"""Run the node of a ROS version, and report why it fails."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def start(number: int) -> int:
     except ImportError as error:
         what = f"{LIBRARIES[version]} for Python {'.'.join(map(str, sys.version_info[:2]))}"
         first = str(error).strip().splitlines()[0]
-        port.say("fatal", text=f"ros.python: {sys.executable} cannot load {what}: {first}")
+        port.send("fatal", text=f"ros.python: {sys.executable} cannot load {what}: {first}")
     except (BrokenPipeError, ConnectionResetError):
-        return 0  # the other side is gone
+        return 0  # the other side has ended
     except NodeError as error:
-        port.say("fatal", text=str(error))
+        port.send("fatal", text=str(error))
     except Exception as error:
-        port.say("fatal", text=f"{type(error).__name__}: {' '.join(str(error).split())}")
+        port.send("fatal", text=f"{type(error).__name__}: {' '.join(str(error).split())}")
     else:
         return 0
     return 1
