@@ -145,12 +145,12 @@ def viewing(page, view):
 # Gamepads that a test plugs in and presses.
 PADS = """() => {
   globalThis.pads = [];
-  globalThis.shaken = [];
-  globalThis.looks = 0;
-  Object.defineProperty(navigator, "getGamepads", { value: () => (looks++, [...pads, null]) });
+  globalThis.vibrations = [];
+  globalThis.polls = 0;
+  Object.defineProperty(navigator, "getGamepads", { value: () => (polls++, [...pads, null]) });
   globalThis.plug = (name) => {
     const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
-    const vibrationActuator = { playEffect: async (kind, { duration }) => shaken.push([kind, duration]) };
+    const vibrationActuator = { playEffect: async (kind, { duration }) => vibrations.push([kind, duration]) };
     pads.push({ index: 0, id: `${name} (Vendor: 046d Product: c24f)`, connected: true, buttons, vibrationActuator });
     dispatchEvent(Object.assign(new Event("gamepadconnected"), { gamepad: pads[0] }));
   };
@@ -161,5 +161,5 @@ PADS = """() => {
 def press_button(page, button):
     """Press a button of the first pad until the page has seen it, and release it likewise."""
     for pressed in ("true", "false"):
-        looks = page.evaluate(f"pads[0].buttons[{button}].pressed = {pressed}, looks")
-        until(lambda looks=looks: page.evaluate("looks") >= looks + 2)
+        polls = page.evaluate(f"pads[0].buttons[{button}].pressed = {pressed}, polls")
+        until(lambda polls=polls: page.evaluate("polls") >= polls + 2)

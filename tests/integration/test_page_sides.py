@@ -304,7 +304,7 @@ def test_a_browser_elsewhere_needs_the_token(chromium, elsewhere):
         assert page.url == f"{url}login"
         page.fill("#token", "guessed")
         page.click("button")
-        until(lambda: "not the token" in page.locator("#problem").inner_text())
+        until(lambda: "Wrong token" in page.locator("#problem").inner_text())
         shot(page, "login")
         page.fill("#token", token)
         page.click("button")

@@ -203,7 +203,7 @@ def steering(served, rad):
         reporting.join()
 
 
-def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
+def test_buttons_act_once_and_a_pad_that_disconnects_is_announced(page, station):
     page.evaluate(PADS)
     page.evaluate("plug('Wheel')")
 
@@ -214,7 +214,7 @@ def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
         time.sleep(0.1)
         return page.locator(".tile.selected").get_attribute("data-camera")
 
-    time.sleep(0.1)  # what is held when it comes does not count
+    time.sleep(0.1)  # a button held while connecting does not count
     assert [hold(button) for button in (14, 12, 13)] == ["cropped", "scaled", "mirrored"]
     hold(3)
     assert page.evaluate("tod.view") == "drive", "of the view in the usual configuration"
@@ -225,8 +225,8 @@ def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
     hold(4)
     assert until(lambda: getattr(station, "asked", None)) == {"event": "mode_selected", "mode": "automatic"}
     page.evaluate("unplug()")
-    until(lambda: "Wheel is gone" in page.inner_text("#toasts"))
-    assert "Wheel is gone" in page.locator("#news").text_content()
+    until(lambda: "Wheel disconnected" in page.inner_text("#toasts"))
+    assert "Wheel disconnected" in page.locator("#news").text_content()
 
 
 def test_keys_do_what_the_configuration_says(page, station):
@@ -252,8 +252,8 @@ def test_a_pad_vibrates_for_a_picture_that_is_lost(page, station, served):
     page.evaluate(PADS)
     page.evaluate("plug('Pad')")
     served.on_state(None)  # the vehicle is offline
-    until(lambda: page.evaluate("shaken"))
-    assert page.evaluate("shaken") == [["dual-rumble", 600]], "once for all pictures"
+    until(lambda: page.evaluate("vibrations"))
+    assert page.evaluate("vibrations") == [["dual-rumble", 600]], "once for all pictures"
 
 
 def test_a_pad_vibrates_more_gently_for_a_picture_that_is_late(page, served):
@@ -261,10 +261,10 @@ def test_a_pad_vibrates_more_gently_for_a_picture_that_is_late(page, served):
     page.evaluate("plug('Pad')")
     served.on_sample(Sample(1.0, None, 0, 0.0, None, 0, {}, clock_bound_ms=1.0))  # ages are known
     time.sleep(1)
-    assert page.evaluate("shaken") == []
+    assert page.evaluate("vibrations") == []
     served.behind_s = 0.5
-    until(lambda: page.evaluate("shaken"))
-    assert page.evaluate("shaken")[0] == ["dual-rumble", 200]
+    until(lambda: page.evaluate("vibrations"))
+    assert page.evaluate("vibrations")[0] == ["dual-rumble", 200]
 
 
 def test_the_vehicle_is_told_of_a_page_that_is_hidden_or_out_of_focus(page, station):
