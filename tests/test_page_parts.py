@@ -215,8 +215,8 @@ def in_windows(steps, *overrides, **more):
 
 def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
     async def steps(windows, station):
-        asked = []
-        station.ask = lambda document, on_reply: (asked.append(document), on_reply(Outcome(0, "applied", "")))
+        requests = []
+        station.ask = lambda document, on_reply: (requests.append(document), on_reply(Outcome(0, "applied", "")))
         monitor = await windows.open("m", "here", show="rear_center,front_left,nothing")
         hello = await received(monitor, "hello")
         assert [(camera["name"], camera["index"]) for camera in hello["cameras"]] == [
@@ -244,7 +244,7 @@ def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
         await received(monitor, "reply", id="1", result="applied")
         await stranger.send_json(request)
         await received(stranger, "reply", id="1", reason="this page does not hold control; take it first")
-        assert asked == [{"event": "mode_selected", "mode": "single"}]
+        assert requests == [{"event": "mode_selected", "mode": "single"}]
         for order in ("take_control", "release_control"):
             await monitor.send_json({order: True})
             await received(monitor, "reply", result="refused")

@@ -434,7 +434,7 @@ class PageServer(Listener):
             answer("refused", f"event: {event!r}: must be one of {', '.join(EVENTS)}")
 
     def _save_layout(self, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
-        """Save a layout in a thread of its own: a disk that hangs must not stop the video."""
+        """Save a layout in its own thread: a hung disk must not stop the video."""
         if unknown := sorted(document.keys() - {"layout"}):
             answer("refused", f"{shortened(unknown[0])}: unknown key, only layout is allowed")
         elif self._is_saving:

@@ -126,15 +126,15 @@ function frontWidth(aspect, width, height, sides, min, usual, gaps) {
   const roomy = (height * (1 - usual) - gaps) * aspect;
   const low = sides ? width * (1 - sides * SIDE.max) : 0;
   const high = width * (1 - sides * SIDE.usual);
-  const wish = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
-  return Math.floor(Math.min(wish, (height * (1 - min) - gaps) * aspect, width * (1 - sides * SIDE.min)));
+  const wanted = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
+  return Math.floor(Math.min(wanted, (height * (1 - min) - gaps) * aspect, width * (1 - sides * SIDE.min)));
 }
 
 /** Height of the row below: limited by the width, and about half of the rest, which it shares with the band. */
 function rowHeight(others, width, height, rest, room) {
   const widest = (width - GAP * (others.length - 1)) / sum(others.map(aspectOf));
-  const wish = Math.max(rest * 0.55, rest - room.max * height);
-  return Math.floor(Math.min(widest, wish, rest - room.min * height));
+  const wanted = Math.max(rest * 0.55, rest - room.max * height);
+  return Math.floor(Math.min(widest, wanted, rest - room.min * height));
 }
 
 /** Without neighbours: the others in a column at the right, which leaves a wide screen's height to the front camera. */

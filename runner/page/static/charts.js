@@ -6,7 +6,7 @@ import { colourOf, themed } from "./colours.js";
 import { byId, displayName, factor, make } from "./format.js";
 
 const SETTLE_MS = 1500; // from the first picture to loading the charts
-const AT_LATEST_MS = 4000; // if there is no picture
+const AT_LATEST_MS = 4000; // if no picture is live by then
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
 

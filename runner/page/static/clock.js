@@ -15,7 +15,7 @@ export class Clock {
   offset = 0;
   bound = Infinity; // error bound of the offset, ms
 
-  /** @param {number} sent when the page asked (page clock)  @param {number} server the station's clock */
+  /** @param {number} sent when the page sent the request (page clock)  @param {number} server the station's clock */
   onEcho(sent, server) {
     const received = now();
     const echo = { delay: received - sent, offset: server - (sent + received) / 2 };

@@ -88,14 +88,14 @@ export function crosses(a, b, { rear, front, right, left }) {
  * @returns {Float32Array[]}
  */
 export function sharesOf(sights, regions) {
-  const wished = sights.map(({ points, near }, i) => {
+  const weights = sights.map(({ points, near }, i) => {
     const fade = fading(regions[i]);
     return Float64Array.from(points, (point, vertex) => (point ? near[vertex] * fade(point) : 0));
   });
-  const shares = wished.map(({ length }) => new Float32Array(length));
-  for (let vertex = 0; vertex < (wished[0]?.length ?? 0); vertex++) {
-    const total = wished.reduce((sum, each) => sum + each[vertex], 0);
-    if (total > 0) for (const [i, each] of wished.entries()) shares[i][vertex] = each[vertex] / total;
+  const shares = weights.map(({ length }) => new Float32Array(length));
+  for (let vertex = 0; vertex < (weights[0]?.length ?? 0); vertex++) {
+    const total = weights.reduce((sum, each) => sum + each[vertex], 0);
+    if (total > 0) for (const [i, each] of weights.entries()) shares[i][vertex] = each[vertex] / total;
   }
   return shares;
 }

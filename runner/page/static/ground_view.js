@@ -28,7 +28,7 @@ export class GroundView {
   drawn = { picture: "", frames: "", lines: "", states: [] }; // what the canvases show
   count = 0; // of the pictures drawn
   /** @type {string[]} */
-  finished = []; // labels of the cameras when the displayed picture was drawn
+  drawn_labels = []; // labels of the cameras when the displayed picture was drawn
   drawn_at = -Infinity; // when the last picture was drawn
   why = ""; // why there is no picture, for the operator
   /** @type {Warp|null} */
@@ -129,7 +129,7 @@ export class GroundView {
     const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
     const isDue = hasGpu || now() - this.drawn_at >= SOFTWARE.every_ms;
     const isBusy = warp.isBusy();
-    if (!isBusy) this.finished = drawn.states;
+    if (!isBusy) this.drawn_labels = drawn.states;
     if (isBusy || (picture === drawn.picture && (frames === drawn.frames || !isDue))) return;
     Object.assign(drawn, { picture, frames, states: seen.map(({ label }) => label) });
     this.drawn_at = now();
@@ -200,7 +200,7 @@ export class GroundView {
   /** For tests: its placement in its box, CSS px; the cameras' labels now, and when the picture was drawn. */
   measure() {
     const laid = this.dimensions && groundPlacement(this.display, this.dimensions);
-    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().label), drawn: this.finished };
+    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().label), drawn: this.drawn_labels };
   }
 }
 

@@ -7,7 +7,7 @@ export const RED = "#e01b24";
 export const AMBER = "#ffb000";
 
 /**
- * Draw the alarm or notice of a status over what the canvas shows.
+ * Draw the alarm or notice of a status over the picture in the canvas.
  * @param {OffscreenCanvasRenderingContext2D} context
  * @param {{x: number, y: number, width: number, height: number}} area the part of the canvas that is on the screen
  * @param {boolean} mirrored whether the canvas is mirrored: text is drawn so that it reads correctly

@@ -30,7 +30,7 @@ const listeners = new Map();
  * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: places in force, the vehicle's own,
  *   and why a layout cannot be saved
  * @typedef {import("./layout.js").Places} Places
- * @typedef {object} Applied what was read back from the elements
+ * @typedef {object} Applied the values read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
  * @property {{width: number, height: number}} [size] px

@@ -1,4 +1,4 @@
-/** The tabs of the side panel, used when there is no room to show everything together. */
+/** The tabs of the side panel, used when there is no room for all panels. */
 
 import { publish } from "./store.js";
 import { byId, setAttribute } from "./format.js";
