@@ -257,7 +257,7 @@ def test_a_layout_survives_a_restart_of_the_operators_process(broker, tmp_path):
     assert places == {"front": None, "rear": layout["rear"], "mast": None}
 
 
-# WCAG 2.2, 1.4.3: text needs a contrast of 4.5 : 1 with its background, large text 3 : 1. Pictures have any colour.
+# WCAG 2.2, 1.4.3: text needs a contrast of 4.5 : 1, large text 3 : 1; over a picture, with any colour below it.
 CONTRAST = """([root, theme, states]) => {
   document.documentElement.dataset.theme = theme;
   const parsed = (text) => {

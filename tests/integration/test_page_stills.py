@@ -132,7 +132,9 @@ def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_ma
     assert roi == pytest.approx({"x": 256, "y": 144, "width": 512, "height": 288}, abs=4)
     name = "mirrored"
     drag(page, at(0.5, 0.5), at(0.6, 0.5), button="middle")
-    until(lambda: (getattr(station, "last_request", None) or {}).get("x") == pytest.approx(288, abs=4))  # only the last region
+    until(
+        lambda: (getattr(station, "last_request", None) or {}).get("x") == pytest.approx(288, abs=4)
+    )  # only the last region
     roi = requested_roi()
     assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
 
