@@ -26,7 +26,7 @@ SIZE = (1280, 720)
 CAR = Dimensions(wheelbase_m=2.9, track_m=1.65, width_m=1.92, front_m=3.65, rear_m=0.95)
 DISTANCES_M = (5, 10, 15)
 WITHIN_PX = 2  # of the full image
-AROUND_PX = 40  # how far from the end of its line a mark is looked for, at most
+AROUND_PX = 40  # maximum search distance of a mark from the end of its line
 FINER = 4  # rays each way through a pixel of the bird's-eye view's cameras, as the light that a sensor collects
 End = tuple[int, int, int]  # 1 ahead or -1 behind, distance in m, side: 0 left or -1 right
 
@@ -43,7 +43,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Mounted:
-    """A camera and the ends of lines that it must show.
+    """A camera and the ends of lines that must be visible in it.
 
     top   where the full image begins in the native one, px
     roi   x, y, width, height in the full image; None: all of it
@@ -115,7 +115,7 @@ ALL_AROUND = tuple(_all_around())
 
 
 def paint(world: Path, marks: Sequence[Mark] = LINE_ENDS) -> None:
-    """Build the street with marks around where the drive begins."""
+    """Build the street, with marks around the start of the drive."""
     from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, plan_course, shrink
 
     build_world(SECONDS, world)
@@ -141,7 +141,7 @@ def paint(world: Path, marks: Sequence[Mark] = LINE_ENDS) -> None:
 def native_pictures(
     world: Path, cameras: Mapping[str, Mounted] = CAMERAS, finer: int = 1
 ) -> Iterator[tuple[str, bytes]]:
-    """The first picture of each camera, I420 of the native size; nothing stands on the ground, which is sharp.
+    """The first picture of each camera, I420 of the native size; without objects on the ground, and without blur.
 
     finer  rays each way through a pixel, which shows their mean
     """
@@ -160,7 +160,7 @@ def native_pictures(
 
 
 def _smaller(i420: bytes, width: int, height: int, times: int) -> bytes:
-    """A picture of which each pixel is the mean of so many each way."""
+    """Downscale a picture: each pixel is the mean of `times` pixels each way."""
     planes, samples, begin = [], np.frombuffer(i420, np.uint8), 0
     for wide, high in ((width, height), (width // 2, height // 2), (width // 2, height // 2)):
         end = begin + wide * high * times**2
@@ -171,7 +171,7 @@ def _smaller(i420: bytes, width: int, height: int, times: int) -> bytes:
 
 
 def ends_of(lines: Sequence[Any], ends: Sequence[End]) -> dict[End, tuple[float, float]]:
-    """Where those ends are in a picture with these guides, see guides.js."""
+    """The positions of those ends in a picture with these guides, see guides.js."""
     points = {}
     for sign, far, side in ends:
         line = [line for line in lines if line["metres"] == far][0 if sign > 0 else -1]
@@ -181,7 +181,7 @@ def ends_of(lines: Sequence[Any], ends: Sequence[End]) -> dict[End, tuple[float,
 
 
 def found(picture: Any, near: tuple[float, float], others: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Where a picture is most like a saddle around a point: the middle of a mark, px. others: where others are"""
+    """The strongest saddle point around a position: the centre of a mark, px. others: other marks"""
     import cv2
 
     around = round(min([AROUND_PX, *(0.6 * math.dist(near, other) for other in others)]))
@@ -198,10 +198,10 @@ def found(picture: Any, near: tuple[float, float], others: Sequence[tuple[float,
 
 
 def corner(picture: Any, near: tuple[float, float], half: tuple[float, float], around: float) -> tuple[float, float]:
-    """Where a picture is most like a mark around a point, px.
+    """The best match of a mark around a position, px.
 
     half    how far the part of a mark that is compared reaches to the right and up, px
-    around  how far from the point the mark is looked for, px
+    around  search radius, px
 
     Fields of equal shade lie opposite each other: the sum of one pair minus that of the other is largest in its middle,
     from where it falls as a straight line to each side.

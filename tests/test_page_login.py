@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import hmac
 
-from runner.page.login import CHALLENGE_S, CHALLENGES, SESSION_S, PageLogin
+from runner.page.login import CHALLENGE_S, MAX_CHALLENGES, SESSION_S, PageLogin
 
 
 def answer(challenge: str, token: bytes = b"token") -> str:
     return hmac.new(token, challenge.encode(), hashlib.sha256).hexdigest()
 
 
-def test_a_right_answer_opens_a_session_for_its_time() -> None:
+def test_a_correct_answer_opens_a_session_until_it_expires() -> None:
     login = PageLogin(lambda: b"token")
     challenge = login.challenge(0)
     session = login.open(challenge, answer(challenge), 1)
@@ -23,7 +23,7 @@ def test_a_right_answer_opens_a_session_for_its_time() -> None:
     assert not login.accepts("guessed", 1)
 
 
-def test_an_answer_is_good_once_in_time_and_with_the_token() -> None:
+def test_an_answer_is_accepted_once_in_time_and_with_the_token() -> None:
     login = PageLogin(lambda: b"token")
     challenge = login.challenge(0)
     assert login.open(challenge, answer(challenge), 0)
@@ -48,9 +48,9 @@ def test_a_new_token_ends_all_sessions() -> None:
     assert not login.accepts(session, 1)
 
 
-def test_what_is_kept_is_bounded() -> None:
+def test_pending_challenges_are_bounded() -> None:
     login = PageLogin(lambda: b"token")
-    challenges = [login.challenge(n / 1000) for n in range(3 * CHALLENGES)]
-    assert len(login._challenges) == CHALLENGES
+    challenges = [login.challenge(n / 1000) for n in range(3 * MAX_CHALLENGES)]
+    assert len(login._challenges) == MAX_CHALLENGES
     assert login.open(challenges[0], answer(challenges[0]), 1) is None
     assert login.open(challenges[-1], answer(challenges[-1]), 1)

@@ -22,10 +22,10 @@ import aiohttp
 
 from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
-from runner.page.control import KEPT_S, Control, attention_of, page_of
-from runner.page.history import KEPT, History
+from runner.page.control import GRACE_S, Control, combined_attention, page_of
+from runner.page.history import MAX_SAMPLES, History
 from runner.page.server import PageServer
-from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, WAITING_UNITS, PageViewer
+from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, Outcome, Position, Sample
 
 UPGRADE = (
@@ -97,8 +97,8 @@ def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
     assert caplog.text == ""
 
 
-def test_no_viewer_is_waited_for_once_the_page_has_stopped():
-    """Python 3.11 may crash when it ends while a handler still waits."""
+def test_no_handler_is_pending_once_the_page_has_stopped():
+    """Python 3.11 may crash at exit while a handler is pending."""
     hello = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:PORT\r\n{UPGRADE}\r\n\r\n"
     with socket.socket() as line:
         with served() as (port, _):
@@ -109,8 +109,8 @@ def test_no_viewer_is_waited_for_once_the_page_has_stopped():
     assert waiting == []
 
 
-def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that():
-    async def hello(port):
+def test_hello_describes_each_cameras_pose_and_optics():
+    async def first_message(port):
         own = f"http://localhost:{port}"
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{own}/live?viewer=me", origin=own) as ws:
             return await ws.receive_json(timeout=5)
@@ -123,8 +123,8 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
         "cameras.rear_center.place.column_span=2",
     )
     with served(*words) as (port, _):
-        told = asyncio.run(hello(port))
-    cameras = {camera["name"]: camera for camera in told["cameras"]}
+        hello = asyncio.run(first_message(port))
+    cameras = {camera["name"]: camera for camera in hello["cameras"]}
     pose = {"x_m": 1.9, "y_m": 0.5, "z_m": 1.5, "yaw_deg": 55, "pitch_deg": 5, "roll_deg": 0}
     native = {"width": 1920, "height": 1080, "left": 0, "top": 30}
     optics = {"pose": pose, "fov_deg": 90, "lens": "pinhole", "native": native, "calibrated": False}
@@ -133,14 +133,14 @@ def test_a_page_is_told_where_each_camera_looks_and_how_its_picture_shows_that()
     optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
     assert {key: cameras["top_left"][key] for key in optics} == optics
     assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
-    assert told["layout"]["places"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
-    assert told["layout"]["own"]["rear_center"] == {"row": 1, "column": 1, "row_span": 1, "column_span": 2}
+    assert hello["layout"]["places"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
+    assert hello["layout"]["own"]["rear_center"] == {"row": 1, "column": 1, "row_span": 1, "column_span": 2}
     dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}
-    assert told["dimensions"] == dimensions
+    assert hello["dimensions"] == dimensions
     assert [cameras[name]["framing"] for name in ("front_left", "front_right")] == ["fit", None]
 
 
-async def stated(station, attention):
+async def attention_becomes(station, attention):
     for _ in range(500):
         if station.attention == attention:
             return
@@ -148,36 +148,36 @@ async def stated(station, attention):
     assert station.attention == attention
 
 
-def test_the_station_is_told_whether_the_driver_watches():
-    """By the page in control alone; a page that is closed is absent, one that gives control away says nothing."""
+def test_the_drivers_attention_is_reported_to_the_station():
+    """Only the page in control counts: a closed page is absent, and one that releases control reports nothing."""
 
     async def drive(own, station):
         async with aiohttp.ClientSession() as session:
             driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
-            await stated(station, None)
+            await attention_becomes(station, None)
             await driver.send_json({"attention": "watching"})
-            await stated(station, "watching")
+            await attention_becomes(station, "watching")
             async with session.ws_connect(f"{own}/live?viewer=other", origin=own) as other:
                 await other.send_json({"attention": "hidden"})
                 await driver.send_json({"attention": "slow"})
-                await stated(station, "slow")
+                await attention_becomes(station, "slow")
                 await other.send_json({"take_control": True})
-                await stated(station, "hidden")
+                await attention_becomes(station, "hidden")
                 await driver.send_json({"take_control": True})
-                await stated(station, "slow")
+                await attention_becomes(station, "slow")
                 for invalid in ("absent", "asleep", 1, None):
                     await driver.send_json({"attention": invalid, "id": "1"})
-                    while (told := await driver.receive_json(timeout=5))["kind"] != "reply":
+                    while (reply := await driver.receive_json(timeout=5))["kind"] != "reply":
                         pass
-                    assert told["result"] == "refused"
+                    assert reply["result"] == "refused"
             assert station.attention == "slow"
             await driver.close()
-            await stated(station, "absent")
+            await attention_becomes(station, "absent")
             driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
             await driver.send_json({"attention": "unfocused"})
-            await stated(station, "unfocused")
+            await attention_becomes(station, "unfocused")
             await driver.send_json({"release_control": True})
-            await stated(station, None)
+            await attention_becomes(station, None)
 
     with served() as (port, station):
         asyncio.run(drive(f"http://localhost:{port}", station))
@@ -195,8 +195,8 @@ class Windows:
         return await self._stack.enter_async_context(connecting)
 
 
-async def told(ws, kind, **wanted):
-    """The next message of a kind that states these values."""
+async def received(ws, kind, **wanted):
+    """The next message of a kind with these values."""
     while (message := await ws.receive_json(timeout=5))["kind"] != kind or not wanted.items() <= message.items():
         pass
     return message
@@ -213,83 +213,83 @@ def in_windows(steps, *overrides, **more):
         asyncio.run(run(port, station))
 
 
-def test_a_monitor_has_selection_and_control_of_the_page_of_its_browser():
+def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
     async def steps(windows, station):
-        asked = []
-        station.ask = lambda document, on_reply: (asked.append(document), on_reply(Outcome(0, "applied", "")))
+        requests = []
+        station.ask = lambda document, on_reply: (requests.append(document), on_reply(Outcome(0, "applied", "")))
         monitor = await windows.open("m", "here", show="rear_center,front_left,nothing")
-        hello = await told(monitor, "hello")
+        hello = await received(monitor, "hello")
         assert [(camera["name"], camera["index"]) for camera in hello["cameras"]] == [
             ("front_left", 0),
             ("rear_center", 3),
         ]
-        await told(monitor, "control", holder="nobody")  # and it does not take control that is free
+        await received(monitor, "control", holder="nobody")  # and it does not take control that is free
         page = await windows.open("driver", "here")
-        assert (await told(page, "hello"))["selected"] is None
-        await told(page, "control", holder="you")
-        await told(monitor, "control", holder="you")
+        assert (await received(page, "hello"))["selected"] is None
+        await received(page, "control", holder="you")
+        await received(monitor, "control", holder="you")
         stranger = await windows.open("s", "there", show="rear_center")
-        await told(stranger, "control", holder="another")
+        await received(stranger, "control", holder="another")
 
         await monitor.send_json({"select": "rear_center"})
-        await told(page, "selection", camera="rear_center")
+        await received(page, "selection", camera="rear_center")
         await page.send_json({"select": "top_left"})
-        await told(monitor, "selection", camera="top_left")
+        await received(monitor, "selection", camera="top_left")
         second = await windows.open("m2", "here", show="top_left")
-        assert (await told(second, "hello"))["selected"] == "top_left"
-        assert (await told(await windows.open("s2", "there", show="top_left"), "hello"))["selected"] is None
+        assert (await received(second, "hello"))["selected"] == "top_left"
+        assert (await received(await windows.open("s2", "there", show="top_left"), "hello"))["selected"] is None
 
         request = {"id": "1", "event": "mode_selected", "mode": "single"}
         await monitor.send_json(request)
-        await told(monitor, "reply", id="1", result="applied")
+        await received(monitor, "reply", id="1", result="applied")
         await stranger.send_json(request)
-        await told(stranger, "reply", id="1", reason="this page does not hold control; take it first")
-        assert asked == [{"event": "mode_selected", "mode": "single"}]
+        await received(stranger, "reply", id="1", reason="this page does not hold control; take it first")
+        assert requests == [{"event": "mode_selected", "mode": "single"}]
         for order in ("take_control", "release_control"):
             await monitor.send_json({order: True})
-            await told(monitor, "reply", result="refused")
+            await received(monitor, "reply", result="refused")
             await stranger.send_json({order: True})
-            await told(stranger, "reply", result="refused")
+            await received(stranger, "reply", result="refused")
 
         other = await windows.open("other", "there")
-        await told(stranger, "control", holder="another")
+        await received(stranger, "control", holder="another")
         await other.send_json({"take_control": True})
-        await told(stranger, "control", holder="you")
-        await told(monitor, "control", holder="another")
+        await received(stranger, "control", holder="you")
+        await received(monitor, "control", holder="another")
         await page.send_json({"take_control": True})
-        await told(monitor, "control", holder="you")
+        await received(monitor, "control", holder="you")
         await page.close()
-        await told(monitor, "control", holder="nobody")
+        await received(monitor, "control", holder="nobody")
         await monitor.send_json(request)
-        await told(monitor, "reply", reason="this page does not hold control; take it first")
+        await received(monitor, "reply", reason="this page does not hold control; take it first")
 
     in_windows(steps)
 
 
-def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one():
+def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one_of_them():
     async def steps(windows, station):
         page = await windows.open("driver", "here")
         monitor = await windows.open("m", "here", show="rear_center")
         stranger = await windows.open("s", "there", show="rear_center")
         await page.send_json({"attention": "watching"})
-        await stated(station, "watching")
-        await told(monitor, "control", elsewhere=True)
+        await attention_becomes(station, "watching")
+        await received(monitor, "control", elsewhere=True)
         await stranger.send_json({"attention": "hidden"})
         await monitor.send_json({"attention": "unfocused"})
         await page.send_json({"attention": "unfocused"})
-        await stated(station, "unfocused")
-        await told(monitor, "control", elsewhere=False)
+        await attention_becomes(station, "unfocused")
+        await received(monitor, "control", elsewhere=False)
         await monitor.send_json({"attention": "watching"})
-        await stated(station, "watching")
-        await told(page, "control", elsewhere=True)
+        await attention_becomes(station, "watching")
+        await received(page, "control", elsewhere=True)
         await monitor.send_json({"attention": "slow"})
-        await stated(station, "slow")
+        await attention_becomes(station, "slow")
         await monitor.send_json({"attention": "hidden"})
-        await stated(station, "hidden")
+        await attention_becomes(station, "hidden")
         await monitor.close()
-        await stated(station, "unfocused")
+        await attention_becomes(station, "unfocused")
         await page.close()
-        await stated(station, "absent")
+        await attention_becomes(station, "absent")
 
     in_windows(steps)
 
@@ -297,29 +297,29 @@ def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one():
 PLACE = {"row": 0, "column": 0, "row_span": 1, "column_span": 2}
 
 
-def test_a_layout_is_saved_by_the_page_in_control_and_told_to_all(tmp_path):
+def test_a_layout_is_saved_by_the_page_in_control_and_sent_to_all(tmp_path):
     file = tmp_path / "layout" / "alice.yaml"
 
     async def steps(windows, station):
         page = await windows.open("driver", "here")
-        assert (await told(page, "hello"))["layout"]["problem"] is None
+        assert (await received(page, "hello"))["layout"]["problem"] is None
         watcher = await windows.open("w", "there")
         monitor = await windows.open("m", "here", show="rear_center")
         await watcher.send_json({"id": "1", "layout": {"rear_center": PLACE}})
-        await told(watcher, "reply", id="1", reason="this page does not hold control; take it first")
+        await received(watcher, "reply", id="1", reason="this page does not hold control; take it first")
         assert not file.exists()
         await page.send_json({"id": "2", "layout": {"rear_center": PLACE}})
         for window in (page, watcher, monitor):
-            layout = await told(window, "layout")
+            layout = await received(window, "layout")
             assert {name: place for name, place in layout["places"].items() if place} == {"rear_center": PLACE}
             assert layout["own"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
-        await told(page, "reply", id="2", result="applied")
+        await received(page, "reply", id="2", result="applied")
         assert "    rear_center: {row: 0, column: 0, column_span: 2}\n" in file.read_text()
-        later = await told(await windows.open("late", "there"), "hello")
+        later = await received(await windows.open("late", "there"), "hello")
         assert later["layout"]["places"]["rear_center"] == PLACE
         await monitor.send_json({"id": "3", "layout": None})  # it has its page's control
-        await told(monitor, "reply", id="3", result="applied")
-        assert (await told(page, "layout"))["places"] == layout["own"]
+        await received(monitor, "reply", id="3", result="applied")
+        assert (await received(page, "layout"))["places"] == layout["own"]
         assert file.read_text().endswith("vehicles: {}\n")
 
     in_windows(steps, layouts=Layouts(tmp_path, "alice"))
@@ -333,18 +333,18 @@ def test_a_layout_is_saved_by_the_page_in_control_and_told_to_all(tmp_path):
         ({"layout": {"rear_centre": PLACE}}, "'rear_centre': unknown camera, did you mean rear_center?"),
         ({"layout": {"rear_center": {**PLACE, "row": -1}}}, "rear_center.row: -1: must be at least 0"),
         ({"layout": "../../x"}, "'../../x': must be a mapping"),
-        ({"layout": {}, "operator": "../bob"}, "operator: unknown key beside layout"),
+        ({"layout": {}, "operator": "../bob"}, "operator: unknown key, only layout is allowed"),
         ({"layout": {}, "id": 7}, "id: must be given, as text of at most 64 characters"),
     ],
 )
 def test_a_layout_that_is_wrong_is_refused_and_nothing_is_written(tmp_path, document, reason):
     async def steps(windows, station):
         page = await windows.open("driver", "here")
-        await told(page, "control", holder="you")
+        await received(page, "control", holder="you")
         await page.send_json({"id": "1", **document})
-        assert (await told(page, "reply"))["reason"] == reason
+        assert (await received(page, "reply"))["reason"] == reason
         await page.send_json({"id": "2", "layout": {}})
-        await told(page, "reply", id="2", result="applied")  # one refusal does not lock the next out
+        await received(page, "reply", id="2", result="applied")  # one refusal does not lock the next out
 
     in_windows(steps, layouts=Layouts(tmp_path / "conf", "alice"))
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["alice.yaml", "conf", "layout"]
@@ -358,9 +358,9 @@ def test_why_a_layout_cannot_be_saved(tmp_path):
 
         async def steps(windows, station):
             page = await windows.open("driver", "here")
-            found.append((await told(page, "hello"))["layout"]["problem"])
+            found.append((await received(page, "hello"))["layout"]["problem"])
             await page.send_json({"id": "1", "layout": {"rear_center": PLACE}})
-            found.append((await told(page, "reply", id="1", result="refused"))["reason"])
+            found.append((await received(page, "reply", id="1", result="refused"))["reason"])
 
         in_windows(steps, layouts=layouts)
         return found
@@ -371,13 +371,13 @@ def test_why_a_layout_cannot_be_saved(tmp_path):
     assert late.startswith(f"{tmp_path}/layout/alice.yaml: cannot be written: ")
 
 
-def test_what_windows_state_together():
+def test_the_combined_attention_of_several_windows():
     hidden, slow, watching, unfocused = Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UNFOCUSED
-    assert attention_of([]) is attention_of([None]) is None
-    assert attention_of([None, unfocused]) is unfocused
-    assert attention_of([unfocused, watching]) is watching
-    assert attention_of([watching, slow]) is slow
-    assert attention_of([slow, hidden, watching]) is hidden
+    assert combined_attention([]) is combined_attention([None]) is None
+    assert combined_attention([None, unfocused]) is unfocused
+    assert combined_attention([unfocused, watching]) is watching
+    assert combined_attention([watching, slow]) is slow
+    assert combined_attention([slow, hidden, watching]) is hidden
 
 
 def window(token, browser="", monitor=False):
@@ -398,10 +398,10 @@ def test_which_page_a_window_belongs_to():
         "it shares nothing with pages that state no browser"
     )
     control.release("3")
-    assert control.seen_by(page_of(nameless, [nameless], control)) == "nobody"
+    assert control.holder_for(page_of(nameless, [nameless], control)) == "nobody"
 
 
-def test_a_monitor_gets_the_pictures_of_its_cameras_alone():
+def test_a_monitor_gets_only_the_pictures_of_its_cameras():
     burst = []
     viewer = PageViewer("me", [1, 3], lambda camera: burst.append(camera) or [unit(camera, key=True)], "here", True)
     for camera in range(4):
@@ -412,7 +412,7 @@ def test_a_monitor_gets_the_pictures_of_its_cameras_alone():
     assert sent(PageViewer("me", [], lambda camera: [unit(0, key=True)], "here", True)) == []
 
 
-def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
+def test_a_viewer_starts_with_a_burst_of_which_only_the_last_unit_is_drawn():
     viewer = PageViewer("me", range(1), lambda camera: [unit(0, key=True), unit(7), unit(8)])
     viewer.show(0, unit(8))  # part of the burst already
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, CATCH_UP, 7), (0, 0, 8)]
@@ -421,7 +421,7 @@ def test_a_viewer_begins_with_a_burst_of_which_only_the_last_is_drawn():
     assert sent(viewer) == [(0, 0, 9), (0, KEY, 10)]
 
 
-def test_a_viewer_waits_for_a_burst_and_a_burst_of_one_is_drawn():
+def test_a_viewer_waits_for_a_burst_and_a_single_unit_is_drawn():
     burst = []
     viewer = PageViewer("me", range(1), lambda camera: burst)
     assert sent(viewer) == []
@@ -431,25 +431,25 @@ def test_a_viewer_waits_for_a_burst_and_a_burst_of_one_is_drawn():
 
 def test_texts_go_first_and_cameras_take_turns():
     viewer = PageViewer("me", range(2), lambda camera: [unit(0, key=True), unit(1)])
-    viewer.tell("state", {})
+    viewer.post("state", {})
     assert [m if isinstance(m, str) else m[0] for m in sent(viewer)] == ["state", 0, 1, 0, 1]
 
 
-def test_a_viewer_that_lags_starts_again_and_never_holds_more_than_it_may():
+def test_a_viewer_that_lags_restarts_and_its_queue_stays_bounded():
     newest = []
     viewer = PageViewer("me", range(1), lambda camera: [unit(0, key=True), *newest])
     sent(viewer)
     for number in range(1, 201):
         newest[:] = [unit(number)]
         viewer.show(0, newest[0])
-        assert len(viewer._waiting[0].live) <= WAITING_UNITS
+        assert len(viewer._queues[0].live) <= MAX_UNITS
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, 0, 200)]
 
 
 def test_texts_are_bounded_too():
     viewer = PageViewer("me", range(0), lambda camera: [])
     for _ in range(10_000):
-        viewer.tell("sample", {})
+        viewer.post("sample", {})
     assert len(sent(viewer)) == 500
 
 
@@ -462,30 +462,30 @@ def test_the_header_states_times_in_ms_and_an_unknown_capture_as_nan():
 
 def test_control_belongs_to_one_page():
     control = Control()
-    control.opened("a", 0)
-    control.opened("b", 1)
-    assert [control.seen_by(page) for page in "ab"] == ["you", "another"]
+    control.on_opened("a", 0)
+    control.on_opened("b", 1)
+    assert [control.holder_for(page) for page in "ab"] == ["you", "another"]
     control.take("b")
-    assert [control.seen_by(page) for page in "ab"] == ["another", "you"]
+    assert [control.holder_for(page) for page in "ab"] == ["another", "you"]
     control.release("a")  # not the holder
-    assert control.seen_by("b") == "you"
+    assert control.holder_for("b") == "you"
     control.release("b")
-    assert [control.seen_by(page) for page in "ab"] == ["nobody", "nobody"]
+    assert [control.holder_for(page) for page in "ab"] == ["nobody", "nobody"]
 
 
 def test_a_reload_keeps_control_and_a_page_that_left_loses_it():
     control = Control()
-    control.opened("a", 0)
-    control.closed("a", 1)
-    control.opened("b", 1 + KEPT_S / 2)
-    assert control.seen_by("b") == "nobody"
-    control.opened("a", 1 + KEPT_S)
-    assert control.seen_by("a") == "you"
-    control.closed("a", 10)
-    control.opened("c", 11 + KEPT_S)
-    assert control.seen_by("c") == "you"
-    control.opened("a", 12 + KEPT_S)
-    assert control.seen_by("a") == "another"
+    control.on_opened("a", 0)
+    control.on_closed("a", 1)
+    control.on_opened("b", 1 + GRACE_S / 2)
+    assert control.holder_for("b") == "nobody"
+    control.on_opened("a", 1 + GRACE_S)
+    assert control.holder_for("a") == "you"
+    control.on_closed("a", 10)
+    control.on_opened("c", 11 + GRACE_S)
+    assert control.holder_for("c") == "you"
+    control.on_opened("a", 12 + GRACE_S)
+    assert control.holder_for("a") == "another"
 
 
 def sample(time, position=None):
@@ -507,15 +507,15 @@ def sample(time, position=None):
 def test_history_keeps_a_point_a_second_for_minutes():
     history = History()
     assert history.columns()["time"] == []
-    for quarter in range(4 * (KEPT + 50)):
+    for quarter in range(4 * (MAX_SAMPLES + 50)):
         history.add(sample(quarter / 4))
     columns = history.columns()
-    assert len(columns["time"]) == KEPT
-    assert columns["time"][-2:] == [KEPT + 48, KEPT + 49]
+    assert len(columns["time"]) == MAX_SAMPLES
+    assert columns["time"][-2:] == [MAX_SAMPLES + 48, MAX_SAMPLES + 49]
     assert columns["cameras"]["front"]["kbps"] == columns["time"]
 
 
-def test_history_begins_anew_when_the_clock_is_set_back():
+def test_history_restarts_when_the_clock_is_set_back():
     history = History()
     for t in (100, 101, 50, 51):
         history.add(sample(t))

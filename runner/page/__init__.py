@@ -1,1 +1,1 @@
-"""The operator's page: an aiohttp server on 127.0.0.1 and what it serves (static/, the charts' script from plotly)."""
+"""The operator's page: an aiohttp server on 127.0.0.1 and the files it serves (static/, plotly's script)."""

@@ -7,55 +7,55 @@ from typing import Protocol
 
 from runner.core.events import Attention
 
-KEPT_S = 5.0  # a page that is reloaded within this time keeps control
-# The driver needs the pictures of all windows, and the focus in one of them: the first of these that any states counts.
-OF_ALL_WINDOWS = (Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UNFOCUSED)
+GRACE_S = 5.0  # a page that is reloaded within this time keeps control
+# The driver needs the pictures of every window but the focus in only one: the first of these that any reports counts.
+PRECEDENCE = (Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UNFOCUSED)
 
 
 class Control:
     """At most one page holds control; a page is known by its token, which survives a reload.
 
-    A page that opens takes control if it is free; any page may take it on request, and the former holder then watches.
+    A page that opens takes control if it is free. Any page may take it on request; the previous holder then watches.
     """
 
     def __init__(self) -> None:
         self._holder = ""
-        self._left: float | None = None  # when the holder's last page closed
+        self._closed_at: float | None = None  # when the holder's last page closed
 
-    def opened(self, token: str, now: float) -> None:
-        free = not self._holder or (self._left is not None and now - self._left > KEPT_S)
+    def on_opened(self, token: str, now: float) -> None:
+        free = not self._holder or (self._closed_at is not None and now - self._closed_at > GRACE_S)
         if free or token == self._holder:
             self.take(token)
 
-    def closed(self, token: str, now: float) -> None:
+    def on_closed(self, token: str, now: float) -> None:
         if token == self._holder:
-            self._left = now
+            self._closed_at = now
 
     def take(self, token: str) -> None:
-        self._holder, self._left = token, None
+        self._holder, self._closed_at = token, None
 
     def release(self, token: str) -> None:
         if token == self._holder:
-            self._holder, self._left = "", None
+            self._holder, self._closed_at = "", None
 
     @property
     def is_held(self) -> bool:
-        """Whether a page holds control, also one that is closed."""
+        """Whether any page holds control, even one that has closed."""
         return bool(self._holder)
 
-    def seen_by(self, token: str) -> str:
-        """you, another or nobody"""
+    def holder_for(self, token: str) -> str:
+        """The holder from a page's point of view: you, another or nobody."""
         if token == self._holder:
             return "you"
-        return "another" if self._holder and self._left is None else "nobody"
+        return "another" if self._holder and self._closed_at is None else "nobody"
 
 
 class Window(Protocol):
     """A browser's window.
 
     token    of the page in it, or of the monitor
-    browser  random name that all windows of a browser share; "": it stated none
-    monitor  whether it shows some cameras for a page in another window of that browser
+    browser  random name that all windows of a browser share; "": none given
+    monitor  whether it shows some cameras for a page in another window of the same browser
     """
 
     @property
@@ -67,19 +67,19 @@ class Window(Protocol):
 
 
 def page_of(window: Window, windows: Sequence[Window], control: Control) -> str:
-    """The token of the page that a window belongs to: its own; of a monitor, that of a page of its browser.
+    """The token of the page that a window belongs to: its own, or for a monitor that of a page in the same browser.
 
-    Of several it is the one in control, else the newest. A monitor without a page is on its own, without control.
+    Of several pages it is the one in control, otherwise the newest. A monitor without a page has no control.
 
-    windows  that are open, the newest last
+    windows  all open windows, the newest last
     """
     if not (window.monitor and window.browser):
         return window.token
     pages = [other.token for other in windows if other.browser == window.browser and not other.monitor]
-    driving = (page for page in pages if control.seen_by(page) == "you")
+    driving = (page for page in pages if control.holder_for(page) == "you")
     return next(driving, pages[-1] if pages else window.token)
 
 
-def attention_of(stated: Collection[Attention | None]) -> Attention | None:
-    """What the windows of a page state together; None: none has stated anything yet."""
-    return next((attention for attention in OF_ALL_WINDOWS if attention in stated), None)
+def combined_attention(reported: Collection[Attention | None]) -> Attention | None:
+    """The attention that the windows of a page report together; None: no window has reported any yet."""
+    return next((attention for attention in PRECEDENCE if attention in reported), None)

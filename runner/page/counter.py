@@ -1,9 +1,9 @@
-"""What a page read of the counter that one of the cameras films, and what that says about latency. Pure.
+"""A page's readings of the counter that a camera films, and the latency they show. Pure.
 
-The camera films a screen that shows a clock as black and white cells (`static/counter.js`). The page reads them out of
-each picture that it draws, by the same machine's clock, so that no clocks are compared. The time in between is all that
-a driver waits for: the screen's delay, which pictures on the page have, too, the camera's, and the time from capture
-to drawing. Only the last part is what the page shows as latency.
+The camera films a screen that shows a clock as black and white cells (`static/counter.js`). The page reads the cells in
+each picture that it draws and compares them with the clock of the same machine, so clock offsets play no part. The
+difference is the whole delay that a driver experiences: the screen's, which pictures on the page have as well, the
+camera's, and the time from capture to drawing. Only the last part is what the page shows as latency.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from statistics import median, quantiles
 from typing import Any
 
-LONGEST_MS = 10_000  # a longer time is a misread counter
-FEWEST = 10  # readings of which a median is stated
+MAX_ELAPSED_MS = 10_000  # a longer time is a misread counter
+MIN_READINGS = 10  # for a median
 
 
 @dataclass(frozen=True, slots=True)
 class CounterReading:
     """One picture that a page has drawn.
 
-    elapsed_ms  since the counter in it was shown; None: no counter was found in it
-    age_ms      from capture to drawing, as the page states it, right to within bound_ms; None: unknown
+    elapsed_ms  since the screen showed this counter value; None: no counter found in the picture
+    age_ms      from capture to drawing, as the page states it, accurate to within bound_ms; None: unknown
     """
 
     camera: str
@@ -32,7 +32,7 @@ class CounterReading:
 
 
 def counter_reading(message: Mapping[str, Any]) -> CounterReading | None:
-    """A reading from a page's message; None if it is not a valid one."""
+    """The reading in a page's message; None if it is invalid."""
     camera, times = message.get("camera"), [message.get(key) for key in ("elapsed_ms", "age_ms", "bound_ms")]
     if not isinstance(camera, str) or not all(time is None or type(time) in (int, float) for time in times):
         return None
@@ -40,13 +40,12 @@ def counter_reading(message: Mapping[str, Any]) -> CounterReading | None:
 
 
 @dataclass(frozen=True, slots=True)
-class LightToLight:
+class GlassToGlass:
     """Latency from the screen through the camera to the page, ms.
 
-    pictures, read      drawn, and those in which a counter was found
+    pictures, read      pictures drawn, and those in which a counter was found
     median, p95         glass to glass
-    stated, bound       capture to drawing, as the page states it, and by how much that may be wrong, medians; None:
-                        unknown
+    stated, bound       capture to drawing, as the page states it, and its error bound, medians; None: unknown
     decoded             capture to decoding, which the operator's side reports to the vehicle, median; None: unknown
     """
 
@@ -59,28 +58,28 @@ class LightToLight:
     decoded: float | None
 
     @property
-    def outside(self) -> float | None:
-        """What camera and screen add, if the stated latency is right."""
+    def camera_and_screen(self) -> float | None:
+        """The delay that camera and screen add, if the stated latency is right."""
         return None if self.stated is None else self.median - self.stated
 
     @property
     def fixed(self) -> float | None:
-        """`latency.fixed_ms`: what the reported latency lacks."""
+        """`latency.fixed_ms`: the part that the reported latency does not include."""
         return None if self.decoded is None else self.median - self.decoded
 
 
-def light_to_light(readings: Sequence[CounterReading], decoded_ms: Sequence[float]) -> LightToLight | None:
-    """The latency that readings show; None if too few of them hold a counter.
+def glass_to_glass(readings: Sequence[CounterReading], decoded_ms: Sequence[float]) -> GlassToGlass | None:
+    """The latency that the readings show; None if too few of them contain a counter.
 
     decoded_ms  capture to decoding at the same time
     """
-    found = [reading for reading in readings if reading.elapsed_ms is not None and reading.elapsed_ms < LONGEST_MS]
-    if len(found) < FEWEST:
+    found = [reading for reading in readings if reading.elapsed_ms is not None and reading.elapsed_ms < MAX_ELAPSED_MS]
+    if len(found) < MIN_READINGS:
         return None
     elapsed = [reading.elapsed_ms for reading in found if reading.elapsed_ms is not None]
     ages = [reading.age_ms for reading in found if reading.age_ms is not None]
     bounds = [reading.bound_ms for reading in found if reading.bound_ms is not None]
-    return LightToLight(
+    return GlassToGlass(
         pictures=len(readings),
         read=len(found),
         median=median(elapsed),

@@ -1,4 +1,4 @@
-"""The last minutes of a drive for the charts, so that a page opened late or reloaded starts with them. Pure."""
+"""The last minutes of a drive for the charts of a page that is opened late or reloaded. Pure."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from typing import Any
 from runner.records import Sample
 
 EVERY_S = 1.0
-KEPT = 300  # points: five minutes
+MAX_SAMPLES = 300  # five minutes
 TOTALS = ("predicted_kbps", "allocated_kbps", "actual_kbps")
-OF_CAMERA = ("kbps", "allocated_kbps", "scaling")
+PER_CAMERA = ("kbps", "allocated_kbps", "scaling")
 
 
 class History:
     """One sample a second, oldest first."""
 
     def __init__(self) -> None:
-        self._samples: deque[Sample] = deque(maxlen=KEPT)
+        self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
 
     def add(self, sample: Sample) -> None:
         if self._samples and sample.t <= self._samples[-1].t - EVERY_S:
-            self._samples.clear()  # the clock was set
+            self._samples.clear()  # the clock was set back
         if not self._samples or sample.t - self._samples[-1].t >= EVERY_S:
             self._samples.append(sample)
 
     def columns(self) -> dict[str, Any]:
-        """By quantity a list over time; None where unknown."""
+        """For each quantity its values over time; None where unknown."""
         samples = list(self._samples)
         positions = [sample.position for sample in samples]
         names = samples[-1].cameras if samples else ()
@@ -35,7 +35,7 @@ class History:
             **{key: [getattr(sample, key) for sample in samples] for key in TOTALS},
             **{key: [position and getattr(position, key) for position in positions] for key in ("lat", "lon")},
             "cameras": {
-                name: {key: [getattr(sample.cameras[name], key) for sample in samples] for key in OF_CAMERA}
+                name: {key: [getattr(sample.cameras[name], key) for sample in samples] for key in PER_CAMERA}
                 for name in names
             },
         }

@@ -1,7 +1,7 @@
-"""Who may open the page from another machine: whoever proves to have its token. Times are passed in, s.
+"""Login to the page from another machine, by proof of having its token. Times are passed in, s.
 
-The browser answers a challenge, HMAC-SHA256 of a random text with the token as key. So the token itself never travels,
-and an answer that somebody has recorded is of no use: each challenge is good for one answer.
+The browser answers a challenge with the HMAC-SHA256 of a random text, keyed with the token. The token itself is never
+sent, and a recorded answer cannot be replayed: each challenge accepts a single answer.
 """
 
 from __future__ import annotations
@@ -11,51 +11,52 @@ import hmac
 import secrets
 from collections.abc import Callable
 
-CHALLENGE_S = 60.0  # how long a challenge waits for its answer
-CHALLENGES = 100  # that wait at once; the oldest is forgotten for a new one
-SESSION_S = 43_200.0  # twelve hours; then the browser proves itself again
-SESSIONS = 100
+CHALLENGE_S = 60.0  # until an unanswered challenge expires
+MAX_CHALLENGES = 100  # pending; a new one evicts the oldest
+SESSION_S = 43_200.0  # twelve hours; then the browser must log in again
+MAX_SESSIONS = 100
 COOKIE = "tod_session"
 
 
 class PageLogin:
-    """Challenges that wait for an answer, and sessions that followed from a right one.
+    """Pending challenges and open sessions.
 
-    token  the page's token, as it is now: with another one all sessions end
+    token  returns the page's current token; a new token ends all sessions
     """
 
     def __init__(self, token: Callable[[], bytes]) -> None:
         self._token = token
-        self._used = token()
-        self._challenges: dict[str, float] = {}  # and until when
+        self._session_token = token()
+        self._challenges: dict[str, float] = {}  # values: when they expire
         self._sessions: dict[str, float] = {}
 
     def challenge(self, now: float) -> str:
         """A new challenge."""
-        return _added(self._challenges, now, CHALLENGE_S, CHALLENGES)
+        return _add(self._challenges, now, CHALLENGE_S, MAX_CHALLENGES)
 
     def open(self, challenge: str, answer: str, now: float) -> str | None:
-        """The session that a right answer opens; None for a wrong one, and for a challenge that was answered before."""
+        """Open a session for a correct answer; None if it is wrong, or the challenge expired or was answered before."""
         if self._challenges.pop(challenge, -1.0) < now:
             return None
         expected = hmac.new(self._token(), challenge.encode(), hashlib.sha256).hexdigest()
         if not hmac.compare_digest(expected.encode(), answer.encode(errors="replace")):
             return None
-        return _added(self._sessions, now, SESSION_S, SESSIONS)
+        return _add(self._sessions, now, SESSION_S, MAX_SESSIONS)
 
     def accepts(self, session: str | None, now: float) -> bool:
         """Whether a session is open."""
-        if self._used != (token := self._token()):
-            self._used = token
+        if self._session_token != (token := self._token()):
+            self._session_token = token
             self._sessions.clear()
         return session is not None and self._sessions.get(session, -1.0) >= now
 
 
-def _added(known: dict[str, float], now: float, seconds: float, most: int) -> str:
-    for old in [name for name, until in known.items() if until < now]:
-        del known[old]
-    if len(known) >= most:
-        del known[min(known, key=lambda name: known[name])]
+def _add(entries: dict[str, float], now: float, lifetime_s: float, limit: int) -> str:
+    """Add a random name with an expiry time; returns it."""
+    for expired in [name for name, expires in entries.items() if expires < now]:
+        del entries[expired]
+    if len(entries) >= limit:
+        del entries[min(entries, key=lambda name: entries[name])]
     name = secrets.token_urlsafe(32)
-    known[name] = now + seconds
+    entries[name] = now + lifetime_s
     return name

@@ -37,7 +37,7 @@ from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
 
 if TYPE_CHECKING:
     from runner.operator.live import LiveOperator
-    from runner.page.counter import CounterReading, LightToLight
+    from runner.page.counter import CounterReading, GlassToGlass
     from runner.vehicle.live import LiveVehicle
 
 DURATION_S = 20.0
@@ -170,15 +170,15 @@ def _count_read(readings: Collection[CounterReading]) -> int:
 
 def _show(name: str, readings: Sequence[CounterReading], decoded_ms: Sequence[float], looped: bool) -> int:
     """Print what was measured; returns the exit status."""
-    from runner.page.counter import FEWEST, light_to_light
+    from runner.page.counter import MIN_READINGS, glass_to_glass
 
     if not readings:
         say(f"no page drew a picture of {name}")
         return 1
-    found = light_to_light(readings, decoded_ms)
+    found = glass_to_glass(readings, decoded_ms)
     if found is None:
         say(
-            f"the counter was read in fewer than {FEWEST} of {len(readings)} pictures of {name}: "
+            f"the counter was read in fewer than {MIN_READINGS} of {len(readings)} pictures of {name}: "
             "it must be sharp, upright, whole, and at least 130 px wide in the picture"
         )
         return 1
@@ -186,15 +186,15 @@ def _show(name: str, readings: Sequence[CounterReading], decoded_ms: Sequence[fl
     return 0
 
 
-def _lines(name: str, found: LightToLight, looped: bool) -> Iterator[str]:
+def _lines(name: str, found: GlassToGlass, looped: bool) -> Iterator[str]:
     yield f"{name}: counter read in {found.read} of {found.pictures} pictures"
     yield f"  glass to glass      {found.median:4.0f} ms median, {found.p95:.0f} ms p95"
-    if found.stated is None or found.bound is None or found.outside is None:
+    if found.stated is None or found.bound is None or found.camera_and_screen is None:
         yield "  capture to drawing  unknown: no clocks were compared"
         return
     yield f"  capture to drawing  {found.stated:4.0f} ± {found.bound:.0f} ms, as the page states it"
     between = "the difference; no camera or screen in between" if looped else "the difference"
-    yield f"  camera and screen   {found.outside:4.0f} ± {found.bound:.0f} ms, {between}"
+    yield f"  camera and screen   {found.camera_and_screen:4.0f} ± {found.bound:.0f} ms, {between}"
     if found.fixed is not None and not looped:
         known = f"{found.decoded:.0f} ms from capture to decoding"
         yield f"  latency.fixed_ms={found.fixed:.0f}, given {known}"

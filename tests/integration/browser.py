@@ -1,4 +1,4 @@
-"""Shared by the tests of the operator's page: a browser's page, and what it shows."""
+"""Helpers for tests of the operator's page in a browser."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ until = partial(rig.until, every_s=0.1)  # each poll costs the browser time
 def opened(browser, url, width=1280, height=800, refused=False, **context):
     """A page in its own browser context, which must stay free of errors and contact no other host.
 
-    refused  the station goes away meanwhile, which the browser logs for each request
+    refused  the station goes offline in between, which the browser logs for each request
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
         page = tab.new_page()
@@ -40,11 +40,11 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
 
 def take_control(page):
     def taken():
-        """A user would click again if the page was still connecting, and may be asked for confirmation or not."""
+        """As a user would, click again if the page was still connecting, and confirm if asked."""
         if page.evaluate("tod.control") == "you":
             return True
         confirm = page.locator("#confirm-yes")
-        if not confirm.is_visible():  # it may have opened late: the holder became known between two clicks
+        if not confirm.is_visible():  # the dialog may open late, if the holder became known between two clicks
             page.locator("#take-control").click()
         if confirm.is_visible():
             confirm.click()
@@ -54,11 +54,11 @@ def take_control(page):
 
 
 def measure(page):
-    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before the introduction
+    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before hello
 
 
 def all_live(page, seconds=rig.WAIT_S):
-    """Every camera has been live at some time; on a busy machine hardly ever all at the same moment."""
+    """Wait until every camera has been live once; on a busy machine they are rarely all live together."""
     waiting = set(measure(page))
 
     def seen():
@@ -113,7 +113,7 @@ BOXES = """() => {
     ];
   };
   // The page places its pictures in a ResizeObserver, between layout and paint. This observer runs after that one;
-  // at any other time the layout may be one that is never painted, as when a banner has just appeared.
+  // at any other time the layout may be one that is never painted, for example just after a banner appears.
   return new Promise((done) => {
     new ResizeObserver((_, self) => (self.disconnect(), done(measured()))).observe(document.documentElement);
   });
@@ -121,7 +121,7 @@ BOXES = """() => {
 
 
 def boxes(page):
-    """By camera, its picture on the screen; and what is outside the window, text cut off, whether it scrolls."""
+    """The box of each camera's picture; and elements outside the window, text cut off, whether the page scrolls."""
     return page.evaluate(BOXES)
 
 
@@ -142,15 +142,15 @@ def viewing(page, view):
     assert page.evaluate("tod.view") == view
 
 
-# Gamepads that a test plugs in and presses.
+# Simulated gamepads.
 PADS = """() => {
   globalThis.pads = [];
-  globalThis.shaken = [];
-  globalThis.looks = 0;
-  Object.defineProperty(navigator, "getGamepads", { value: () => (looks++, [...pads, null]) });
+  globalThis.vibrations = [];
+  globalThis.polls = 0;
+  Object.defineProperty(navigator, "getGamepads", { value: () => (polls++, [...pads, null]) });
   globalThis.plug = (name) => {
     const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
-    const vibrationActuator = { playEffect: async (kind, { duration }) => shaken.push([kind, duration]) };
+    const vibrationActuator = { playEffect: async (kind, { duration }) => vibrations.push([kind, duration]) };
     pads.push({ index: 0, id: `${name} (Vendor: 046d Product: c24f)`, connected: true, buttons, vibrationActuator });
     dispatchEvent(Object.assign(new Event("gamepadconnected"), { gamepad: pads[0] }));
   };
@@ -159,7 +159,7 @@ PADS = """() => {
 
 
 def press_button(page, button):
-    """Press a button of the first pad until the page has seen it, and release it likewise."""
+    """Press a button of the first pad until the page has polled it, and release it likewise."""
     for pressed in ("true", "false"):
-        looks = page.evaluate(f"pads[0].buttons[{button}].pressed = {pressed}, looks")
-        until(lambda looks=looks: page.evaluate("looks") >= looks + 2)
+        polls = page.evaluate(f"pads[0].buttons[{button}].pressed = {pressed}, polls")
+        until(lambda polls=polls: page.evaluate("polls") >= polls + 2)

@@ -35,12 +35,12 @@ image = pytest.importorskip("PIL.Image")
 pytest.importorskip("cv2")
 pytest.importorskip("numba")
 
-FPS = 1  # as the page knows it; pictures come more often, so that none is late on a busy machine
+FPS = 1  # as the page knows it; pictures are sent more often, so that none is late on a busy machine
 EVERY_S = 0.4
 
 
 class Station(SimpleNamespace):
-    """What the page needs of the operator's side: a vehicle in mode S, of which each camera sends one picture.
+    """A stub of the operator's side: a vehicle in mode S whose cameras each send one picture.
 
     place     directory for its configuration
     cameras   by name, as in painted.py
@@ -77,7 +77,7 @@ class Station(SimpleNamespace):
         return VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
 
     def encoded(self, name, picture):
-        """A key frame of what the vehicle would send of a native picture: cropped, scaled, as H.264."""
+        """An H.264 keyframe of a native picture, cropped and scaled as the vehicle would send it."""
         (width, height), setting = self.cameras[name].native, self.run.decision.settings[name]
         roi, top = setting.roi, self.cameras[name].top
         edges = (f"left={roi.x}", f"right={width - roi.x - roi.width}")
@@ -103,7 +103,7 @@ class Station(SimpleNamespace):
         return captured
 
     def ask(self, document, on_reply):
-        self.asked = document
+        self.last_request = document
 
 
 def vehicle_file(cameras, size, estimated):
@@ -127,7 +127,7 @@ def vehicle_file(cameras, size, estimated):
 
 @contextmanager
 def serving(station):
-    """The page's server, which sends the pictures of all cameras but the silent ones."""
+    """The page's server, sending the pictures of all cameras except the silent ones."""
     page, ended = PageServer(station.vehicle, station), threading.Event()
     page.behind_s = 0.0  # how long ago pictures were captured
 
@@ -149,7 +149,7 @@ def serving(station):
 
 
 def on_screen(locator, before, mode="L"):
-    """A part of the screen in a mode of PIL, and what `before` returned both before and after it: something true."""
+    """A screenshot in a PIL mode, and what `before` returned, truthy and equal, both before and after it."""
 
     def pictured():
         known = before()

@@ -141,7 +141,7 @@ class Driver:
         if by == "buttons":
             page.evaluate(PADS)
             page.evaluate("plug('Pad')")
-            until(lambda: page.evaluate("looks") >= 2)  # what is held when it comes does not count
+            until(lambda: page.evaluate("polls") >= 2)  # a button held while connecting does not count
 
     def does(self, action):
         self.press(self._inputs[action])

@@ -10,7 +10,7 @@ from helpers import Command
 
 from browser import measure, opened
 from rig import ROBOT, answers, free_port, process, until
-from runner.page.counter import CounterReading, counter_reading, light_to_light
+from runner.page.counter import CounterReading, counter_reading, glass_to_glass
 
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
 RESULT = re.compile(
@@ -32,10 +32,10 @@ def test_the_stated_latency_is_what_a_counter_in_the_picture_shows(chromium, tmp
             assert measuring.wait(timeout=60) == 0, output.read_text()
     found = RESULT.search(output.read_text())
     assert found, output.read_text()
-    read, pictures, light, stated, bound, outside = map(int, found.groups())
+    read, pictures, light, stated, bound, camera_and_screen = map(int, found.groups())
     assert read > 0.8 * pictures > 8
-    assert abs(light - stated - outside) <= 1
-    assert abs(outside) <= bound + 10, "nothing is between the counter and its capture"
+    assert abs(light - stated - camera_and_screen) <= 1
+    assert abs(camera_and_screen) <= bound + 10, "nothing is between the counter and its capture"
 
 
 def test_a_counter_that_is_not_in_the_picture_is_an_error(chromium) -> None:
@@ -70,19 +70,19 @@ def readings(elapsed: list[float | None], age: float | None = 40.0) -> list[Coun
 
 
 def test_the_fixed_part_is_what_the_reported_latency_lacks() -> None:
-    """Camera and screen add 50 ms to the 40 known to the page, 25 of which are known to the vehicle."""
-    found = light_to_light(readings([*[90.0] * 18, 130.0, None]), [25.0, 20.0, 30.0])
+    """Camera and screen add 50 ms to the 40 of which the page knows; the vehicle knows of 25 of those."""
+    found = glass_to_glass(readings([*[90.0] * 18, 130.0, None]), [25.0, 20.0, 30.0])
     assert found
     assert (found.pictures, found.read, found.median, found.stated, found.bound) == (20, 19, 90.0, 40.0, 2.0)
-    assert (found.outside, found.fixed) == (50.0, 65.0)
+    assert (found.camera_and_screen, found.fixed) == (50.0, 65.0)
     assert 90 <= found.p95 <= 130
 
 
 def test_few_readings_say_nothing_and_misread_ones_do_not_count() -> None:
-    assert light_to_light(readings([90.0] * 9 + [200_000.0]), []) is None
-    found = light_to_light(readings([90.0] * 10, age=None), [])
+    assert glass_to_glass(readings([90.0] * 9 + [200_000.0]), []) is None
+    found = glass_to_glass(readings([90.0] * 10, age=None), [])
     assert found
-    assert (found.stated, found.bound, found.outside, found.fixed) == (None, None, None, None)
+    assert (found.stated, found.bound, found.camera_and_screen, found.fixed) == (None, None, None, None)
 
 
 @pytest.mark.parametrize(

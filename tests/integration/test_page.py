@@ -40,7 +40,7 @@ aiohttp = pytest.importorskip("aiohttp")
 image = pytest.importorskip("PIL.Image")
 
 
-SIZES = {  # half of each side: the processor has time to spare for the tests
+SIZES = {  # halved sides, to leave CPU time for the tests
     **dict.fromkeys(("front_left", "front_center", "front_right"), (960, 520)),
     "rear_center": (960, 600),
     **dict.fromkeys(("top_front", "top_left", "top_right", "top_rear"), (640, 400)),
@@ -62,13 +62,13 @@ def demo():
         f"media.port={free_port()}",
         f"control.port={free_port()}",
         "control.expires_s=10",  # a busy machine delays requests ...
-        "modes=open_loop",  # ... and packets, which would lower the measured link and with it the total
+        "modes=open_loop",  # ... and packets, which would lower the measured link rate and so the total
         "duration_s=1200",
         "source.render.seconds=6",
-        "fps_max=5",  # so that counts mean something on two cores that also run the tests
+        "fps_max=5",  # so that counts are meaningful on two cores that also run the tests
         *(f"cameras.{name}.width_px={width}" for name, (width, _) in SIZES.items()),
         *(f"cameras.{name}.height_px={height}" for name, (_, height) in SIZES.items()),
-        "pqos.position.speed_mps=32",  # the loop in 25 s
+        "pqos.position.speed_mps=32",  # one loop in 25 s
     )
     with process("demo", *words, stdout=subprocess.DEVNULL) as child:
         until(lambda: answers(port) or child.poll() is not None, seconds=300)  # the drive may have to be rendered
@@ -88,14 +88,14 @@ def page(chromium, demo):
         choose(page, "automatic")
 
 
-def apart(coroutine):
-    """Run to completion in its own thread, since this one is the browser's."""
+def run_in_thread(coroutine):
+    """Run to completion in another thread, since this one is the browser's."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(asyncio.run, coroutine).result(timeout=60)
 
 
 def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
-    """Every camera draws more than so many pictures after it was counted, and no decoder fails."""
+    """Wait until every camera has drawn more than so many pictures since `counted`, and no decoder has failed."""
 
     def waiting():
         return {
@@ -110,7 +110,7 @@ def pictures_continue(page, counted, pictures=2, seconds=WAIT_S):
 
 
 def choose(page, mode):
-    """A user clicks again where a busy machine has let the request expire."""
+    """Choose a mode; as a user would, click again if the request expires on a busy machine."""
 
     def chosen():
         page.locator(f"#mode-{mode}").click()
@@ -129,7 +129,7 @@ def test_eight_pictures_move(page):
     shot(page, "automatic")
 
 
-def test_single_a_dragged_region_changes_what_is_received(page):
+def test_single_a_dragged_region_changes_the_received_picture(page):
     choose(page, "single")
     tile = page.locator("[data-camera=front_center] canvas[role=img]").bounding_box()
     full, _ = luma(page, "front_center")
@@ -151,7 +151,7 @@ def test_single_a_dragged_region_changes_what_is_received(page):
     assert size[0] < full.shape[0]
     until(lambda: luma(page, "front_center")[0].shape == size)
     shot(page, "single")
-    # The picture is the middle of the one before, as sharp as the factor allows.
+    # The picture is the middle of the previous one, as sharp as the factor allows.
     middle = full[full.shape[0] // 4 : -full.shape[0] // 4, full.shape[1] // 4 : -full.shape[1] // 4]
     assert middle.shape[0] == pytest.approx(size[0], abs=16)
     applied = state_when(page, lambda now: now["cameras"]["front_center"]["applied"]["roi"] == roi)
@@ -188,7 +188,7 @@ def test_single_numbers_and_sliders_set_one_camera(page):
 
 
 @pytest.mark.parametrize("mode", ["automatic", "collective"])
-def test_a_camera_that_is_off_frees_its_share(page, mode):
+def test_a_camera_switched_off_frees_its_share(page, mode):
     before = choose(page, mode)
     toggle = page.locator("[data-camera=rear_center] .switch")
     toggle.click()
@@ -230,17 +230,17 @@ def test_automatic_the_drop_of_the_map_lowers_factors(page):
     until(lambda: re.search(note, page.evaluate("document.querySelector('#news').innerText")))
 
 
-def test_a_page_opened_in_the_middle_of_a_drive_begins_with_true_pictures(chromium, demo):
-    """The first drawn picture of each camera against a clean decode, in mode single: sizes do not change."""
+def test_a_page_opened_mid_drive_starts_with_intact_pictures(chromium, demo):
+    """Compares the first drawn picture of each camera with a clean decode; in mode single sizes do not change."""
     single = ({"take_control": True}, {"id": "1", "event": "mode_selected", "mode": "single"})
     with recorded(demo, *single, viewer="holder"):
-        time.sleep(1.5)  # until changes of size have ended
+        time.sleep(1.5)  # until size changes have settled
         with recorded(demo) as units:
             time.sleep(4)
             with opened(chromium, f"{demo}#measure") as late:
                 until(lambda: all(camera["first_drawn_ms"] for camera in measure(late).values()))
                 first = {name: camera["first_drawn_ms"] for name, camera in measure(late).items()}
-                assert max(first.values()) < 10_000, first  # ten times what is normal
+                assert max(first.values()) < 10_000, first  # ten times the normal time
                 pictures = {name: luma_first(late, name) for name in TUM}
                 until(lambda: late.evaluate("tod.control") == "another")
             time.sleep(0.5)
@@ -254,7 +254,7 @@ def test_a_page_opened_in_the_middle_of_a_drive_begins_with_true_pictures(chromi
 
 
 def luma_first(page, camera):
-    """The first picture that was ever drawn of a camera."""
+    """The first picture drawn of a camera."""
     picture = page.evaluate(f"tod.first('{camera}')")
     data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
     return data.reshape(picture["height"], picture["width"]), picture["captured"]
@@ -262,7 +262,7 @@ def luma_first(page, camera):
 
 @contextmanager
 def recorded(url, *orders, viewer="recorder"):
-    """Every unit of every camera as a watching page gets it: by camera, (captured ms, data)."""
+    """Every unit that a watching page receives: by camera, (captured ms, data)."""
     units, stopped = [[] for _ in TUM], threading.Event()
 
     async def watch():
@@ -288,7 +288,7 @@ def recorded(url, *orders, viewer="recorder"):
 
 
 def decoded(units, shape):
-    """Luma of every unit, decoded by another decoder."""
+    """Luma of every unit, decoded by ffmpeg."""
     command = ["ffmpeg", "-v", "error", "-threads", "1", "-f", "h264", "-i", "-", "-fps_mode", "passthrough"]
     command += ["-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
     data = subprocess.run(command, input=b"".join(units), capture_output=True, check=True).stdout
@@ -298,7 +298,7 @@ def decoded(units, shape):
     return pictures[:, : height * width].reshape(-1, height, width)
 
 
-def test_a_reload_loses_nothing(page):
+def test_a_reload_keeps_control_history_and_mode(page):
     choose(page, "collective")
     before = page.evaluate("tod.history.time.length")
     page.reload()
@@ -319,7 +319,7 @@ def test_charts_and_map_are_drawn(page):
     page.locator("#theme").click()
 
 
-def test_requests_that_are_wrong_are_refused_with_the_reason(page):
+def test_invalid_requests_are_refused_with_a_reason(page):
     choose(page, "automatic")
     wrong = [
         ({"event": "total_set", "kbps": 3000}, "total_set is accepted in mode collective only, the mode is automatic"),
@@ -342,7 +342,7 @@ def test_requests_that_are_wrong_are_refused_with_the_reason(page):
     assert "ROI 100x100 at 900,0" in reply["reason"]
 
 
-def test_whatever_a_socket_sends_the_streams_continue(page, demo):
+def test_invalid_messages_do_not_disturb_the_streams(page, demo):
     async def attack():
         answers = []
         async with (
@@ -380,7 +380,7 @@ def test_whatever_a_socket_sends_the_streams_continue(page, demo):
             return answers, ws.close_code
 
     counted = measure(page)
-    answers, code = apart(attack())
+    answers, code = run_in_thread(attack())
     assert {answer["result"] for answer in answers} == {"refused"}
     assert answers[6]["reason"] == "this page does not hold control; take it first"
     assert answers[8]["reason"] == "100000 bytes: must be at most 65536"
@@ -397,18 +397,18 @@ def test_whatever_a_socket_sends_the_streams_continue(page, demo):
         ({"Host": "evil.example"}, 403),
     ],
 )
-def test_only_pages_of_this_server_may_look(demo, headers, status):
+def test_only_pages_of_this_server_have_access(demo, headers, status):
     async def ask():
         async with aiohttp.ClientSession() as session, session.get(demo, headers=headers) as answer:
             return answer.status, answer.headers.get("Content-Security-Policy")
 
-    answered, policy = apart(ask())
+    answered, policy = run_in_thread(ask())
     assert answered == status
     if status == 200:
         assert "default-src 'self'" in policy
 
 
-def test_a_viewer_that_does_not_read_harms_nobody(page, demo):
+def test_a_viewer_that_does_not_read_disturbs_no_other(page, demo):
     counted = measure(page)
     with upgraded(demo, "lazy"):
         time.sleep(6)
@@ -438,7 +438,7 @@ def test_without_its_worker_a_page_shows_no_camera_as_live(chromium, demo):
         assert {text.split()[1] for text in page.locator("[data-camera] .status").all_inner_texts()} == {"LOST"}
 
 
-def test_a_copy_of_a_page_only_watches(page):
+def test_a_duplicated_page_only_watches(page):
     with page.expect_popup() as opening:
         page.evaluate("void open(location.href)")  # copies the storage of its tab, as duplicating a tab does
     copy = opening.value
@@ -448,7 +448,7 @@ def test_a_copy_of_a_page_only_watches(page):
     until(lambda: page.evaluate("tod.control") == "you")
 
 
-def test_without_webcodecs_one_sentence_names_what_it_needs(chromium, demo):
+def test_without_webcodecs_a_message_names_the_requirement(chromium, demo):
     with chromium.new_context() as tab:
         tab.add_init_script("delete window.VideoDecoder")
         blind = tab.new_page()
@@ -487,8 +487,8 @@ NAMED = (
 )
 
 
-def test_screen_readers_find_a_name_for_everything(page):
-    """In both views; a name of an element without a role would not be read."""
+def test_every_control_has_a_name_for_screen_readers(page):
+    """In both views; screen readers ignore the name of an element without a role."""
     reader = page.context.new_cdp_session(page)
 
     def nameless(least):
@@ -529,7 +529,7 @@ def overlap(a, b):
 
 
 def whole(page):
-    """Boxes of the pictures, of which none overlaps another; nothing is cut off."""
+    """Boxes of the pictures, after checking that none overlap and nothing is cut off."""
     pictures, wrong = boxes(page)
     assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}, page.viewport_size
     assert set(pictures) == set(TUM)
@@ -562,7 +562,7 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     assert page.inner_text("#advised") == "no speed advised"
     until(lambda: re.match(r"Automatic · \d+( of \d+)? kbit/s · \w+", page.inner_text("#line")))
     page.evaluate("dispatchEvent(new Event('blur'))")
-    # On a busy machine the page may be slow at any time, which it states first.
+    # On a busy machine the page may be slow at any time, which takes precedence.
     until(lambda: page.inner_text("#attention") == "OUT OF FOCUS: keys do not reach this page; click it")
     time.sleep(0.6)  # a shorter absence is not reported
     page.evaluate("dispatchEvent(new Event('focus'))")
@@ -570,16 +570,16 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     until(lambda: re.search(r"No key reached this page for \d+ s", page.inner_text("#toasts")))
 
 
-def test_pictures_that_stand_still_are_named_and_heard_in_the_drive_view(chromium, demo):
+def test_stalled_pictures_are_named_and_sounded_in_the_drive_view(chromium, demo):
     with opened(chromium, demo) as page:
         all_live(page)
         take_control(page)
-        viewing(page, "drive")  # its key lets the page sound
+        viewing(page, "drive")  # the key press allows the page to play sound
         count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
         page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
         until(lambda: page.inner_text("#sound") == "Sound on")
         page.evaluate("boot.worker.terminate()")
-        until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures stand still")
+        until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
         assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
         assert page.inner_text("#worst") == "– ms"
         assert page.get_attribute("#latency", "data-level") == "late"
@@ -602,7 +602,7 @@ def test_drive_is_offered_once_and_only_the_driver_changes_the_view(page):
     page.locator("#drive-control").click()
     until(lambda: page.evaluate("tod.control") == "nobody")
     page.reload()
-    until(lambda: page.evaluate("window.tod?.control") == "you")  # nobody had it
+    until(lambda: page.evaluate("window.tod?.control") == "you")  # it was free
     assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "drive")
     page.locator("#to-configure").click()
     assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "configure")
@@ -617,7 +617,7 @@ def test_keys_of_the_drive_view(page):
         return page.locator(".tile.selected").get_attribute("data-camera")
 
     def is_at(camera, place):
-        """As soon as no banner moves the pictures."""
+        """Waits, since a banner may still move the pictures."""
         until(lambda: page.locator(f"[data-camera={camera}]").bounding_box() == box[place])
 
     keys = ("ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown")
@@ -641,24 +641,24 @@ def test_keys_of_the_drive_view(page):
     until(lambda: page.evaluate("document.fullscreenElement === null"))
 
 
-@pytest.mark.soak  # 13 s; the arithmetic is that of tests/js/framing.test.js
-def test_regions_dragged_in_mirrored_and_cropped_pictures_are_where_they_are_in_the_image(page):
+@pytest.mark.soak  # 13 s; tests/js/framing.test.js covers the arithmetic
+def test_regions_dragged_in_mirrored_and_cropped_pictures_map_to_the_image(page):
     choose(page, "single")
     viewing(page, "drive")
     sized(page, 1920, 1080)
     until(lambda: likeness(page, "rear_center", mirrored=True) > 0.8 > likeness(page, "rear_center", mirrored=False))
     assert drag(page, "rear_center", (0.1, 0.2), (0.4, 0.7)) == pytest.approx([576, 120, 288, 300], abs=12)
     box = page.locator("[data-camera=front_left] .picture").bounding_box()
-    part = 520 * box["width"] / box["height"]  # of the image's 960 px, the right ones
+    part = 520 * box["width"] / box["height"]  # the rightmost of the image's 960 px
     assert page.inner_text("[data-camera=front_left] .shown") == f"right {part / 9.6:.0f} % shown"
     expected = [960 - 0.75 * part, 130, part / 2, 260]
     assert drag(page, "front_left", (0.25, 0.25), (0.75, 0.75)) == pytest.approx(expected, abs=12)
-    plain, mirrored = (lost_words(page, is_mirrored) for is_mirrored in ("false", "true"))
+    plain, mirrored = (lost_alarm(page, is_mirrored) for is_mirrored in ("false", "true"))
     assert np.abs(plain - mirrored[:, ::-1]).mean() < 0.1 * np.abs(plain - mirrored).mean()
 
 
 def likeness(page, camera, mirrored):
-    """Correlation of what the screen shows of a camera with its picture; low if that has changed meanwhile."""
+    """Correlation of a camera's picture with its screenshot; low if the picture has changed in between."""
     picture, _ = luma(page, camera)
     png = page.locator(f"[data-camera={camera}] canvas[role=img]").screenshot()
     seen = np.asarray(image.open(io.BytesIO(png)).convert("L").resize(picture.shape[::-1]), float)
@@ -666,7 +666,7 @@ def likeness(page, camera, mirrored):
 
 
 def drag(page, camera, begin, end):
-    """Drag a region between two points of the box, in shares of its sides; returns it, and undoes it."""
+    """Drag a region between two points of the box, in fractions of its sides; returns the region and resets it."""
     box = page.locator(f"[data-camera={camera}] .picture").bounding_box()
     a, b = ((box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in (begin, end))
     page.mouse.move(*a)
@@ -679,8 +679,8 @@ def drag(page, camera, begin, end):
     return [roi[side] for side in ("x", "y", "width", "height")]
 
 
-def lost_words(page, mirrored):
-    """An alarm as it is drawn into a canvas that is mirrored on the screen, or is not."""
+def lost_alarm(page, mirrored):
+    """An alarm as drawn into a canvas that is mirrored on the screen or not."""
     found = page.evaluate(f"""import("/static/overlay.js").then(({{ drawOverlay }}) => {{
       const context = new OffscreenCanvas(600, 300).getContext("2d", {{ willReadFrequently: true }});
       drawOverlay(context, {{ x: 0, y: 0, width: 600, height: 300 }}, {mirrored}, "lost", "LOST 7 s");
@@ -689,16 +689,16 @@ def lost_words(page, mirrored):
     return np.reshape(found, (300, 600)).astype(float)
 
 
-def test_a_viewer_that_answers_no_ping_is_dropped(demo):
+def test_a_viewer_that_does_not_answer_pings_is_dropped(demo):
     with upgraded(demo, "silent") as viewer:
         began = time.monotonic()
         with suppress(ConnectionResetError):
-            while viewer.recv(65_536):  # reads, and sends nothing
+            while viewer.recv(65_536):  # reads but sends nothing
                 pass
         assert 1 < time.monotonic() - began < 20
 
 
-def test_a_viewer_that_reads_slowly_and_answers_stays(demo):
+def test_a_slow_viewer_that_answers_pings_stays_connected(demo):
     async def watch():
         read = 0
         async with (
@@ -713,12 +713,12 @@ def test_a_viewer_that_reads_slowly_and_answers_stays(demo):
                 await asyncio.sleep(len(message.data) / 50_000)  # 400 kbit/s
         return read
 
-    assert apart(watch()) > 100_000
+    assert run_in_thread(watch()) > 100_000
 
 
 @contextmanager
 def upgraded(url, viewer):
-    """A bare socket, upgraded to a viewer."""
+    """A raw socket, upgraded to a WebSocket as a viewer."""
     host = url.removeprefix("http://").rstrip("/")
     with socket.create_connection(("127.0.0.1", int(host.rpartition(":")[2])), timeout=20) as line:
         line.sendall(
@@ -738,7 +738,7 @@ def upgraded(url, viewer):
         ("h265", "420101214000000300b0000003000003009999", "hev1.1.2.H153.B0"),
     ],
 )
-def test_the_codec_is_named_as_webcodecs_wants_it(chromium, demo, codec, start, string):
+def test_the_codec_string_is_valid_for_webcodecs(chromium, demo, codec, start, string):
     with opened(chromium, demo) as page:
         unit = [0, 0, 0, 1, *bytes.fromhex(start), 0xA0]
         script = (

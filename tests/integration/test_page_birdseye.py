@@ -18,8 +18,8 @@ from runner.core.model import Pose
 pytestmark = MARKS
 
 WITHIN_M = 0.05
-AROUND_M = 0.3  # how far from its place a mark is looked for
-MOST_M = 0.65  # of a mark that is compared: the view ends 1 m beyond the last ones
+SEARCH_M = 0.3  # search radius around the expected place of a mark
+MAX_MARK_M = 0.65  # compared part of a mark: the view ends 1 m beyond the last marks
 FRONT = Mounted(Pose(2.0, 0.0, 1.5, 0, 5), (), native=TOP_SIZE)
 BODY = (0x39, 0x43, 0x4D)
 AMBER = (0xFF, 0xB0, 0x00)
@@ -41,7 +41,7 @@ def page(chromium, station):
     with serving(station) as served, opened(chromium, served.url, 1280, 800) as page:
         all_live(page)
         page.locator("body").press("v")
-        page.add_style_tag(content="#attention, #toasts { visibility: hidden; }")  # of a busy machine
+        page.add_style_tag(content="#attention, #toasts { visibility: hidden; }")  # they may appear on a busy machine
         yield page
         station.silent.clear()
 
@@ -51,37 +51,37 @@ def above(page):
 
 
 def shown_large(page):
-    """The bird's-eye view in place of the front camera, of pictures that all move; returns how it lies in its box."""
+    """Show the bird's-eye view in place of the front camera, all pictures live; returns its placement."""
     page.locator("body").press("e")
     small = until(lambda: (view := above(page))["on"] and view)
     page.locator("body").press("e")
     return until(lambda: moves(view := above(page)) and view["px_per_m"] > 1.5 * small["px_per_m"] and view)
 
 
-def moves(view, still=()):
-    """Whether it shows moving pictures, of all cameras but those that stand still."""
+def moves(view, stalled=()):
+    """Whether it shows live pictures of all cameras except the stalled ones."""
     assert view["why"] == ""
-    wanted = ["LOST" if name in still else "" for name in TOP_CAMERAS]
+    wanted = ["LOST" if name in stalled else "" for name in TOP_CAMERAS]
     return view["on"] and all([words[:4] for words in view[key]] == wanted for key in ("drawn", "states"))
 
 
-def lying(view):
+def placement(view):
     return {key: view[key] for key in ("px_per_m", "x", "y")}
 
 
-def seen(page, mode="RGB", still=()):
-    """What the screen shows while all pictures move but those, and how it lies there."""
+def seen(page, mode="RGB", stalled=()):
+    """A screenshot with live pictures of all cameras except the stalled ones, and its placement."""
 
     def steady():
         view = above(page)
         changes = [change for change in page.evaluate("tod.measure()")["status_log"] if change[1] in TOP_CAMERAS]
-        return moves(view, still) and (lying(view), changes)
+        return moves(view, stalled) and (placement(view), changes)
 
     pixels, (view, _) = on_screen(page.locator("#birdseye"), steady, mode)
     return pixels, view
 
 
-def test_marks_on_the_ground_are_where_they_are_within_5_cm(page):
+def test_marks_on_the_ground_appear_within_5_cm_of_their_place(page):
     shown_large(page)
     page.add_style_tag(content="#birdseye-lines, #birdseye .head { visibility: hidden; }")
     picture, scale = seen(page, "L")
@@ -89,13 +89,13 @@ def test_marks_on_the_ground_are_where_they_are_within_5_cm(page):
     px, apart = scale["px_per_m"], {}
     for mark in ALL_AROUND:
         there = (scale["x"] - px * mark.y, scale["y"] - px * mark.x)
-        half = (px * min(0.8 * mark.aside, MOST_M), px * min(0.8 * mark.along, MOST_M))
-        apart[mark.x, mark.y] = round(math.dist(corner(picture, there, half, AROUND_M * px), there) / px, 3)
+        half = (px * min(0.8 * mark.aside, MAX_MARK_M), px * min(0.8 * mark.along, MAX_MARK_M))
+        apart[mark.x, mark.y] = round(math.dist(corner(picture, there, half, SEARCH_M * px), there) / px, 3)
     print(px, apart)
     assert {place: metres for place, metres in apart.items() if metres > WITHIN_M} == {}
 
 
-def test_it_is_off_until_asked_for_and_labelled_where_a_camera_is_not_calibrated(page):
+def test_it_is_off_by_default_and_labelled_if_a_camera_is_not_calibrated(page):
     assert page.locator("#birdseye").is_hidden() and not above(page)["on"]
     assert page.locator("[data-camera=top_rear]").is_visible()
     page.locator("#to-birdseye").click()
@@ -121,16 +121,16 @@ def share(pixels, colour):
     return (np.abs(pixels - colour).max(axis=-1) < 8).mean()
 
 
-def test_the_vehicle_is_as_large_as_it_is(page):
+def test_the_vehicle_is_drawn_to_scale(page):
     shown_large(page)
-    until(lambda: is_as_large_as_stated(page))  # on a busy machine words may lie over it for a moment
+    until(lambda: is_to_scale(page))  # on a busy machine a label may briefly cover it
     shot(page, "birdseye")
 
 
-def is_as_large_as_stated(page):
-    pixels, view = on_screen(page.locator("#birdseye"), lambda: lying(above(page)), "RGB")
+def is_to_scale(page):
+    pixels, view = on_screen(page.locator("#birdseye"), lambda: placement(above(page)), "RGB")
     px, half = view["px_per_m"], CAR.width_m / 2
-    row, column = round(view["y"]), round(view["x"] + 0.8 * px * half)  # beside the wedge that points ahead
+    row, column = round(view["y"]), round(view["x"] + 0.8 * px * half)  # next to the wedge that points ahead
     found = [*run(pixels[row], column), *run(pixels[:, column], row)]
     expected = [view["x"] - px * half, view["x"] + px * half, view["y"] - px * CAR.front_m, view["y"] + px * CAR.rear_m]
     print(found, expected)
@@ -144,13 +144,13 @@ def run(line, at):
     return others[after - 1] + 1, others[after]
 
 
-def test_a_picture_that_stands_still_is_not_shown(page, station):
+def test_a_stalled_picture_is_not_shown(page, station):
     shown_large(page)
     left, right = sides(*seen(page))
     assert min(bright(left), bright(right)) > 0.06
     assert max(red(left), red(right)) < 0.001
     station.silent.add("top_left")
-    left, right = sides(*seen(page, still=["top_left"]))
+    left, right = sides(*seen(page, stalled=["top_left"]))
     shot(page, "birdseye-lost")
     assert (red(left) > 0.2, red(right)) == (True, 0)
     assert bright(left) < 0.02, "words and lines"
@@ -158,7 +158,7 @@ def test_a_picture_that_stands_still_is_not_shown(page, station):
     assert red(sides(*seen(page))[0]) == 0
 
 
-def test_without_webgl_it_says_so_and_pictures_come_as_they_are(chromium, station):
+def test_without_webgl_it_says_so_and_pictures_are_not_straightened(chromium, station):
     flags = [*CHROMIUM_FLAGS, "--disable-software-rasterizer"]
     other = chromium.browser_type.launch(executable_path=shutil.which("chromium"), args=flags)
     try:
@@ -177,7 +177,7 @@ def test_without_webgl_it_says_so_and_pictures_come_as_they_are(chromium, statio
 
 
 def sides(pixels, view):
-    """The ground at the left and right of the vehicle, behind what is written there."""
+    """The ground to the left and right of the vehicle, below the labels."""
     px = view["px_per_m"]
     rows = slice(*(round(view["y"] - px * metres) for metres in (1.5, -0.5)))
     columns = (sorted(round(view["x"] - side * px * metres) for metres in (2, 8)) for side in (1, -1))
@@ -185,7 +185,7 @@ def sides(pixels, view):
 
 
 def bright(pixels):
-    """Share of what is as bright as a white field."""
+    """Share of pixels as bright as a white field."""
     return (pixels.min(axis=-1) > 150).mean()
 
 

@@ -27,13 +27,13 @@ from runner.records import CameraState, Outcome, VehicleState, applied_to_json
 pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
 aiohttp = pytest.importorskip("aiohttp")
 
-WORDS = (*SMALL_ROBOT, "source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures come more often
+WORDS = (*SMALL_ROBOT, "source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often
 CAMERAS = ("front", "rear", "mast")
 EVERY_S = 0.3
 
 
 class Station(SimpleNamespace):
-    """What the page needs of the operator's side: a vehicle in mode A that applies every request at once."""
+    """A stub of the operator's side: a vehicle in mode A that applies every request immediately."""
 
     def __init__(self, vehicle):
         run = step(vehicle, start(vehicle), parse({"t": 0, "event": "bitrate_predicted", "kbps": 3000}))
@@ -42,19 +42,19 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-        super().__init__(state=state, note=print, answer_s=1.0, attention=None, asked=[])
+        super().__init__(state=state, note=print, answer_s=1.0, attention=None, requests=[])
 
     def captured_here(self, camera, captured):
         return captured
 
     def ask(self, document, on_reply):
-        self.asked.append(document)
+        self.requests.append(document)
         on_reply(Outcome(0.0, "applied", ""))
 
 
 @pytest.fixture(scope="module")
 def picture():
-    """A key frame of H.264."""
+    """An H.264 keyframe."""
     size = "video/x-raw,width=320,height=180,pixel-aspect-ratio=1/1"
     stream = "video/x-h264,stream-format=byte-stream,alignment=au,profile=constrained-baseline"
     line = f"videotestsrc num-buffers=1 pattern=white ! {size} ! x264enc tune=zerolatency ! {stream} ! fdsink fd=1"
@@ -63,7 +63,7 @@ def picture():
 
 @contextmanager
 def served(picture, layouts):
-    """The page of a robot, with pictures: its server and the station."""
+    """A robot's page with pictures: its server and the station."""
     vehicle = configuration([*WORDS, f"page.port={free_port()}"]).vehicle()
     station = Station(vehicle)
     page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
@@ -106,7 +106,7 @@ def where(page, camera):
 
 
 def edges(page, selector="article"):
-    """By camera, the box of its tile, or of what lies on that."""
+    """By camera, the box of its tile, or of another element."""
     return {name: page.locator(f"{selector}[data-camera={name}]").bounding_box() for name in CAMERAS}
 
 
@@ -125,7 +125,7 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         assert [where(page, name) for name in ("mast", "rear")] == [
             "row 2, column 1, 1 high, 1 wide",
             "row 1, column 2, 1 high, 1 wide",
-        ], "they change places"
+        ], "they swap"
         page.focus("[data-mover=front]")
         page.keyboard.press("Shift+ArrowRight")
         assert where(page, "front") == "row 1, column 1, 1 high, 2 wide"
@@ -161,10 +161,10 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         page.wait_for_selector("#layout-bar", state="hidden")
         assert file.read_text() == f"{HEADER}vehicles: {{}}\n"
         assert edges(page) == before
-        assert station.asked == [], "no region was dragged, no camera switched"
+        assert station.requests == [], "no region was dragged, no camera switched"
 
 
-@pytest.mark.soak  # the station's answers are those of tests/test_page_parts.py
+@pytest.mark.soak  # tests/test_page_parts.py covers the station's replies
 def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
     with served(picture, None) as (server, _), opened(chromium, server.url) as page:
         controlling(page)
@@ -178,10 +178,10 @@ def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
         page.keyboard.press("ArrowDown")
         page.click("#layout-save")
         until(lambda: "alice.yaml: cannot be written: " in page.inner_text("#toasts"))
-        assert where(page, "front") == "row 2, column 1, 1 high, 1 wide", "what was edited is still there"
+        assert where(page, "front") == "row 2, column 1, 1 high, 1 wide", "the draft is kept"
 
 
-def test_monitors_are_windows_of_their_page(chromium, picture):
+def test_monitors_share_selection_control_and_attention_with_their_page(chromium, picture):
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
@@ -209,7 +209,7 @@ def test_monitors_are_windows_of_their_page(chromium, picture):
         page.keyboard.press("2")
         until(lambda: monitor.evaluate("tod.selected") == "rear")
         monitor.keyboard.press("o")
-        assert until(lambda: station.asked) == [{"event": "camera_switched", "camera": "rear", "on": False}]
+        assert until(lambda: station.requests) == [{"event": "camera_switched", "camera": "rear", "on": False}]
         monitor.keyboard.press("t")
         until(lambda: "not its monitors" in monitor.inner_text("#toasts"))
         assert page.evaluate("tod.control") == "you"
@@ -233,7 +233,7 @@ def test_monitors_are_windows_of_their_page(chromium, picture):
         assert wrong.inner_text("#no-such-camera") == "delivery_robot has no camera raer; cameras are front, rear, mast"
 
 
-def test_a_layout_outlasts_the_operators_process(broker, tmp_path):
+def test_a_layout_survives_a_restart_of_the_operators_process(broker, tmp_path):
     port, layout = free_port(), {"rear": {"row": 0, "column": 0, "row_span": 1, "column_span": 2}}
 
     async def exchange(messages):
@@ -257,7 +257,7 @@ def test_a_layout_outlasts_the_operators_process(broker, tmp_path):
     assert places == {"front": None, "rear": layout["rear"], "mast": None}
 
 
-# WCAG 2.2, 1.4.3: text has 4.5 : 1 with what is below it, large text 3 : 1. Over a picture anything may be below it.
+# WCAG 2.2, 1.4.3: text needs a contrast of 4.5 : 1, large text 3 : 1; over a picture, with any colour below it.
 CONTRAST = """([root, theme, states]) => {
   document.documentElement.dataset.theme = theme;
   const parsed = (text) => {
@@ -336,7 +336,7 @@ CONTRAST = """([root, theme, states]) => {
 }"""
 LEVELS = ["fine", "near", "late", "unknown", "none"]
 STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "unsupported"]
-# By selector and attribute, what a page shows only at times.
+# Elements that a page shows only at times, by selector and attribute.
 STATES = [
     *([f"#{name}", "data-test", ["shown"]] for name in ("banner", "warning", "offer", "attention", "no-such-camera")),
     ["#latency", "data-level", LEVELS],
@@ -352,7 +352,7 @@ STATES = [
 ]
 
 
-def test_every_text_can_be_read_by_day_and_by_night(chromium, picture, tmp_path):
+def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path):
     with served(picture, Layouts(tmp_path)) as (server, _), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)

@@ -1,4 +1,4 @@
-"""The operator's page in a real browser, when a vehicle or an operator's process fails or differs."""
+"""The operator's page in a real browser when a vehicle or an operator's process fails or differs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ pytestmark = [
 ]
 
 
-# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
+# Not the measured link rate: a busy machine delays packets, which would lower it and so the total.
 ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=15", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 
 
@@ -42,7 +42,7 @@ def sides(*overrides, log="log.video=false", keys=None):
     """Vehicle and operator as two processes. Yields the page's address, a way to start the vehicle, the operator.
 
     log   argument of the operator's side
-    keys  directory with the keys of everybody; None: nothing is encrypted
+    keys  directory with the keys of all sides; None: nothing is encrypted
     """
     vehicle_keys, operator_keys = ([f"keys={keys / name}"] if keys else [] for name in ("delivery_robot", "alice"))
     control, media, port = (free_port() for _ in range(3))
@@ -56,7 +56,7 @@ def sides(*overrides, log="log.video=false", keys=None):
 
 
 @pytest.mark.alone
-def test_a_killed_vehicle_is_unmistakable_and_comes_back(chromium):
+def test_a_killed_vehicle_is_clearly_marked_and_recovers(chromium):
     """Each picture is marked before the banner names the cause."""
     kill_and_restart_the_vehicle(chromium, banner_ms=10_000)
 
@@ -91,7 +91,7 @@ def kill_and_restart_the_vehicle(chromium, banner_ms, frozen_ms=None):
 
 
 @pytest.mark.alone
-def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
+def test_a_hung_station_is_dropped_and_reconnected(chromium):
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url) as page:
         all_live(page)
         operator.send_signal(signal.SIGSTOP)
@@ -99,34 +99,34 @@ def test_a_station_that_hangs_is_given_up_and_found_again(chromium):
         page.wait_for_selector("#banner:not([hidden])", timeout=10_000)
         assert time.monotonic() - stopped < 3  # 2 s without a message
         assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
-        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4)  # each gives up after 1 s
+        until(lambda: page.evaluate("tod.measure()")["attempts"] >= 4)  # each times out after 1 s
         shot(page, "station-gone")
         operator.send_signal(signal.SIGCONT)
-        found_again(page)
+        reconnects(page)
 
 
 @pytest.mark.alone
 @pytest.mark.parametrize("attempts", [12, pytest.param(25, marks=pytest.mark.soak)])
-def test_a_station_that_starts_again_is_found_at_once(chromium, attempts):
-    """However many attempts have failed: browsers delay WebSockets that failed often."""
+def test_a_restarted_station_is_reconnected_promptly(chromium, attempts):
+    """However many attempts have failed: browsers delay WebSockets after repeated failures."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
         all_live(page)
         operator.kill()
         until(lambda: page.evaluate("tod.measure()")["attempts"] >= attempts)
         with process(*operator.args[3:]):
             until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
-            found_again(page)
+            reconnects(page)
 
 
-def found_again(page):
+def reconnects(page):
     back = time.monotonic()
     until(lambda: page.locator("#banner").is_hidden())
     all_live(page)
     assert time.monotonic() - back < 5
 
 
-def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
-    """Such a stream has no IDR to start from."""
+def test_an_operator_that_joins_a_watched_stream_shows_pictures(chromium):
+    """A running stream has no IDR to start from."""
     from runner.operator.frames import live_frames
 
     with sides() as (url, vehicle, _), vehicle() as running:
@@ -137,10 +137,10 @@ def test_an_operator_that_starts_beside_another_viewer_shows_pictures(chromium):
 
 
 @pytest.mark.soak
-def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
+def test_two_size_changes_a_second_break_no_decoder(chromium):
     """`make soak` runs it for longer."""
     turns = int(os.environ.get("TOD_NEW_SIZES", "20"))
-    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # keyframes there, refresh waves elsewhere
+    graphs = ("+graph@cameras.rear.graph=openh264_rtsp",)  # keyframes there, refresh waves on the other cameras
     keys = Path(os.environ["TOD_NEW_SIZES_KEYS"]) if "TOD_NEW_SIZES_KEYS" in os.environ else None
     with sides("mode=single", *graphs, keys=keys) as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         all_live(page)
@@ -161,7 +161,7 @@ def test_a_new_size_twice_a_second_breaks_no_decoder(chromium):
 
 
 @needs_compiler
-def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
+def test_ages_are_right_although_the_vehicles_clock_is_ahead(chromium, tmp_path):
     log = f"log={tmp_path / 'drive'}"
     ahead = clock_ahead(tmp_path, seconds=3.7)
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
@@ -170,7 +170,7 @@ def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
         age = until(lambda: re.search(r" (\d+) ± (\d+) ms", shown()))
         assert 0 <= int(age[1]) < 500, age  # and not 3700
         assert int(age[2]) < 100, age
-        time.sleep(2.5)  # by then a clock that was not compared is warned of
+        time.sleep(2.5)  # by then the page warns of an unknown clock offset
         assert page.locator("#warning").is_hidden()
         shot(page, "clock-ahead")
         operator.terminate()
@@ -183,7 +183,7 @@ def test_ages_are_right_though_the_vehicles_clock_is_ahead(chromium, tmp_path):
     assert sum(right) >= 0.99 * len(right)
 
 
-def test_nothing_old_is_shown_of_a_camera_that_is_off_or_lost(chromium):
+def test_no_stale_values_are_shown_of_a_camera_that_is_off_or_lost(chromium):
     with sides() as (url, vehicle, _), opened(chromium, url) as page:
         with vehicle() as running:
             all_live(page)
@@ -216,7 +216,7 @@ element: x265enc
 
 @pytest.fixture
 def h265(tmp_path):
-    """A user's directory with a graph of H.265, made from the packaged one by swapping elements."""
+    """A user's directory with an H.265 graph, made from the packaged H.264 graph by swapping elements."""
     text = (CHECKOUT / "conf" / "graph" / "h264_rtsp.yaml").read_text()
     text = re.sub(r"element: x264enc\n    properties:\n(      .*\n)+", X265, text)
     text = re.sub(r".*property: vbv-buf-capacity.*\n", "", text)
@@ -255,7 +255,7 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
 
 
 def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
-    """Pictures come as always; only their content shows that none of them is new."""
+    """Pictures arrive as usual; only their content shows that none of them is new."""
     still = "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true, pattern: circular}}, "
     raw = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}]"
     with sides() as (url, vehicle, _), vehicle(still + raw, "+source.repeated_s=1"), opened(chromium, url) as page:
@@ -269,7 +269,7 @@ def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
 
 
 def _own_address():
-    """An address of this machine that others may reach it at."""
+    """An address at which other machines may reach this one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # sends nothing
@@ -279,7 +279,7 @@ def _own_address():
 
 
 @pytest.fixture
-def elsewhere(tmp_path):
+def remote_page(tmp_path):
     """The page of an operator, served at an address that is not loopback: (url, keys)."""
     here = _own_address()
     keys, port = tmp_path / "keys", free_port()
@@ -295,16 +295,16 @@ def elsewhere(tmp_path):
         yield f"https://{here}:{port}/", keys / "alice"
 
 
-def test_a_browser_elsewhere_needs_the_token(chromium, elsewhere):
-    url, alice = elsewhere
+def test_a_browser_on_another_machine_needs_the_token(chromium, remote_page):
+    url, alice = remote_page
     token = (alice / "page.token").read_text()
-    with chromium.new_context(ignore_https_errors=True) as tab:  # its authority is not known to this browser
+    with chromium.new_context(ignore_https_errors=True) as tab:  # this browser does not know the authority
         page = tab.new_page()
         page.goto(url)
         assert page.url == f"{url}login"
         page.fill("#token", "guessed")
         page.click("button")
-        until(lambda: "not the token" in page.locator("#problem").inner_text())
+        until(lambda: "Wrong token" in page.locator("#problem").inner_text())
         shot(page, "login")
         page.fill("#token", token)
         page.click("button")
@@ -317,9 +317,9 @@ def test_a_browser_elsewhere_needs_the_token(chromium, elsewhere):
         until(lambda: page.reload() and page.url == f"{url}login", every_s=1)
 
 
-def test_pages_of_other_sites_and_names_are_refused(elsewhere):
-    """Cross-site WebSocket, DNS rebinding, another site's form, a path that climbs up, and no session at all."""
-    url, alice = elsewhere
+def test_other_sites_and_host_names_are_refused(remote_page):
+    """Cross-site WebSocket, DNS rebinding, another site's form, path traversal, and no session at all."""
+    url, alice = remote_page
     host = url.removeprefix("https://").rstrip("/")
     own = {"Host": host, "Origin": url.rstrip("/")}
     tls = ssl.create_default_context(cafile=alice / "ca.crt")

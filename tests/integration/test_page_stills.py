@@ -1,4 +1,4 @@
-"""The page in a real browser, with still pictures in place of a drive: lines on the ground, lens, pads, attention."""
+"""The page in a real browser with still pictures: lines on the ground, lens, gamepads, attention."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def guides(page, name):
     return page.evaluate(f"tod.guides('{name}')")
 
 
-def test_lines_end_where_marks_on_the_ground_are(page):
+def test_lines_end_at_the_marks_on_the_ground(page):
     until(lambda: guides(page, "mirrored"))
     assert not guides(page, "fisheye"), "not calibrated"
     page.locator("body").press("g")
@@ -74,7 +74,7 @@ def test_lines_end_where_marks_on_the_ground_are(page):
     assert {key: value for key, value in apart.items() if value > WITHIN_PX} == {}
 
 
-def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(page, station):
+def test_lines_match_marks_in_a_straightened_fisheye_which_accepts_no_region(page, station):
     number = list(CAMERAS).index("fisheye") + 1
     for key in (str(number), "Enter", "g", "l"):
         page.locator("body").press(key)
@@ -98,20 +98,20 @@ def test_a_straightened_fisheye_shows_lines_where_marks_are_and_takes_no_region(
     for line in lines:
         for piece in line["pieces"]:
             assert is_drawn(on - off, piece) is not False, (line["kind"], line["metres"])
-    station.asked = None
+    station.last_request = None
     box = page.locator("[data-camera=fisheye] .picture").bounding_box()
     drag(page, (box["x"] + 300, box["y"] + 200), (box["x"] + 500, box["y"] + 400))
     until(lambda: "no ROI can be chosen on a straightened picture" in page.inner_text("#toasts"))
-    assert station.asked is None
+    assert station.last_request is None
     page.locator("body").press("l")
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "")
 
 
 def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_may_be_locked(page, station):
-    def asked():
-        roi = until(lambda: getattr(station, "asked", None))
-        station.asked = None
-        until(lambda: page.evaluate("tod.requests.pending") == [])  # the station carries out nothing
+    def requested_roi():
+        roi = until(lambda: getattr(station, "last_request", None))
+        station.last_request = None
+        until(lambda: page.evaluate("tod.requests.pending") == [])  # the stub executes nothing
         assert (roi.pop("event"), roi.pop("camera")) == ("roi_set", name)
         return roi
 
@@ -119,21 +119,23 @@ def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_ma
         box = page.locator(f"[data-camera={name}] .picture").bounding_box()
         return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
-    station.asked = None
+    station.last_request = None
     name = "scaled"
     page.mouse.move(*at(0.25, 0.5))
     page.mouse.wheel(0, -500 * math.log(2))
-    assert asked() == pytest.approx({"x": 160, "y": 180, "width": 640, "height": 360}, abs=4)
+    assert requested_roi() == pytest.approx({"x": 160, "y": 180, "width": 640, "height": 360}, abs=4)
     page.locator("body").press("d")
     page.locator("[data-control=roi-aspect]").click()
     page.locator("body").press("d")
     drag(page, at(0.2, 0.2), at(0.6, 0.9))
-    roi = asked()
+    roi = requested_roi()
     assert roi == pytest.approx({"x": 256, "y": 144, "width": 512, "height": 288}, abs=4)
     name = "mirrored"
     drag(page, at(0.5, 0.5), at(0.6, 0.5), button="middle")
-    until(lambda: (getattr(station, "asked", None) or {}).get("x") == pytest.approx(288, abs=4))  # and none on the way
-    roi = asked()
+    until(
+        lambda: (getattr(station, "last_request", None) or {}).get("x") == pytest.approx(288, abs=4)
+    )  # only the last region
+    roi = requested_roi()
     assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
 
 
@@ -154,7 +156,7 @@ def seen(page, name):
 
 
 def scale_of(page, name, camera):
-    """CSS px of the screen for one of the full image."""
+    """CSS px on the screen per px of the full image."""
     box = page.locator(f"[data-camera={name}] .picture").bounding_box()
     width, height = camera.roi[2:] if camera.roi else SIZE
     sides = (box["width"] / width, box["height"] / height)
@@ -162,7 +164,7 @@ def scale_of(page, name, camera):
 
 
 def is_drawn(difference, points):
-    """Whether the screen changes along a line where guides are switched off; None: it is outside of the picture."""
+    """Whether the screen changes along a line where guides are switched off; None: it is outside the picture."""
     height, width = difference.shape
     at = [(int(point["y"]), int(point["x"])) for point in points]
     inside = [(row, column) for row, column in at if 0 <= row < height and 0 <= column < width]
@@ -187,7 +189,7 @@ def test_the_path_follows_the_steering_and_disappears_with_it(page, served):
 
 @contextmanager
 def steering(served, rad):
-    """The angle reported 20 times a second."""
+    """Report the angle 20 times a second."""
     ended = threading.Event()
 
     def report():
@@ -203,7 +205,7 @@ def steering(served, rad):
         reporting.join()
 
 
-def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
+def test_buttons_act_once_and_a_pad_that_disconnects_is_announced(page, station):
     page.evaluate(PADS)
     page.evaluate("plug('Wheel')")
 
@@ -214,33 +216,33 @@ def test_buttons_act_once_and_a_pad_that_disappears_is_announced(page, station):
         time.sleep(0.1)
         return page.locator(".tile.selected").get_attribute("data-camera")
 
-    time.sleep(0.1)  # what is held when it comes does not count
+    time.sleep(0.1)  # a button held while connecting does not count
     assert [hold(button) for button in (14, 12, 13)] == ["cropped", "scaled", "mirrored"]
     hold(3)
-    assert page.evaluate("tod.view") == "drive", "of the view in the usual configuration"
+    assert page.evaluate("tod.view") == "drive", "this button changes the view by default only"
     hold(7, seconds=1)
     assert page.evaluate("tod.view") == "configure", "a held button counts once"
     hold(7)
     assert page.evaluate("tod.view") == "drive"
     hold(4)
-    assert until(lambda: getattr(station, "asked", None)) == {"event": "mode_selected", "mode": "automatic"}
+    assert until(lambda: getattr(station, "last_request", None)) == {"event": "mode_selected", "mode": "automatic"}
     page.evaluate("unplug()")
-    until(lambda: "Wheel is gone" in page.inner_text("#toasts"))
-    assert "Wheel is gone" in page.locator("#news").text_content()
+    until(lambda: "Wheel disconnected" in page.inner_text("#toasts"))
+    assert "Wheel disconnected" in page.locator("#news").text_content()
 
 
-def test_keys_do_what_the_configuration_says(page, station):
+def test_keys_follow_the_configuration(page, station):
     def selected_by(key):
         page.keyboard.press(key)
         return page.locator(".tile.selected").get_attribute("data-camera")
 
     page.keyboard.press("v")
-    assert page.evaluate("tod.view") == "drive", "the key of the view is another"
+    assert page.evaluate("tod.view") == "drive", "another key is assigned to the view"
     assert [selected_by(key) for key in ("ArrowLeft", "ArrowUp", "ArrowDown")] == ["cropped", "scaled", "mirrored"]
     for key, expected in (("Shift+C", "collective"), ("Shift+A", "automatic")):
-        station.asked = None
+        station.last_request = None
         page.keyboard.press(key)
-        assert until(lambda: station.asked) == {"event": "mode_selected", "mode": expected}
+        assert until(lambda: station.last_request) == {"event": "mode_selected", "mode": expected}
     page.keyboard.press("?")
     page.wait_for_selector("dialog[open]")
     assert "Drive or Configure view" in page.locator("#help tr", has=page.locator("th", has_text="x")).inner_text()
@@ -252,8 +254,8 @@ def test_a_pad_vibrates_for_a_picture_that_is_lost(page, station, served):
     page.evaluate(PADS)
     page.evaluate("plug('Pad')")
     served.on_state(None)  # the vehicle is offline
-    until(lambda: page.evaluate("shaken"))
-    assert page.evaluate("shaken") == [["dual-rumble", 600]], "once for all pictures"
+    until(lambda: page.evaluate("vibrations"))
+    assert page.evaluate("vibrations") == [["dual-rumble", 600]], "once for all pictures"
 
 
 def test_a_pad_vibrates_more_gently_for_a_picture_that_is_late(page, served):
@@ -261,19 +263,19 @@ def test_a_pad_vibrates_more_gently_for_a_picture_that_is_late(page, served):
     page.evaluate("plug('Pad')")
     served.on_sample(Sample(1.0, None, 0, 0.0, None, 0, {}, clock_bound_ms=1.0))  # ages are known
     time.sleep(1)
-    assert page.evaluate("shaken") == []
+    assert page.evaluate("vibrations") == []
     served.behind_s = 0.5
-    until(lambda: page.evaluate("shaken"))
-    assert page.evaluate("shaken")[0] == ["dual-rumble", 200]
+    until(lambda: page.evaluate("vibrations"))
+    assert page.evaluate("vibrations")[0] == ["dual-rumble", 200]
 
 
-def test_the_vehicle_is_told_of_a_page_that_is_hidden_or_out_of_focus(page, station):
+def test_a_hidden_or_unfocused_page_is_reported_to_the_vehicle(page, station):
     until(lambda: station.attention in ("watching", "unfocused"))
     page.evaluate("dispatchEvent(new Event('focus'))")
     until(lambda: station.attention == "watching")
     page.evaluate("dispatchEvent(new Event('blur'))")
     until(lambda: station.attention == "unfocused")
-    until(lambda: "OUT OF FOCUS" in page.inner_text("#attention"))  # a busy machine may be slow for a moment
+    until(lambda: "OUT OF FOCUS" in page.inner_text("#attention"))  # a busy machine may be slow at first
     page.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     until(lambda: station.attention == "hidden")

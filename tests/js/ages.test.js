@@ -7,7 +7,7 @@ import { ageOf, skewOf, worstOf } from "../../runner/page/static/ages.js";
 
 const picture = (captured, ...later) => [captured, ...later];
 
-test("without a picture nothing is known", () => {
+test("without a picture all ages are unknown", () => {
   assert.deepEqual(ageOf([]), { age_ms: null, parts_ms: { page: null, decode: null, draw: null } });
 });
 
@@ -16,17 +16,17 @@ test("an age is the sum of its parts", () => {
   assert.deepEqual(ageOf(pictures), { age_ms: 61, parts_ms: { page: 2, decode: 8, draw: 11 } });
 });
 
-test("one slow picture does not change the median, and old ones are forgotten", () => {
+test("one slow picture does not change the median, and old ones drop out", () => {
   const quick = Array.from({ length: 15 }, () => picture(0, 10, 11, 12, 13));
   assert.equal(ageOf([...quick, picture(0, 10, 11, 12, 400)]).age_ms, 13);
   assert.equal(ageOf([picture(0, 1, 2, 3, 900), ...quick]).age_ms, 13);
 });
 
-test("an age below what the clocks can tell is shown as 0, not as negative", () => {
+test("an age within the clock error is shown as 0, not as negative", () => {
   assert.equal(ageOf([picture(10, 5, 6, 7, 8)]).age_ms, 0);
 });
 
-test("a capture time that is unknown leaves the parts on the page", () => {
+test("with an unknown capture time the parts on the page remain", () => {
   assert.deepEqual(ageOf([picture(NaN, 10, 12, 15, 20)]), { age_ms: null, parts_ms: { page: 2, decode: 3, draw: 5 } });
 });
 
@@ -44,12 +44,12 @@ test("the skew is between moving pictures only", () => {
 const age = (age_ms, bound_ms = 5) => ({ age_ms, bound_ms });
 const live = (...names) => Object.fromEntries(names.map((name) => [name, "live"]));
 
-test("the worst latency counts what the clocks may hide", () => {
+test("the worst latency includes the error bound of the clocks", () => {
   const ages = { front: age(90, 5), rear: age(80, 30) };
   assert.deepEqual(worstOf(ages, live("front", "rear"), 200), { camera: "rear", age_ms: 80, bound_ms: 30, level: "fine" });
 });
 
-test("its level follows the limit, at which a picture is not late yet", () => {
+test("its level depends on the limit; exactly at the limit a picture is not late", () => {
   const level = (age_ms) => worstOf({ front: age(age_ms, 10) }, live("front"), 200).level;
   assert.deepEqual([140, 141, 190, 191].map(level), ["fine", "near", "near", "late"]);
 });

@@ -11,26 +11,26 @@ function tones(...changes) {
   return changes.map(([now, status, camera = "front"]) => alarm.due(camera, status, now));
 }
 
-test("a picture that stands still and one that is late have tones of their own", () => {
+test("a stalled picture and a late one have different tones", () => {
   for (const status of ["lost", "frozen", "unsupported"]) assert.deepEqual(tones([0, status]), ["lost"]);
   for (const status of ["late", "damaged"]) assert.deepEqual(tones([0, status]), ["late"]);
   for (const status of ["live", "synchronising", "off", "paused"]) assert.deepEqual(tones([0, status]), [null]);
 });
 
-test("a picture that fails again within two seconds sounds once", () => {
+test("a picture that fails again within two seconds triggers one tone", () => {
   assert.deepEqual(tones([0, "frozen"], [5, "frozen"], [900, "lost"], [2000, "lost"]), ["lost", null, null, "lost"]);
 });
 
-test("pictures that fail together are one tone, also while they get worse", () => {
+test("pictures that fail together trigger one tone, even as they get worse", () => {
   const together = [[0, "frozen", "front"], [5, "frozen", "rear"], [900, "frozen", "left"]];
   const worse = [[1500, "lost", "front"], [1500, "lost", "rear"], [1500, "lost", "left"]];
   assert.deepEqual(tones(...together, ...worse), ["lost", null, null, null, null, null]);
 });
 
-test("a picture that fails a second after another one has a tone of its own", () => {
+test("a picture that fails a second after another one triggers a tone", () => {
   assert.deepEqual(tones([0, "frozen", "front"], [300, "live", "front"], [1000, "lost", "rear"]), ["lost", null, "lost"]);
 });
 
-test("a late picture does not hide one that stands still, but is hidden by it", () => {
+test("a late picture does not mask a stalled one, but is masked by it", () => {
   assert.deepEqual(tones([0, "late"], [50, "frozen"], [100, "late"], [2100, "late"]), ["late", "lost", null, "late"]);
 });

@@ -1,4 +1,4 @@
-/** The Drive view: who looks where, and that every picture has its place. */
+/** The Drive view: the roles of the cameras, and a place for every picture. */
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -84,7 +84,7 @@ test("neighbours are cropped to their inner part, which touches the front camera
   assert.deepEqual(pictures.get("front_right").view, { fit: "cover", align: 0, mirrored: false });
 });
 
-test("a camera may state that it fits, or fills its box", () => {
+test("a camera's framing may be fit or fill", () => {
   const cameras = VEHICLES.tum_q7.map((each) => ({ ...each, framing: { front_left: "fit", top_left: "fill" }[each.name] ?? null }));
   const { pictures } = arrange(cameras, 1920, 1080);
   const fit = (name) => pictures.get(name).view.fit;
@@ -92,12 +92,12 @@ test("a camera may state that it fits, or fills its box", () => {
   assert.equal(pictures.get("front_left").view.align, 0.5);
 });
 
-test("only what looks back is mirrored, and no top view", () => {
+test("only cameras that look backwards are mirrored, and no top view", () => {
   const { pictures } = arrange(VEHICLES.tum_q7, 1920, 1080);
   assert.deepEqual([...pictures].filter(([, { view }]) => view.mirrored).map(([name]) => name), ["rear_center"]);
 });
 
-test("angles count in either direction and beyond a turn", () => {
+test("angles wrap around in either direction", () => {
   const roles = rolesOf([camera("rear", -180), camera("left", 420), camera("right", 300), camera("front", 360)]);
   assert.deepEqual(named(roles), { front: "front", left: "left", right: "right", rear: "rear", others: [] });
 });
@@ -106,7 +106,7 @@ test("the front camera is the one nearest to straight ahead, within 30 degrees",
   assert.equal(rolesOf([camera("a", 20), camera("b", -10), camera("top", 0, 40)]).front.name, "b");
 });
 
-test("else the first one that looks forward, else the first", () => {
+test("otherwise it is the first one that looks forward, otherwise the first", () => {
   assert.equal(rolesOf([camera("rear", 180), camera("a", 60), camera("b", -40)]).front.name, "a");
   assert.equal(rolesOf([camera("top", 0, 60), camera("rear", 180)]).front.name, "top");
   assert.equal(rolesOf([camera("x"), camera("y")]).front.name, "x");
@@ -118,7 +118,7 @@ test("a second rear view is in the row, mirrored too", () => {
   assert.equal(arrange(cameras, 1920, 1080).pictures.get("rear_left").view.mirrored, true);
 });
 
-test("a camera may change places with the front camera; both are whole then", () => {
+test("a camera may be swapped with the front camera; both are shown whole", () => {
   const before = arrange(VEHICLES.tum_q7, 1920, 1080).pictures;
   const after = arrange(VEHICLES.tum_q7, 1920, 1080, "rear_center").pictures;
   const place = ({ x, y, width, height }) => [x, y, width, height];
@@ -133,7 +133,7 @@ const ABOVE = { width: 18, height: 21 };
 
 for (const vehicle of ["tum_q7", "delivery_robot", "six top views"])
   for (const [width, height] of SIZES)
-    test(`${vehicle} at ${width}x${height}: a bird's-eye view is in place of the top views, and overlaps nothing`, () => {
+    test(`${vehicle} at ${width}x${height}: a bird's-eye view replaces the top views, and overlaps nothing`, () => {
       const cameras = VEHICLES[vehicle];
       const { pictures } = arrange(cameras, width, height, null, ABOVE);
       assert.deepEqual([...pictures.keys()].sort(), [...cameras.filter((each) => !isTopView(each)).map(({ name }) => name), BIRDSEYE].sort());
@@ -147,7 +147,7 @@ for (const vehicle of ["tum_q7", "delivery_robot", "six top views"])
       assert.ok(Math.abs(above.width / above.height - 18 / 21) < 0.02, JSON.stringify(above));
     });
 
-test("the bird's-eye view may change places with the front camera, and a top view may beside it", () => {
+test("the bird's-eye view may be swapped with the front camera, and so may a top view next to it", () => {
   const large = arrange(VEHICLES.tum_q7, 1920, 1080, BIRDSEYE, ABOVE).pictures;
   const usual = arrange(VEHICLES.tum_q7, 1920, 1080, null, ABOVE).pictures;
   assert.deepEqual([large.get(BIRDSEYE).width, large.get("front_center").width], [usual.get("front_center").width, usual.get(BIRDSEYE).width]);

@@ -1,4 +1,4 @@
-/** An operator who looks elsewhere is told so on the return. */
+/** An operator whose attention lapses is warned, and informed on return. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -7,51 +7,51 @@ import { Attention } from "../../runner/page/static/attention.js";
 
 const HERE = { hidden: false, focused: true };
 
-test("nobody who stays is told anything", () => {
+test("an attentive operator gets no message", () => {
   const attention = new Attention();
-  assert.equal(attention.changed(HERE, 0), null);
-  assert.equal(attention.changed(HERE, 60_000), null);
+  assert.equal(attention.update(HERE, 0), null);
+  assert.equal(attention.update(HERE, 60_000), null);
   assert.equal(attention.warning, null);
 });
 
-test("out of focus is said at once, and for how long on the return", () => {
+test("loss of focus is warned of immediately, and its duration reported on return", () => {
   const attention = new Attention();
-  assert.equal(attention.changed({ hidden: false, focused: false }, 1000), null);
+  assert.equal(attention.update({ hidden: false, focused: false }, 1000), null);
   assert.equal(attention.warning, "OUT OF FOCUS: keys do not reach this page; click it");
-  assert.equal(attention.changed(HERE, 4100), "No key reached this page for 3 s");
+  assert.equal(attention.update(HERE, 4100), "No key reached this page for 3 s");
   assert.equal(attention.warning, null);
 });
 
-test("a hidden page cannot be read: it speaks on the return", () => {
+test("a hidden page reports only on return", () => {
   const attention = new Attention();
-  attention.changed({ hidden: false, focused: false }, 1000);
-  attention.changed({ hidden: true, focused: false }, 1100);
+  attention.update({ hidden: false, focused: false }, 1000);
+  attention.update({ hidden: true, focused: false }, 1100);
   assert.equal(attention.warning, null);
-  assert.equal(attention.changed({ hidden: false, focused: false }, 9000), null);
-  assert.equal(attention.changed(HERE, 11_000), "This page was hidden for 10 s: look at every picture");
+  assert.equal(attention.update({ hidden: false, focused: false }, 9000), null);
+  assert.equal(attention.update(HERE, 11_000), "This page was hidden for 10 s: check every picture");
 });
 
-test("an absence counts from its own start, and a moment is not one", () => {
+test("an absence counts from its own start, and a very short one is ignored", () => {
   const attention = new Attention();
-  attention.changed({ hidden: true, focused: true }, 0);
-  attention.changed(HERE, 5000);
-  attention.changed({ hidden: false, focused: false }, 6000);
-  assert.equal(attention.changed(HERE, 6400), null);
-  attention.changed({ hidden: false, focused: false }, 7000);
-  assert.equal(attention.changed(HERE, 7600), "No key reached this page for 1 s");
+  attention.update({ hidden: true, focused: true }, 0);
+  attention.update(HERE, 5000);
+  attention.update({ hidden: false, focused: false }, 6000);
+  assert.equal(attention.update(HERE, 6400), null);
+  attention.update({ hidden: false, focused: false }, 7000);
+  assert.equal(attention.update(HERE, 7600), "No key reached this page for 1 s");
 });
 
-test("keys that reach another window of the page are not missing here, and pictures that nobody saw are", () => {
+test("focus in another window of the page raises no warning, but hidden pictures are reported", () => {
   const attention = new Attention();
-  attention.changed({ hidden: false, focused: false, elsewhere: true }, 0);
+  attention.update({ hidden: false, focused: false, elsewhere: true }, 0);
   assert.equal(attention.state, "unfocused");
   assert.equal(attention.warning, null);
-  assert.equal(attention.changed(HERE, 9000), null);
-  attention.changed({ hidden: false, focused: false, elsewhere: false }, 10_000);
+  assert.equal(attention.update(HERE, 9000), null);
+  attention.update({ hidden: false, focused: false, elsewhere: false }, 10_000);
   assert.match(attention.warning ?? "", /OUT OF FOCUS/);
-  assert.equal(attention.changed({ hidden: false, focused: false, elsewhere: true }, 12_000), "No key reached this page for 2 s");
-  attention.changed({ hidden: true, focused: false, elsewhere: true }, 13_000);
-  assert.equal(attention.changed({ hidden: false, focused: false, elsewhere: true }, 16_000), "This page was hidden for 3 s: look at every picture");
+  assert.equal(attention.update({ hidden: false, focused: false, elsewhere: true }, 12_000), "No key reached this page for 2 s");
+  attention.update({ hidden: true, focused: false, elsewhere: true }, 13_000);
+  assert.equal(attention.update({ hidden: false, focused: false, elsewhere: true }, 16_000), "This page was hidden for 3 s: check every picture");
 });
 
 const STATES = [
@@ -63,9 +63,9 @@ const STATES = [
   [{ hidden: true, focused: false, slow: true }, "hidden", null],
 ];
 for (const [page, state, warning] of STATES)
-  test(`the worst is told, and warned of where it can be seen: ${JSON.stringify(page)}`, () => {
+  test(`the worst state is reported, with a warning if the page is visible: ${JSON.stringify(page)}`, () => {
     const attention = new Attention();
-    attention.changed(/** @type {any} */ (page), 0);
+    attention.update(/** @type {any} */ (page), 0);
     assert.equal(attention.state, state);
     if (warning) assert.match(attention.warning ?? "", /** @type {RegExp} */ (warning));
     else assert.equal(attention.warning, null);

@@ -5,7 +5,7 @@ import { test } from "node:test";
 
 import { factorTicks, timeAxis } from "../../runner/page/static/axes.js";
 
-test("the time axis grows with the drive up to five minutes, and never cuts off what is shown", () => {
+test("the time axis grows with the drive up to five minutes, and never cuts off data", () => {
   const spans = [0, 10, 30, 31, 100, 170, 299, 300, 4000].map((lasted) => -timeAxis(lasted).range[0]);
   assert.deepEqual(spans, [30, 30, 30, 60, 120, 180, 300, 300, 300]);
 });
@@ -26,6 +26,6 @@ test("ticks are at the factors of the cameras, each once", () => {
   assert.deepEqual(factorTicks([]), []);
 });
 
-test("labels do not overlap: of two factors that are near the lower one is labelled", () => {
+test("labels do not overlap: of two close factors the lower one is labelled", () => {
   assert.deepEqual(factorTicks([{ scaling: [0.01, 0.25, 0.26, 0.3, 1] }]), [0.01, 0.25, 0.3, 1]);
 });

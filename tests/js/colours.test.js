@@ -1,4 +1,4 @@
-/** Colours: eight cameras are told apart by colour-blind users, and all text has the contrast that WCAG 2.1, level AA, asks for. */
+/** Colours: eight cameras are told apart by colour-blind users, and all text has the contrast that WCAG 2.1, level AA, requires. */
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -53,19 +53,19 @@ function variables() {
 for (const [theme, colours] of Object.entries(variables())) {
   const { back, panel, raised } = colours;
   for (const name of ["text", "muted", "fine", "warn", "bad", "accent"])
-    test(`${theme}: --${name} can be read on every background`, () => {
+    test(`${theme}: --${name} is readable on every background`, () => {
       for (const behind of [back, panel, raised]) assert.ok(contrast(colours[name], behind) >= TEXT, `on ${behind}: ${contrast(colours[name], behind).toFixed(2)}`);
     });
-  test(`${theme}: words on coloured plates can be read`, () => {
+  test(`${theme}: text on coloured labels is readable`, () => {
     assert.ok(contrast(colours["on-accent"], colours["accent-back"]) >= TEXT);
     assert.ok(contrast("#ffffff", colours["bad-back"]) >= TEXT);
   });
-  test(`${theme}: lines of charts, swatches and the mark of the focus stand out`, () => {
+  test(`${theme}: chart lines, swatches and the focus ring stand out`, () => {
     for (const colour of [...PALETTES[theme], colours.predicted, colours.allocated, colours.actual, colours.focus])
       for (const behind of [back, panel]) assert.ok(contrast(colour, behind) >= GRAPHIC, `${colour} on ${behind}: ${contrast(colour, behind).toFixed(2)}`);
   });
 }
 
-test("words of the alarms can be read", () => {
+test("alarm text is readable", () => {
   for (const [fore, behind] of [["#ffffff", "#e01b24"], ["#000000", "#ffb000"], ["#e6ebf0", "#2b333c"]]) assert.ok(contrast(fore, behind) >= TEXT, `${fore} on ${behind}: ${contrast(fore, behind).toFixed(2)}`);
 });

@@ -17,7 +17,7 @@ test("unused rows and columns are left out, and cameras without a place follow b
   assert.deepEqual(completed([], {}), {});
 });
 
-test("a tile that lands on another one changes places with it", () => {
+test("a tile that lands on another one swaps with it", () => {
   assert.deepEqual(moved(DRAFT, "a", 0, 2), { ...DRAFT, a: at(0, 2), c: at(0, 0) });
 });
 
@@ -25,7 +25,7 @@ test("a tile that lands on a free cell leaves the others alone", () => {
   assert.deepEqual(moved(DRAFT, "a", 1, 0), { ...DRAFT, a: at(1, 0) });
 });
 
-test("a tile that is too large for the place of the other one moves it down", () => {
+test("a tile too large to swap with the other one moves it down", () => {
   const draft = { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2) };
   assert.deepEqual(moved(draft, "a", 0, 1), { a: at(0, 1, 2, 2), b: at(2, 2), c: at(3, 2) });
 });
@@ -52,7 +52,7 @@ test("the grid of a draft has a free row and column", () => {
 
 const meet = (a, b, side) => a[side] < b[side] + b[`${side}_span`] && b[side] < a[side] + a[`${side}_span`];
 
-test("whatever is done, no tile covers another one, and no other tile changes its size", () => {
+test("whatever the edits, no tile covers another one, and no other tile changes its size", () => {
   let seed = 7;
   const chance = (count) => (seed = (seed * 48271) % 2147483647) % count; // Park and Miller, 1988
   let draft = completed(cameras("a", "b", "c", "d", "e", "f", "g", "h"), {});

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { imageToBox, placed, shownWords, toBox, toPicture, visible, WHOLE } from "../../runner/page/static/framing.js";
+import { framingText, imageToBox, placement, toBox, toPicture, visible, WHOLE } from "../../runner/page/static/framing.js";
 
 const PICTURE = { width: 1920, height: 1080 };
 const NARROW = { width: 270, height: 1080 };
@@ -13,7 +13,7 @@ const near = (found, expected) => {
 };
 
 test("a whole picture is centred in its box", () => {
-  near(placed({ width: 960, height: 1000 }, PICTURE, WHOLE), { scale: 0.5, x: 0, y: 230, width: 960, height: 540 });
+  near(placement({ width: 960, height: 1000 }, PICTURE, WHOLE), { scale: 0.5, x: 0, y: 230, width: 960, height: 540 });
   near(toPicture({ x: 480, y: 500 }, { width: 960, height: 1000 }, PICTURE, WHOLE), { x: 960, y: 540 });
 });
 
@@ -24,7 +24,7 @@ test("a cropped picture keeps the part that it is aligned to", () => {
   near(toPicture({ x: 270, y: 1080 }, NARROW, PICTURE, cover(1)), { x: 1920, y: 1080 });
 });
 
-test("a mirrored picture shows its right at the left", () => {
+test("a mirrored picture has its right side on the left", () => {
   const mirrored = { ...WHOLE, mirrored: true };
   near(toPicture({ x: 100, y: 20 }, { width: 960, height: 540 }, PICTURE, mirrored), { x: 1720, y: 40 });
   near(toBox({ x: 1720, y: 40, width: 200, height: 100 }, { width: 960, height: 540 }, PICTURE, mirrored), { x: 0, y: 20, width: 100, height: 50 });
@@ -36,7 +36,7 @@ test("a mirrored and cropped picture shows the part that it is aligned to as wel
   near(toPicture({ x: 270, y: 0 }, NARROW, PICTURE, cover(1, true)), { x: 1650, y: 0 });
 });
 
-test("from the box into the picture and back is where it was", () => {
+test("a rectangle survives the round trip from box to picture and back", () => {
   for (const mirrored of [false, true])
     for (const fit of ["contain", "cover"])
       for (const align of [0, 0.5, 1])
@@ -48,9 +48,9 @@ test("from the box into the picture and back is where it was", () => {
         }
 });
 
-test("a point of the full image is where the picture of a region shows it, scaled, cropped and mirrored", () => {
+test("a point of the full image maps to the box through region, scale, crop and mirror", () => {
   const region = { x: 480, y: 260, width: 960, height: 540 };
-  const half = { width: 480, height: 270 }; // px of the picture that comes
+  const half = { width: 480, height: 270 }; // px of the received picture
   near(imageToBox({ width: 960, height: 600 }, half, WHOLE, region)({ x: 480 + 240, y: 260 + 54 }), { x: 240, y: 30 + 54 });
   near(imageToBox({ width: 960, height: 540 }, half, { ...WHOLE, mirrored: true }, region)({ x: 480 + 240, y: 260 }), { x: 720, y: 0 });
   near(imageToBox({ width: 270, height: 540 }, half, cover(1), region)({ x: 480 + 960, y: 260 + 540 }), { x: 270, y: 540 });
@@ -61,12 +61,12 @@ test("a point of the full image is where the picture of a region shows it, scale
   }
 });
 
-test("what is cropped or mirrored is stated, and nothing else", () => {
-  assert.equal(shownWords({ width: 960, height: 540 }, PICTURE, WHOLE), "");
-  assert.equal(shownWords({ width: 960, height: 900 }, PICTURE, WHOLE), "");
-  assert.equal(shownWords(NARROW, PICTURE, cover(1)), "right 14 % shown");
-  assert.equal(shownWords(NARROW, PICTURE, cover(0)), "left 14 % shown");
-  assert.equal(shownWords(NARROW, PICTURE, cover(0.5)), "middle 14 % shown");
-  assert.equal(shownWords({ width: 1920, height: 540 }, PICTURE, cover(0.5)), "middle 50 % of the height shown");
-  assert.equal(shownWords({ width: 960, height: 540 }, PICTURE, { ...WHOLE, mirrored: true }), "mirrored");
+test("cropping and mirroring are stated, and nothing else", () => {
+  assert.equal(framingText({ width: 960, height: 540 }, PICTURE, WHOLE), "");
+  assert.equal(framingText({ width: 960, height: 900 }, PICTURE, WHOLE), "");
+  assert.equal(framingText(NARROW, PICTURE, cover(1)), "right 14 % shown");
+  assert.equal(framingText(NARROW, PICTURE, cover(0)), "left 14 % shown");
+  assert.equal(framingText(NARROW, PICTURE, cover(0.5)), "middle 14 % shown");
+  assert.equal(framingText({ width: 1920, height: 540 }, PICTURE, cover(0.5)), "middle 50 % of the height shown");
+  assert.equal(framingText({ width: 960, height: 540 }, PICTURE, { ...WHOLE, mirrored: true }), "mirrored");
 });

@@ -1,9 +1,9 @@
-/** The ground around the vehicle: what hides it, whose picture counts where, and where it lies on the screen. */
+/** The ground around the vehicle: what hides it, which picture is used where, and its placement on the screen. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { crosses, groundOf, laidOut, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "../../runner/page/static/ground.js";
+import { crosses, groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "../../runner/page/static/ground.js";
 
 const CAR = { wheelbase_m: 2.9, track_m: 1.6, width_m: 2, front_m: 4, rear_m: 1 };
 const NATIVE = { width: 1280, height: 800, left: 0, top: 0 };
@@ -35,7 +35,7 @@ const LINES = [
   ["that ends at its front", place(6, 0), place(4, 0), false],
   ["over a corner", place(5, 0), place(3, 2), false],
   ["through a corner", place(4.5, 0), place(3, 1.2), true],
-  ["inside of it", place(1, 0), place(1, 0), true],
+  ["inside it", place(1, 0), place(1, 0), true],
   ["out of it", place(1, 0), place(9, 0), true],
 ];
 for (const [what, a, b, expected] of /** @type {[string, any, any, boolean][]} */ (LINES))
@@ -44,7 +44,7 @@ for (const [what, a, b, expected] of /** @type {[string, any, any, boolean][]} *
     assert.equal(crosses(b, a, BODY), expected);
   });
 
-test("the vehicle hides from a camera at its outside what is behind it; from one above it, nothing", () => {
+test("the vehicle hides what is behind it from a camera on its outside, and nothing from one above it", () => {
   const places = [place(9, 0), place(-5, 0), place(-5, 4)];
   assert.deepEqual(sightOf(AROUND[0], CAR, places).near.map((each) => each > 0), [true, false, false]);
   assert.deepEqual(sightOf(camera(2, 0, 2.5, 0, 60), CAR, places).near.map((each) => each > 0), [true, true, true]);
@@ -61,14 +61,14 @@ test("each camera shows what is in front of it", () => {
   for (const [i, shares] of found.entries()) near(shares[i], 1, 1e-3);
 });
 
-test("all of the ground is shown once, but for what is straight below a camera: the shares add up to 1", () => {
+test("the shares add up to 1 everywhere except directly below a camera", () => {
   const { places } = latticeOf(groundOf(CAR).extent);
   const outside = places.filter(({ x, y }) => !(x >= -1.2 && x <= 4.2 && Math.abs(y) <= 1.2));
   const dark = sharesAt(outside).filter((shares) => Math.abs(shares.reduce((a, b) => a + b) - 1) > 1e-6);
   assert.equal(dark.length, 0, `${dark.length} of ${outside.length} places`);
 });
 
-test("between two cameras the share goes over without a jump", () => {
+test("between two cameras the shares blend without a jump", () => {
   const arc = Array.from({ length: 181 }, (_, i) => place(3 + 7 * Math.cos((i * Math.PI) / 360), 7 * Math.sin((i * Math.PI) / 360)));
   const shares = sharesAt(arc);
   near(shares[0][0], 1, 1e-3);
@@ -76,7 +76,7 @@ test("between two cameras the share goes over without a jump", () => {
   for (const [i, each] of shares.slice(1).entries()) for (const k of [0, 1]) assert.ok(Math.abs(each[k] - shares[i][k]) < 0.1, `${i}: ${shares[i]} ${each}`);
 });
 
-test("what a region leaves out is shown by another camera that sees it, or by none", () => {
+test("ground outside a camera's region is shown by another camera that sees it, or by none", () => {
   const [ahead, between] = [place(8, 0), place(8, 5)];
   const lower = { x: 0, y: 700, width: 1280, height: 100 };
   const [whole, cut] = [sharesAt([ahead, between]), sharesAt([ahead, between], [lower, FULL, FULL, FULL])];
@@ -85,7 +85,7 @@ test("what a region leaves out is shown by another camera that sees it, or by no
   near(cut[1][1], 1, 1e-6);
 });
 
-test("a triangle with a corner that has no image is not drawn, nor one without a share", () => {
+test("a triangle with a corner without an image, or without any share, is not drawn", () => {
   const [point, ones] = [{ x: 1, y: 1 }, new Float32Array(6).fill(1)];
   assert.deepEqual([...trianglesOf(2, 2, [point, point, point, point], ones)], [0, 1, 2, 1, 3, 2]);
   assert.deepEqual([...trianglesOf(2, 2, [point, point, point, null], ones)], [0, 1, 2]);
@@ -93,12 +93,12 @@ test("a triangle with a corner that has no image is not drawn, nor one without a
   assert.deepEqual([...trianglesOf(2, 2, [point, point, point, point], Float32Array.of(0.2, 0, 0, 0))], [0, 1, 2]);
 });
 
-test("the front is up, the left at the left, and a metre has as many px each way", () => {
-  const wide = laidOut({ width: 1000, height: 460 }, CAR);
+test("the front is up, the left at the left, and the scale is the same in both directions", () => {
+  const wide = groundPlacement({ width: 1000, height: 460 }, CAR);
   near(wide.px_per_m, 20);
   near(wide.x, 500);
   near(wide.y, 13 * 20, 1e-9); // the front end of the ground is 13 m ahead of the rear axle, at the top
-  const high = laidOut({ width: 400, height: 1000 }, CAR);
+  const high = groundPlacement({ width: 400, height: 1000 }, CAR);
   near(high.px_per_m, 20);
   near(high.y, 500 + 1.5 * 20, 1e-9); // the ground's middle is 1.5 m ahead
 });

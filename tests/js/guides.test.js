@@ -1,4 +1,4 @@
-/** Lines on the ground: where the vehicle fits through, and where its wheels go. */
+/** Guide lines on the ground: the vehicle's width, distances, and the paths of its wheels. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -9,7 +9,7 @@ const CAR = { wheelbase_m: 3, track_m: 1.6, width_m: 2, front_m: 3.9, rear_m: 1.
 const ends = ({ places }) => [places[0], places[places.length - 1]];
 const near = (found, x, y) => assert.ok(Math.hypot(found.x - x, found.y - y) < 1e-9, `${found.x}, ${found.y}, not ${x}, ${y}`);
 
-test("the sides go on for 15 m from both ends of the vehicle", () => {
+test("the sides extend 15 m from both ends of the vehicle", () => {
   const widths = straightGuides(CAR).filter(({ kind }) => kind === "width");
   const expected = [[3.9, 1, 18.9, 1], [3.9, -1, 18.9, -1], [-1.1, 1, -16.1, 1], [-1.1, -1, -16.1, -1]];
   assert.equal(widths.length, expected.length);
@@ -27,7 +27,7 @@ test("distances count from the ends of the vehicle, and are as wide as it is", (
   for (const line of distances) assert.deepEqual(ends(line).map(({ y }) => y), [1, -1]);
 });
 
-test("straight on the wheels go on their tracks", () => {
+test("without steering the wheels go straight ahead", () => {
   const paths = pathGuides(CAR, 0);
   const expected = [[3.9, 0.8, 18.9, 0.8], [3.9, -0.8, 18.9, -0.8], [-1.1, 0.8, -16.1, 0.8], [-1.1, -0.8, -16.1, -0.8]];
   for (const [i, [x0, y0, x1, y1]] of expected.entries()) {
@@ -55,7 +55,7 @@ test("a path ends after a quarter turn", () => {
   near(ends(left)[1], 4.2, 8); // (3, 0.8 - 5) turned by 90 degrees about (0, 5)
 });
 
-test("wheels that are turned by next to nothing go straight on", () => {
+test("with next to no steering the wheels go straight ahead", () => {
   const straight = pathGuides(CAR, 0);
   for (const [i, { places }] of pathGuides(CAR, 1e-9).entries())
     for (const [j, { x, y }] of places.entries()) assert.ok(Math.hypot(x - straight[i].places[j].x, y - straight[i].places[j].y) < 1e-6);
@@ -79,7 +79,7 @@ test("without a choice only calibrated cameras have guides, and none without a p
   assert.deepEqual(shown("none"), [false, false, false]);
 });
 
-test("each choice shows other guides than the one before", () => {
+test("each choice shows different guides from the one before", () => {
   const steps = (cameras) => ["calibrated", "all", "none"].map((choice) => nextChoice(cameras, /** @type {any} */ (choice)));
   assert.deepEqual(steps([CALIBRATED, ESTIMATED]), ["all", "none", "calibrated"]);
   assert.deepEqual(steps([CALIBRATED]), ["none", "none", "calibrated"]);

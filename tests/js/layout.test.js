@@ -22,7 +22,7 @@ test("cameras without a place fill a square", () => {
   assert.deepEqual(names(bandsOf(cameras("a", "b", "c", "d", "e"), {})), [["a", "b", "c"], ["d", "e"]]);
 });
 
-test("cameras without a place follow in rows as long as the longest that has places", () => {
+test("cameras without a place follow in rows as long as the longest row with places", () => {
   const bands = bandsOf(cameras("x", "y", "z", "u", "a", "b", "c"), { a: at(1, 1), b: at(1, 2), c: at(1, 3) });
   assert.deepEqual(names(bands), [["a", "b", "c"], ["x", "y", "z"], ["u"]]);
 });
@@ -32,7 +32,7 @@ test("no cameras, no bands", () => {
   assert.deepEqual(heightsOf([], 1000, 500, CHROME), []);
 });
 
-test("rows that a picture joins are one band, and rows and columns that nothing covers take no room", () => {
+test("rows that a picture joins form one band, and empty rows and columns take no space", () => {
   const places = { a: at(1, 2, 2, 2), b: at(1, 5), c: at(2, 5), d: at(7, 0), e: at(7, 9) };
   const bands = bandsOf(cameras("a", "b", "c", "d", "e"), places);
   assert.deepEqual(where(bands), [[["a", 0, 0], ["b", 0, 2], ["c", 1, 2]], [["d", 0, 0], ["e", 0, 1]]]);
@@ -61,20 +61,20 @@ test("a row that the width limits leaves its height to the others, up to 1.25 of
   assert.deepEqual(checked([6, 1], 1200, 600), [108, 135]);
 });
 
-test("where the area is high enough every row is as wide as it may be", () => {
+test("if the area is high enough, every row is as wide as possible", () => {
   assert.deepEqual(checked([6, 1], 1200, 1000), [108, 675]);
 });
 
 test("a single wide picture fills the width", () => assert.deepEqual(checked([1], 1600, 2000), [900]));
 
-test("pictures never vanish, however small the area is", () => {
+test("pictures never vanish, however small the area", () => {
   const bands = bandsOf(cameras("a", "b"), { a: at(0, 0), b: at(1, 0) });
   assert.deepEqual(heightsOf(bands, 800, 100, CHROME), [24, 24]);
 });
 
 const AREAS = [[1600, 1000], [1600, 500], [700, 1200], [500, 420]];
 const LAYOUTS = {
-  "a large picture beside two": { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2) },
+  "a large picture next to two": { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2) },
   "with a row below": { a: at(0, 0, 2, 2), b: at(0, 2), c: at(1, 2), d: at(2, 0), e: at(2, 1) },
   "a wide one above": { a: at(0, 0, 1, 3), b: at(1, 0), c: at(1, 1), d: at(1, 2) },
   "a pinwheel": { a: at(0, 0, 1, 2), b: at(0, 2, 2, 1), c: at(2, 1, 1, 2), d: at(1, 0, 2, 1), e: at(1, 1) },

@@ -6,27 +6,27 @@ import { test } from "node:test";
 import { actionOf, keyOf, Presses } from "../../runner/page/static/presses.js";
 
 const pad = (held, index = 0) => ({ index, buttons: [0, 1, 2, 3].map((button) => ({ pressed: held.includes(button) })) });
-const looks = (presses, ...steps) => steps.map((pads) => presses.look(pads));
+const polled = (presses, ...steps) => steps.map((pads) => presses.poll(pads));
 
 test("a press counts once, and again after the button was released", () => {
-  assert.deepEqual(looks(new Presses(), [pad([])], [pad([1])], [pad([1])], [pad([1, 3])], [pad([3])], [pad([1, 3])]), [[], [1], [], [3], [], [1]]);
+  assert.deepEqual(polled(new Presses(), [pad([])], [pad([1])], [pad([1])], [pad([1, 3])], [pad([3])], [pad([1, 3])]), [[], [1], [], [3], [], [1]]);
 });
 
-test("what is held when a pad comes, or comes back, does not count", () => {
-  assert.deepEqual(looks(new Presses(), [pad([2])], [pad([2])], [], [pad([1])], [pad([1, 2])]), [[], [], [], [], [2]]);
+test("a button that is held when a pad connects, or reconnects, does not count", () => {
+  assert.deepEqual(polled(new Presses(), [pad([2])], [pad([2])], [], [pad([1])], [pad([1, 2])]), [[], [], [], [], [2]]);
 });
 
-test("each pad has buttons of its own, and one press of two is one", () => {
+test("each pad has buttons of its own, and the same button on two pads counts once", () => {
   const [wheel, stick] = [(held) => pad(held, 0), (held) => pad(held, 3)];
-  assert.deepEqual(looks(new Presses(), [wheel([]), stick([])], [wheel([1]), stick([])], [wheel([1]), stick([1])], [wheel([1]), stick([])]), [[], [1], [1], []]);
-  assert.deepEqual(looks(new Presses(), [wheel([]), stick([])], [wheel([2]), stick([2])]), [[], [2]]);
+  assert.deepEqual(polled(new Presses(), [wheel([]), stick([])], [wheel([1]), stick([])], [wheel([1]), stick([1])], [wheel([1]), stick([])]), [[], [1], [1], []]);
+  assert.deepEqual(polled(new Presses(), [wheel([]), stick([])], [wheel([2]), stick([2])]), [[], [2]]);
 });
 
-test("what was pressed while the page was out of focus does not count", () => {
+test("a button pressed while the page was out of focus does not count", () => {
   const presses = new Presses();
-  presses.look([pad([])]);
-  presses.forget();
-  assert.deepEqual(looks(presses, [pad([0])], [pad([0, 1])]), [[], [1]]);
+  presses.poll([pad([])]);
+  presses.reset();
+  assert.deepEqual(polled(presses, [pad([0])], [pad([0, 1])]), [[], [1]]);
 });
 
 test("an action is found by its key or button; null is none", () => {

@@ -1,4 +1,4 @@
-/** Where places around the vehicle appear in a camera's image: worked out by hand. */
+/** Where places around the vehicle appear in a camera's image, checked against values computed by hand. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -44,7 +44,7 @@ test("the full image begins where it is cut out of the native one, whose width t
   near(cropped(place(12, 1)), 960 - 96 - 100, 540 + 144 - 40);
 });
 
-test("what lies behind has no image", () => {
+test("places behind the camera have no image", () => {
   for (const where of [place(-5, 0), place(-5, 3), place(2, 4), place(2, 0)]) assert.equal(camera()(where), null);
   const fisheye = camera({}, { fov_deg: 200, lens: "fisheye" });
   assert.equal(fisheye(place(-5, 0, 1.5)), null);

@@ -1,4 +1,4 @@
-/** Regions zoomed, moved and in an aspect ratio. */
+/** Zoomed and moved regions, and their aspect ratio. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -14,23 +14,23 @@ test("a region is in whole px, inside the image and not too small", () => {
   assert.deepEqual(inside({ x: 100, y: 100, width: 5000, height: 200 }, FULL), { x: 0, y: 100, width: 1920, height: 200 });
 });
 
-test("zoomed in, a point stays where it is on the picture", () => {
+test("zooming in keeps the point under the pointer", () => {
   assert.deepEqual(zoomed(WHOLE, { x: 960, y: 540 }, 0.5, FULL), PART);
   assert.deepEqual(zoomed(WHOLE, { x: 0, y: 1080 }, 0.5, FULL), { x: 0, y: 540, width: 960, height: 540 });
   assert.deepEqual(zoomed(PART, { x: 720, y: 406 }, 0.5, FULL), { x: 600, y: 338, width: 480, height: 270 }); // a quarter of the way
 });
 
-test("zoomed out it ends at the full image, whatever its aspect ratio", () => {
+test("zooming out ends at the full image, whatever the aspect ratio", () => {
   assert.deepEqual(zoomed(PART, { x: 480, y: 270 }, 2, FULL), WHOLE);
   assert.deepEqual(zoomed({ x: 0, y: 0, width: 400, height: 540 }, { x: 0, y: 0 }, 3, FULL), { x: 0, y: 0, width: 1200, height: 1080 });
   assert.deepEqual(zoomed({ x: 0, y: 0, width: 1200, height: 1080 }, { x: 0, y: 0 }, 3, FULL), WHOLE);
 });
 
-test("it becomes no smaller than 16 px, and keeps its aspect ratio there", () => {
+test("a region is at least 16 px, and keeps its aspect ratio there", () => {
   assert.deepEqual(zoomed(PART, { x: 480, y: 270 }, 1e-3, FULL), { x: 480, y: 270, width: 28, height: 16 });
 });
 
-test("a point outside of the region counts as its edge", () => {
+test("a point outside the region counts as on its edge", () => {
   assert.deepEqual(zoomed(PART, { x: 0, y: 0 }, 0.5, FULL), { x: 480, y: 270, width: 480, height: 270 });
 });
 
@@ -39,7 +39,7 @@ test("a region is moved up to the edges of the image", () => {
   assert.deepEqual(moved(PART, { x: 5000, y: -5000 }, FULL), { ...PART, x: 960, y: 0 });
 });
 
-test("with an aspect ratio it is the part at the corner where the drag began", () => {
+test("a locked aspect ratio keeps the corner where the drag began", () => {
   const dragged = { x: 100, y: 100, width: 400, height: 400 };
   assert.deepEqual(withAspect(dragged, 2, { right: true, down: true }), { x: 100, y: 100, width: 400, height: 200 });
   assert.deepEqual(withAspect(dragged, 2, { right: false, down: false }), { x: 100, y: 300, width: 400, height: 200 });

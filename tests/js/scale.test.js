@@ -1,4 +1,4 @@
-/** The slider's arithmetic: even steps are even ratios, and what is sent while it moves. */
+/** The slider's arithmetic: equal steps are equal ratios, and requests are throttled. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -13,12 +13,12 @@ test("the slider runs from a 200th of the maximum to the maximum", () => {
 
 test("a bitrate is never below 1 kbit/s", () => assert.equal(toKbps(0, 1), 1));
 
-test("bitrates outside the slider stand at its ends", () => {
+test("bitrates outside the slider's range are at its ends", () => {
   assert.equal(toStep(1, 6000), 0);
   assert.equal(toStep(9000, 6000), STEPS);
 });
 
-test("a step survives the way to a bitrate and back, where bitrates are that fine", () => {
+test("a step survives the round trip to a bitrate, to within rounding", () => {
   for (let step = 0; step <= STEPS; step++) assert.ok(Math.abs(toStep(toKbps(step, 40000), 40000) - step) <= 1, `${step}`);
 });
 
@@ -26,7 +26,7 @@ test("a higher step is never a lower bitrate", () => {
   for (let step = 1; step <= STEPS; step++) assert.ok(toKbps(step, 6000) >= toKbps(step - 1, 6000));
 });
 
-test("a hand that moves sends at once, then at intervals, and its last value always", (context) => {
+test("throttling sends the first value immediately, then at intervals, and always the last one", (context) => {
   const due = [];
   context.mock.method(globalThis, "setTimeout", (call, ms) => due.push([call, ms]));
   const sent = [];

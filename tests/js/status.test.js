@@ -1,9 +1,9 @@
-/** What a tile says of its stream, from times alone. */
+/** The status of a tile's stream, from times alone. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { judge, words } from "../../runner/page/static/status.js";
+import { alarmText, judge } from "../../runner/page/static/status.js";
 
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
@@ -13,15 +13,15 @@ const LIVE = {
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
 
-test("a stream whose pictures come is live", () => assert.equal(judged({}), "live"));
+test("a stream whose pictures arrive is live", () => assert.equal(judged({}), "live"));
 
 const CASES = [
   ["off", { on: false }],
-  ["off", { on: false, sending: false, arrived: NOW - 5000 }], // silence is what was asked for
+  ["off", { on: false, sending: false, arrived: NOW - 5000 }], // the silence was requested
   ["paused", { sending: false }],
   ["lost", { connected: false }],
   ["lost", { online: false }],
-  ["lost", { connected: false, on: false }], // nothing is known of a camera that cannot be heard
+  ["lost", { connected: false, on: false }], // the state of an unreachable camera is unknown
   ["lost", { arrived: NOW - 1001 }],
   ["frozen", { arrived: NOW - 1000 }],
   ["unsupported", { refused: "no decoder" }],
@@ -29,14 +29,14 @@ const CASES = [
   ["synchronising", { drawn: false }],
   ["frozen", { arrived: NOW - 121 }],
   ["live", { arrived: NOW - 120 }],
-  ["frozen", { decoded: NOW - 121 }], // units come, and no picture of them
+  ["frozen", { decoded: NOW - 121 }], // units arrive but are not decoded
   ["late", { late_until: NOW + 1 }],
   ["live", { late_until: NOW }],
   ["frozen", { late_until: NOW + 1, arrived: NOW - 500 }],
   ["damaged", { damaged: true }],
   ["damaged", { damaged: true, late_until: NOW + 1 }],
   ["frozen", { damaged: true, arrived: NOW - 500 }],
-  ["frozen", { faulty: true }], // pictures come, and may be the same one again and again
+  ["frozen", { faulty: true }], // pictures arrive, but may all be the same one
   ["off", { faulty: true, on: false }],
 ];
 for (const [status, more] of CASES) test(`${status}: ${JSON.stringify(more)}`, () => assert.equal(judged(more), status));
@@ -46,11 +46,11 @@ test("a slow camera freezes after 1.3 frame intervals, not after the limit of fa
   assert.equal(judged({ fps: 5, arrived: NOW - 261 }), "frozen");
 });
 
-test("alarms say for how long and how late", () => {
-  assert.equal(words("frozen", 450, NaN), "FROZEN 0.4 s");
-  assert.equal(words("late", 0, 313), "LATE 310 ms");
-  assert.equal(words("lost", 3999, NaN), "LOST 3 s");
-  assert.equal(words("lost", 1e9, NaN), "LOST");
-  assert.equal(words("unsupported", 0, NaN), "NO PICTURE");
-  assert.equal(words("synchronising", 0, NaN), "SYNCHRONISING");
+test("alarms state how long and how late", () => {
+  assert.equal(alarmText("frozen", 450, NaN), "FROZEN 0.4 s");
+  assert.equal(alarmText("late", 0, 313), "LATE 310 ms");
+  assert.equal(alarmText("lost", 3999, NaN), "LOST 3 s");
+  assert.equal(alarmText("lost", 1e9, NaN), "LOST");
+  assert.equal(alarmText("unsupported", 0, NaN), "NO PICTURE");
+  assert.equal(alarmText("synchronising", 0, NaN), "SYNCHRONISING");
 });

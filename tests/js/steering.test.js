@@ -1,4 +1,4 @@
-/** The steering angle belongs to a picture by its capture time. */
+/** The steering angle at the capture time of a picture. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -7,7 +7,7 @@ import { Steering } from "../../runner/page/static/steering.js";
 
 function reported(...pairs) {
   const steering = new Steering();
-  for (const [at, rad] of pairs) steering.heard(at, rad);
+  for (const [at, rad] of pairs) steering.onReport(at, rad);
   return steering;
 }
 
@@ -28,7 +28,7 @@ const TABLE = [
 ];
 for (const [what, pairs, captured, expected] of TABLE)
   test(`angle ${what}`, () => {
-    const found = reported(...pairs).when(captured);
+    const found = reported(...pairs).angleAt(captured);
     if (expected === null) assert.equal(found, null);
     else assert.ok(Math.abs((found ?? NaN) - expected) < 1e-12, `${found}, not ${expected}`);
   });

@@ -1,4 +1,4 @@
-/** A fisheye's image straightened: worked out by hand. */
+/** A straightened fisheye image, checked against values computed by hand. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -26,7 +26,7 @@ test("a crop and a turned camera are taken into account", () => {
   near(cropped({ x: 1240, y: 300 }), { x: 3, y: 1, z: 1 });
 });
 
-test("the straight image has 100 degrees at most, and the middle in its middle", () => {
+test("the straightened image spans at most 100 degrees, and keeps the middle", () => {
   assert.equal(straightOptics(FISHEYE).fov_deg, 100);
   assert.equal(straightOptics({ ...FISHEYE, fov_deg: 80 }).fov_deg, 80);
   const { places, points } = straightMesh(FISHEYE);
@@ -37,7 +37,7 @@ test("the straight image has 100 degrees at most, and the middle in its middle",
   near(at(640, 800), { x: 640, y: 400 + (down / (Math.PI / 2)) * 640 });
 });
 
-test("between vertices the image is off by less than 0.2 px", () => {
+test("between vertices the image has an error below 0.2 px", () => {
   const { places, points } = straightMesh(FISHEYE);
   const exact = (place) => projection(FISHEYE)(sightline(straightOptics(FISHEYE))(place));
   for (let i = 0; i + 1 < places.length; i += 7) {
@@ -48,7 +48,7 @@ test("between vertices the image is off by less than 0.2 px", () => {
   }
 });
 
-test("where the camera is does not matter to what it shows", () => {
+test("the camera's pose does not affect the straightened image", () => {
   const moved = straightMesh({ ...FISHEYE, pose: { ...POSE, x_m: -1, yaw_deg: 130, pitch_deg: 35, roll_deg: 4 } });
   const unknown = straightMesh({ ...FISHEYE, pose: null });
   for (const mesh of [moved, unknown]) for (const [i, point] of straightMesh(FISHEYE).points.entries()) near(mesh.points[i], { ...point }, 1e-6);

@@ -1,73 +1,73 @@
-/** What the operator does by a key or a button; which one is the vehicle's configuration, `inputs`. */
+/** The operator's actions; `inputs` in the configuration assigns them to keys and buttons. */
 
 import { enlarge, publish, select, store } from "./store.js";
 import { selectMode, toggleControl } from "./header.js";
 import { focusTile, switchCamera } from "./tiles.js";
-import { changeTotal } from "./total.js";
+import { scaleTotal } from "./total.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
 import { rolesOf } from "./arrange.js";
-import { changeBirdseye } from "./birdseye.js";
+import { cycleBirdseye } from "./birdseye.js";
 import { toggleGuides } from "./drive.js";
 import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
-import { isEdited } from "./edit.js";
+import { isEditing } from "./edit.js";
 
 /**
  * @typedef {object} Action
- * @property {string} words
+ * @property {string} description
  * @property {() => unknown} run
- * @property {boolean} [onCameras] by a key only while no control has the focus: Enter on a button presses that
+ * @property {boolean} [onCameras] a key triggers it only while no control has the focus: Enter on a button presses the button
  */
 /** @type {Record<string, Action>} */
 export const ACTIONS = {
-  camera_left: { words: "Drive view: select the left camera", run: () => look("left"), onCameras: true },
-  camera_front: { words: "Drive view: select the front camera", run: () => look("front"), onCameras: true },
-  camera_right: { words: "Drive view: select the right camera", run: () => look("right"), onCameras: true },
-  camera_rear: { words: "Drive view: select the rear camera", run: () => look("rear"), onCameras: true },
-  reverse: { words: "Drive view: the rear camera large, in the front camera's place, and back", run: reverse },
-  enlarge: { words: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera", run: enlargeSelected, onCameras: true },
-  back: { words: "back from the enlarged picture", run: () => store.enlarged && enlarge(null) },
-  mode_single: { words: "mode Single", run: () => selectMode("single") },
-  mode_automatic: { words: "mode Automatic", run: () => selectMode("automatic") },
-  mode_collective: { words: "mode Collective", run: () => selectMode("collective") },
-  total_lower: { words: "mode Collective: lower the total by a tenth", run: () => changeTotal(0.9) },
-  total_raise: { words: "mode Collective: raise the total by a tenth", run: () => changeTotal(1.1) },
-  view: { words: "Drive or Configure view", run: toggleView },
-  guides: { words: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
-  birdseye: { words: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none", run: changeBirdseye },
-  straighten: { words: "straighten the picture of the selected fisheye, or show it as it comes", run: () => toggleStraight() },
-  drawer: { words: "Drive view: open or close the drawer", run: toggleDrawer },
-  map: { words: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
-  sound: { words: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
-  full_screen: { words: "full screen", run: toggleFullScreen },
-  monitors: { words: "pictures in further windows, for other monitors", run: listMonitors },
-  switch: { words: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
-  full_image: { words: "full image of the selected camera (mode S)", run: sendFull },
-  control: { words: "take or release control", run: toggleControl },
-  theme: { words: "night or day", run: toggleTheme },
-  help: { words: "this list", run: () => publish("help") },
+  camera_left: { description: "Drive view: select the left camera", run: () => selectRole("left"), onCameras: true },
+  camera_front: { description: "Drive view: select the front camera", run: () => selectRole("front"), onCameras: true },
+  camera_right: { description: "Drive view: select the right camera", run: () => selectRole("right"), onCameras: true },
+  camera_rear: { description: "Drive view: select the rear camera", run: () => selectRole("rear"), onCameras: true },
+  reverse: { description: "Drive view: the rear camera large, in the front camera's place, and back", run: reverse },
+  enlarge: { description: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera", run: enlargeSelected, onCameras: true },
+  back: { description: "back from the enlarged picture", run: () => store.enlarged && enlarge(null) },
+  mode_single: { description: "mode Single", run: () => selectMode("single") },
+  mode_automatic: { description: "mode Automatic", run: () => selectMode("automatic") },
+  mode_collective: { description: "mode Collective", run: () => selectMode("collective") },
+  total_lower: { description: "mode Collective: lower the total by a tenth", run: () => scaleTotal(0.9) },
+  total_raise: { description: "mode Collective: raise the total by a tenth", run: () => scaleTotal(1.1) },
+  view: { description: "Drive or Configure view", run: toggleView },
+  guides: { description: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
+  birdseye: { description: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none", run: cycleBirdseye },
+  straighten: { description: "straighten the picture of the selected fisheye, or show the original", run: () => toggleStraight() },
+  drawer: { description: "Drive view: open or close the drawer", run: toggleDrawer },
+  map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
+  sound: { description: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
+  full_screen: { description: "full screen", run: toggleFullScreen },
+  monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
+  switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
+  full_image: { description: "full image of the selected camera (mode S)", run: sendFull },
+  control: { description: "take or release control", run: toggleControl },
+  theme: { description: "night or day theme", run: toggleTheme },
+  help: { description: "show this list", run: () => publish("help") },
 };
 
 /** @param {"left"|"front"|"right"|"rear"} role */
-function look(role) {
+function selectRole(role) {
   if (store.view === "drive") selectCamera(rolesOf(store.hello?.cameras ?? [])[role]?.name);
 }
 
-/** Change between driving forwards and backwards. */
+/** Switch between driving forwards and backwards. */
 function reverse() {
   const { front, rear } = rolesOf(store.hello?.cameras ?? []);
   if (store.view !== "drive") return;
-  if (!rear) return publish("toast", { text: "no camera looks back", level: "hint" });
+  if (!rear) return publish("toast", { text: "no camera looks backwards", level: "hint" });
   const large = store.enlarged === rear.name;
   enlarge(large ? null : rear.name);
   selectCamera((large ? front : rear)?.name);
 }
 
 function enlargeSelected() {
-  if (store.selected && !isEdited()) enlarge(store.enlarged === store.selected ? null : store.selected);
+  if (store.selected && !isEditing()) enlarge(store.enlarged === store.selected ? null : store.selected);
 }
 
 export function selectCamera(name) {

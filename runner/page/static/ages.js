@@ -1,8 +1,8 @@
-/** The age of the pictures on show, from the times at which each passed: ms on the station's clock. Pure. */
+/** The age of the displayed pictures, from the time at which each passed each stage: ms on the station's clock. Pure. */
 
 import { MOVING } from "./status.js";
 
-const LAST = 15; // pictures whose median counts
+const LAST = 15; // pictures, for a median
 const NEAR = 0.75; // of the limit
 
 /** @typedef {[captured: number, arrived: number, received: number, decoded: number, drawn: number]} Times */
@@ -21,8 +21,8 @@ export function ageOf(pictures) {
 
 /**
  * The camera whose moving picture may be oldest: its age plus the error bound is the largest. `level` is "late" where
- * that exceeds the limit, "near" where it exceeds 75 % of it; "unknown" if the age of any moving picture is; "none" if
- * none moves.
+ * that exceeds the limit, "near" where it exceeds 75 % of it; "unknown" if the age of any moving picture is unknown;
+ * "none" if no picture moves.
  * @param {Record<string, {age_ms: number|null, bound_ms: number}>} ages by camera
  * @param {Record<string, string>} statuses by camera
  * @param {number} late_ms
@@ -32,14 +32,14 @@ export function worstOf(ages, statuses, late_ms) {
   const moving = Object.entries(ages).filter(([name]) => MOVING.includes(statuses[name]));
   const unknown = moving.find(([, { age_ms, bound_ms }]) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
   if (unknown || !moving.length) return { camera: unknown?.[0] ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
-  const most = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
-  const [camera, worst] = moving.reduce((a, b) => (most(b[1]) > most(a[1]) ? b : a));
-  const level = most(worst) > late_ms ? "late" : most(worst) > NEAR * late_ms ? "near" : "fine";
+  const upperBound = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
+  const [camera, worst] = moving.reduce((a, b) => (upperBound(b[1]) > upperBound(a[1]) ? b : a));
+  const level = upperBound(worst) > late_ms ? "late" : upperBound(worst) > NEAR * late_ms ? "near" : "fine";
   return { camera, age_ms: worst.age_ms, bound_ms: worst.bound_ms, level };
 }
 
 /**
- * Time between the captures of the oldest and of the newest picture on show; null: fewer than two move.
+ * Time between the captures of the oldest and the newest displayed picture; null: fewer than two move.
  * @param {{status: string, captured: number}[]} shown
  */
 export function skewOf(shown) {

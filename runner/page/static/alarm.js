@@ -1,7 +1,7 @@
-/** Which tone a change of a picture's status deserves, and how often. Pure; times in ms. */
+/** Which tone a change of a picture's status triggers, and how often. Pure; times in ms. */
 
 const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one tone
-const AGAIN_MS = 2000; // a picture that flickers does not sound each time
+const REPEAT_MS = 2000; // a picture that flickers does not sound each time
 const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", late: "late", damaged: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
 
@@ -10,7 +10,7 @@ const latest = (tones, kind) => Math.max(tones.lost, kind === "late" ? tones.lat
 
 export class Alarm {
   #last = never();
-  #of = {}; // by camera, the tones that announced it
+  #ofCamera = {}; // the last tones that announced each camera
 
   /**
    * @param {string} camera
@@ -20,8 +20,8 @@ export class Alarm {
    */
   due(camera, status, now) {
     const kind = KINDS[status];
-    const own = (this.#of[camera] ??= never());
-    if (!kind || now - latest(own, kind) < AGAIN_MS) return null;
+    const own = (this.#ofCamera[camera] ??= never());
+    if (!kind || now - latest(own, kind) < REPEAT_MS) return null;
     const tone = latest(this.#last, kind);
     const announced = now - tone < TOGETHER_MS;
     own[kind] = announced ? tone : now;

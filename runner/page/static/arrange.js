@@ -1,22 +1,22 @@
 /** The Drive view: which camera looks where, and the boxes of the pictures. Pure; lengths in px. */
 
 const AHEAD_DEG = 30; // a camera within this of straight ahead is the front camera
-const BEHIND_DEG = 135; // a camera turned further than this looks back
+const BEHIND_DEG = 135; // a camera turned further than this looks backwards
 const DOWN_DEG = 25; // a camera tipped down by this much is a top view
 const GAP = 4;
-// Shares of the area: the front camera's least part of it, and what the others get of its height or width.
+// Shares of the area: the front camera's minimum, and of its height or width for the others.
 const FRONT = 0.42;
-const BAND = { least: 0.1, usual: 0.14, most: 0.22 }; // above the pictures: the mirror and the figures
-const BAND_WITHOUT_MIRROR = { least: 0.1, usual: 0.1, most: 0.12 };
-const STRIP = { least: 0.1, usual: 0.17 };
-const SIDE = { least: 0.07, usual: 0.12, most: 0.16 };
+const BAND = { min: 0.1, usual: 0.14, max: 0.22 }; // above the pictures: the mirror and the figures
+const BAND_WITHOUT_MIRROR = { min: 0.1, usual: 0.1, max: 0.12 };
+const STRIP = { min: 0.1, usual: 0.17 };
+const SIDE = { min: 0.07, usual: 0.12, max: 0.16 };
 const COLUMN = 0.14;
-const NARROW = 1.3; // width of a height
-const MIRROR = 0.3; // most of the width
+const NARROW = 1.3; // width / height below which an area is narrow
+const MIRROR = 0.3; // maximum share of the width
 
 /** @typedef {import("./framing.js").View} View */
 /** @typedef {{x: number, y: number, width: number, height: number}} Box */
-/** @typedef {Box & {view: View}} Framed a picture's box and how the picture lies in it */
+/** @typedef {Box & {view: View}} Framed a picture's box and how the picture is placed in it */
 /**
  * @typedef {object} Camera
  * @property {string} name
@@ -27,30 +27,30 @@ const MIRROR = 0.3; // most of the width
  */
 /** @typedef {{front: Camera|null, left: Camera|null, right: Camera|null, rear: Camera|null, others: Camera[]}} Roles */
 
-export const BIRDSEYE = "bird's eye"; // in place of a camera's name; no camera has a blank in its name
+export const BIRDSEYE = "bird's eye"; // in place of a camera's name, which cannot contain a space
 
-/** To the left, from -180 to 180. */
+/** Yaw in degrees to the left, from -180 to 180. */
 const yawOf = ({ pose }) => pose && 180 - (((180 - pose.yaw_deg) % 360) + 360) % 360;
 export const isTopView = ({ pose }) => pose !== null && pose.pitch_deg >= DOWN_DEG;
-const looksBack = (camera) => camera.pose !== null && !isTopView(camera) && Math.abs(yawOf(camera)) >= BEHIND_DEG;
+const looksBackwards = (camera) => camera.pose !== null && !isTopView(camera) && Math.abs(yawOf(camera)) >= BEHIND_DEG;
 
 /**
- * The cameras by what a driver uses them for. The front camera is the one nearest to straight ahead, else the first that
- * looks forward, else the first. Top views, and what has no other place, are the others, in their order.
+ * The cameras by their role for a driver. The front camera is the one nearest to straight ahead, otherwise the first that
+ * looks forward, otherwise the first. Top views and cameras without a role are the others, in their order.
  * @param {Camera[]} cameras
  * @returns {Roles}
  */
 export function rolesOf(cameras) {
   const level = cameras.filter((camera) => camera.pose && !isTopView(camera));
   const front = nearest(level, 0, AHEAD_DEG) ?? level.find((camera) => Math.abs(yawOf(camera)) < 90) ?? cameras[0] ?? null;
-  const rear = nearest(level.filter((camera) => camera !== front && looksBack(camera)), 180, 180);
+  const rear = nearest(level.filter((camera) => camera !== front && looksBackwards(camera)), 180, 180);
   const ahead = front?.pose ? yawOf(front) : 0;
-  const beside = (sign) => {
+  const neighbour = (sign) => {
     const turned = (camera) => sign * (yawOf(camera) - ahead);
-    const found = level.filter((camera) => camera !== front && !looksBack(camera) && turned(camera) > 0);
+    const found = level.filter((camera) => camera !== front && !looksBackwards(camera) && turned(camera) > 0);
     return front?.pose ? (found.sort((a, b) => turned(a) - turned(b))[0] ?? null) : null;
   };
-  const [left, right] = [beside(1), beside(-1)];
+  const [left, right] = [neighbour(1), neighbour(-1)];
   return { front, left, right, rear, others: cameras.filter((camera) => ![front, left, right, rear].includes(camera)) };
 }
 
@@ -62,9 +62,9 @@ function nearest(cameras, yaw, within) {
 
 /**
  * The box of each picture, of the band above them, and of the mirror in its middle (of no width without one). No two boxes
- * of pictures overlap. A bird's-eye view takes the place of the top views, except of the main one.
+ * of pictures overlap. A bird's-eye view replaces the top views, except the main one.
  * @param {Camera[]} cameras  @param {number} width  @param {number} height of the area
- * @param {string|null} main camera that has changed places with the front camera
+ * @param {string|null} main camera that is swapped with the front camera
  * @param {{width: number, height: number}|null} birdseye its size, in any unit; null: none
  * @returns {{band: Box, mirror: Box, pictures: Map<string, Framed>}} pictures of cameras, and BIRDSEYE
  */
@@ -73,15 +73,15 @@ export function arrange(cameras, width, height, main = null, birdseye = null) {
   const area = (found) => (roles.front ? found.pictures.get(roles.front.name).width : 0);
   const found = [withStrip(roles, width, height), ...(roles.left || roles.right || !roles.others.length ? [] : [withColumn(roles, width, height)])];
   const best = found.sort((a, b) => area(b) - area(a))[0];
-  exchange(best.pictures, roles.front?.name, main);
+  swap(best.pictures, roles.front?.name, main);
   return best;
 }
 
 /** @returns {Camera} */
 const asCamera = (birdseye) => ({ ...birdseye, name: BIRDSEYE, pose: null, framing: null });
 
-/** Let two cameras change places; both are whole there. */
-function exchange(pictures, front, main) {
+/** Swap two cameras; both are shown whole. */
+function swap(pictures, front, main) {
   const [a, b] = [pictures.get(front), pictures.get(main)];
   if (!a || !b || a === b) return;
   const whole = (box, { mirrored }) => ({ ...box, view: { fit: "contain", align: 0.5, mirrored } });
@@ -93,13 +93,13 @@ function withStrip(roles, width, height) {
   const { front, left, right, others } = roles;
   const sides = [left, right].filter((side) => side !== null).length;
   const room = roomAbove(roles);
-  const strip = others.length ? STRIP : { least: 0, usual: 0 };
+  const strip = others.length ? STRIP : { min: 0, usual: 0 };
   const gaps = GAP * (others.length ? 2 : 1);
-  const wide = front ? frontWidth(aspectOf(front), width, height, sides, room.least + strip.least, room.usual + strip.usual, gaps) : 0;
+  const wide = front ? frontWidth(aspectOf(front), width, height, sides, room.min + strip.min, room.usual + strip.usual, gaps) : 0;
   const high = front ? Math.floor(wide / aspectOf(front)) : 0;
   const rest = height - high - gaps;
   const row = others.length ? rowHeight(others, width, height, rest, room) : 0;
-  const band = bandOf(roles, width, Math.floor(Math.min(rest - row, room.most * height)));
+  const band = bandOf(roles, width, Math.floor(Math.min(rest - row, room.max * height)));
   const middle = { y: band.band.height + GAP, height: height - band.band.height - row - gaps };
   const side = sides ? Math.floor((width - wide) / sides) - GAP : 0;
   const at = left ? side + GAP : sides ? 0 : Math.floor((width - wide) / 2);
@@ -118,23 +118,23 @@ function withStrip(roles, width, height) {
 }
 
 /**
- * The front camera's width: its share of the area first, then as large as the height allows within what the sides give.
- * In a narrow area, beside the open drawer, the sides need their part more.
+ * The front camera's width: at least its share of the area, beyond that what the height allows and the sides leave. In a
+ * narrow area, next to the open drawer, the sides have priority.
  */
-function frontWidth(aspect, width, height, sides, least, usual, gaps) {
+function frontWidth(aspect, width, height, sides, min, usual, gaps) {
   const share = Math.sqrt(FRONT * width * height * aspect);
   const roomy = (height * (1 - usual) - gaps) * aspect;
-  const low = sides ? width * (1 - sides * SIDE.most) : 0;
+  const low = sides ? width * (1 - sides * SIDE.max) : 0;
   const high = width * (1 - sides * SIDE.usual);
-  const wish = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
-  return Math.floor(Math.min(wish, (height * (1 - least) - gaps) * aspect, width * (1 - sides * SIDE.least)));
+  const wanted = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
+  return Math.floor(Math.min(wanted, (height * (1 - min) - gaps) * aspect, width * (1 - sides * SIDE.min)));
 }
 
-/** Height of the row below: what the width allows, and more than half of the rest, of which the band needs its part. */
+/** Height of the row below: limited by the width, and about half of the rest, which it shares with the band. */
 function rowHeight(others, width, height, rest, room) {
   const widest = (width - GAP * (others.length - 1)) / sum(others.map(aspectOf));
-  const wish = Math.max(rest * 0.55, rest - room.most * height);
-  return Math.floor(Math.min(widest, wish, rest - room.least * height));
+  const wanted = Math.max(rest * 0.55, rest - room.max * height);
+  return Math.floor(Math.min(widest, wanted, rest - room.min * height));
 }
 
 /** Without neighbours: the others in a column at the right, which leaves a wide screen's height to the front camera. */
@@ -143,7 +143,7 @@ function withColumn(roles, width, height) {
   const room = roomAbove(roles);
   const wide = Math.floor(Math.min(width * (1 - COLUMN) - GAP, (height * (1 - room.usual) - GAP) * aspectOf(front)));
   const high = Math.floor(wide / aspectOf(front));
-  const band = bandOf(roles, width, Math.floor(Math.min(height - high - GAP, room.most * height)));
+  const band = bandOf(roles, width, Math.floor(Math.min(height - high - GAP, room.max * height)));
   const y = band.band.height + GAP;
   const available = height - y - GAP * (others.length - 1);
   const column = Math.min(width - wide - GAP, available / sum(others.map((camera) => 1 / aspectOf(camera))));
@@ -172,10 +172,10 @@ const aspectOf = ({ width, height }) => width / height;
 const sum = (values) => values.reduce((a, b) => a + b, 0);
 
 /**
- * @param {Camera} camera  @param {"fit"|"fill"} usual unless the camera states it  @param {number} align of what is cropped
+ * @param {Camera} camera  @param {"fit"|"fill"} usual unless the camera states it  @param {number} align where it is cropped
  * @returns {View}
  */
 export function viewOf(camera, usual = "fit", align = 0.5) {
   const fills = (camera.framing ?? usual) === "fill";
-  return { fit: fills ? "cover" : "contain", align: fills ? align : 0.5, mirrored: looksBack(camera) };
+  return { fit: fills ? "cover" : "contain", align: fills ? align : 0.5, mirrored: looksBackwards(camera) };
 }

@@ -1,39 +1,39 @@
 /** Whether the operator can see this page, it draws enough pictures, and its keys reach it. Pure; ms. */
 
-const NOTICED_MS = 500; // a shorter absence, as of a dialog of the browser, is not worth a word
+const REPORTED_MS = 500; // a shorter absence, such as for a browser dialog, is not reported
 
 /** Absences of the operator, from the events of page and window. */
 export class Attention {
   hidden = false;
   focused = true;
-  elsewhere = false; // whether keys reach another window of this page
+  elsewhere = false; // whether another window of this page has the keyboard focus
   /** @type {number|null} since when the page is hidden or out of focus */
-  since = null;
-  saw = true; // whether the page was visible all that time
+  away_since = null;
+  was_visible = true; // whether the page was visible all that time
   slow = false; // whether too few pictures are drawn
 
   /**
-   * The page is hidden or not, in focus or not, as one of its other windows is or not, and draws too few pictures or not.
+   * Update the state: the page is hidden, focused, has its focus in another window (elsewhere), or draws too few pictures.
    * @param {{hidden: boolean, focused: boolean, elsewhere?: boolean, slow?: boolean}} page
    * @param {number} now
-   * @returns {string|null} what to tell an operator who has just returned
+   * @returns {string|null} message for an operator who has just returned
    */
-  changed({ hidden, focused, elsewhere = false, slow = false }, now) {
+  update({ hidden, focused, elsewhere = false, slow = false }, now) {
     Object.assign(this, { hidden, focused, elsewhere, slow });
     if (hidden || !(focused || elsewhere)) {
-      if (this.since === null) Object.assign(this, { since: now, saw: true });
-      this.saw &&= !hidden;
+      if (this.away_since === null) Object.assign(this, { away_since: now, was_visible: true });
+      this.was_visible &&= !hidden;
       return null;
     }
-    const away = this.since === null ? 0 : now - this.since;
-    this.since = null;
-    if (away < NOTICED_MS) return null;
+    const away = this.away_since === null ? 0 : now - this.away_since;
+    this.away_since = null;
+    if (away < REPORTED_MS) return null;
     const seconds = `${Math.max(1, Math.round(away / 1000))} s`;
-    return this.saw ? `No key reached this page for ${seconds}` : `This page was hidden for ${seconds}: look at every picture`;
+    return this.was_visible ? `No key reached this page for ${seconds}` : `This page was hidden for ${seconds}: check every picture`;
   }
 
   /**
-   * In one word, as the vehicle is told it.
+   * The state as reported to the vehicle.
    * @returns {"watching"|"unfocused"|"slow"|"hidden"}
    */
   get state() {
@@ -42,7 +42,7 @@ export class Attention {
     return this.focused ? "watching" : "unfocused";
   }
 
-  /** What to tell an operator who may still see the page; null: all is well. */
+  /** Warning for an operator who may still see the page; null: none. */
   get warning() {
     if (this.state === "slow") return "SLOW: this page draws fewer than 10 pictures a second";
     return this.state === "unfocused" && !this.elsewhere ? "OUT OF FOCUS: keys do not reach this page; click it" : null;

@@ -3,15 +3,15 @@
 import { enlarge, listen, publish, store } from "./store.js";
 import { BIRDSEYE, isTopView } from "./arrange.js";
 import { groundOf } from "./ground.js";
-import { giveGround, showGround } from "./link.js";
-import { STANDING } from "./status.js";
-import { by, mark, spoken, write } from "./format.js";
+import { showGround, transferGround } from "./link.js";
+import { STALLED } from "./status.js";
+import { byId, displayName, setAttribute, setText } from "./format.js";
 
 const CHOICE = "tod-birdseye";
 
 const cameras = () => (globalThis.boot.canShowVideo && store.hello?.dimensions ? store.hello.cameras.filter(isTopView) : []);
 
-/** Without a choice only what was measured is shown. */
+/** By default it is shown only if all its cameras are calibrated. */
 function isChosen() {
   const choice = localStorage.getItem(CHOICE);
   return choice === null ? cameras().every(({ calibrated }) => calibrated) : choice === "on";
@@ -28,8 +28,8 @@ function choose(choice) {
   publish("birdseye");
 }
 
-/** In the row below the front camera, then large in its place, then off. */
-export function changeBirdseye() {
+/** Cycle: in the row below the front camera, large in its place, off. */
+export function cycleBirdseye() {
   if (store.view !== "drive" || !cameras().length) return;
   if (!isChosen()) return choose("on");
   if (store.enlarged !== BIRDSEYE) return enlarge(BIRDSEYE);
@@ -37,26 +37,26 @@ export function changeBirdseye() {
   choose("off");
 }
 
-/** Show it in a box of the Drive view, or not. @param {import("./arrange.js").Box|undefined} box */
+/** Show it in a box of the Drive view, or hide it. @param {import("./arrange.js").Box|undefined} box */
 export function placeBirdseye(box) {
-  const element = by("birdseye");
+  const element = byId("birdseye");
   element.hidden = !box;
   if (box) Object.assign(element.style, Object.fromEntries([["left", box.x], ["top", box.y], ["width", box.width], ["height", box.height]].map(([key, px]) => [key, `${px}px`])));
   showGround(Boolean(box), element);
-  mark(by("to-birdseye"), "aria-pressed", Boolean(box));
+  setAttribute(byId("to-birdseye"), "aria-pressed", Boolean(box));
 }
 
-/** Said here, too, since the worker may hang. */
+/** Also shown here, since the worker may hang. */
 function refreshState() {
-  const standing = cameras().map(({ name }) => name).filter((name) => STANDING.includes(store.status[name]));
-  mark(by("birdseye"), "data-standing", standing.length ? "" : null);
-  write(by("birdseye-state"), standing.length ? `✕ not live: ${standing.map(spoken).join(", ")}` : "");
+  const stalled = cameras().map(({ name }) => name).filter((name) => STALLED.includes(store.status[name]));
+  setAttribute(byId("birdseye"), "data-standing", stalled.length ? "" : null);
+  setText(byId("birdseye-state"), stalled.length ? `✕ not live: ${stalled.map(displayName).join(", ")}` : "");
 }
 
 export function startBirdseye() {
-  giveGround(by("birdseye-picture"), by("birdseye-lines"));
-  by("to-birdseye").addEventListener("click", changeBirdseye);
-  by("birdseye").addEventListener("dblclick", () => enlarge(store.enlarged === BIRDSEYE ? null : BIRDSEYE));
-  listen("hello", () => (by("to-birdseye").hidden = !cameras().length));
+  transferGround(byId("birdseye-picture"), byId("birdseye-lines"));
+  byId("to-birdseye").addEventListener("click", cycleBirdseye);
+  byId("birdseye").addEventListener("dblclick", () => enlarge(store.enlarged === BIRDSEYE ? null : BIRDSEYE));
+  listen("hello", () => (byId("to-birdseye").hidden = !cameras().length));
   listen("hello status", refreshState);
 }

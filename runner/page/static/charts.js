@@ -3,19 +3,19 @@
 import { factorTicks, timeAxis } from "./axes.js";
 import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
-import { by, factor, make, spoken } from "./format.js";
+import { byId, displayName, factor, make } from "./format.js";
 
 const SETTLE_MS = 1500; // from the first picture to loading the charts
-const AT_LATEST_MS = 4000; // without any picture
+const AT_LATEST_MS = 4000; // if no picture is live by then
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
 
 const visible = new Set();
-let loading = false;
+let isLoading = false;
 
 // --- traces -----------------------------------------------------------------------------------------------------------
 
-const ages = () => {
+const relativeTimes = () => {
   const { time } = store.series;
   const now = time.at(-1) ?? 0;
   return time.map((each) => each - now);
@@ -26,7 +26,7 @@ const line = (x, y, name, colour, more = {}) =>
 
 function totals() {
   const { predicted_kbps, allocated_kbps, actual_kbps } = store.series;
-  const x = ages();
+  const x = relativeTimes();
   return [
     line(x, predicted_kbps, "predicted", themed("predicted"), { dash: "dash", shape: "hv" }),
     line(x, allocated_kbps, "allocated", themed("allocated"), { shape: "hv" }),
@@ -35,16 +35,16 @@ function totals() {
 }
 
 function cameras() {
-  const x = ages();
+  const x = relativeTimes();
   return perCamera((name, columns, colour, width) => [
-    line(x, columns.allocated_kbps, `${spoken(name)} allocated`, colour, { dash: "dot", width: width * 0.7, shape: "hv" }),
-    line(x, columns.kbps, spoken(name), colour, { width }),
+    line(x, columns.allocated_kbps, `${displayName(name)} allocated`, colour, { dash: "dot", width: width * 0.7, shape: "hv" }),
+    line(x, columns.kbps, displayName(name), colour, { width }),
   ]);
 }
 
 function factors() {
-  const x = ages();
-  return perCamera((name, { scaling }, colour, width) => [line(x, scaling, spoken(name), colour, { shape: "hv", width })]);
+  const x = relativeTimes();
+  return perCamera((name, { scaling }, colour, width) => [line(x, scaling, displayName(name), colour, { shape: "hv", width })]);
 }
 
 /** Traces of all cameras, the selected one last and thicker. */
@@ -97,9 +97,9 @@ function base(x, y, more = {}) {
   };
 }
 
-const time = () => axis("seconds before now", { ...timeAxis(-(ages()[0] ?? 0)), tickangle: 0 });
+const time = () => axis("seconds before now", { ...timeAxis(-(relativeTimes()[0] ?? 0)), tickangle: 0 });
 
-/** Ticks at the factors that the cameras have; others, as mode S allows, lie between them. */
+/** Ticks at the cameras' factors; mode S also allows values in between. */
 function factorAxis() {
   const ticks = factorTicks(store.hello?.cameras ?? []);
   return axis("factor", { rangemode: "tozero", tickvals: ticks, ticktext: ticks.map(factor) });
@@ -121,57 +121,57 @@ const charts = [
 ];
 const config = { displaylogo: false, displayModeBar: false, responsive: false, doubleClick: false };
 
-// --- when they draw ---------------------------------------------------------------------------------------------------
+// --- drawing ----------------------------------------------------------------------------------------------------------
 
 function draw(chart) {
-  const element = by(chart.id);
+  const element = byId(chart.id);
   if (!globalThis.Plotly || !visible.has(chart.id) || document.hidden || !element.clientHeight) return;
   const size = { width: element.clientWidth, height: element.clientHeight, autosize: false };
   Plotly.react(element, chart.traces(), { ...chart.layout(), ...size }, config);
-  document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true"); // where Plotly measures text
+  document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true"); // Plotly measures text in it
 }
 
 function drawAll() {
   for (const [i, chart] of charts.entries()) setTimeout(draw, i * BETWEEN_MS, chart);
 }
 
-function load() {
-  if (loading) return;
-  loading = true;
+function loadPlotly() {
+  if (isLoading) return;
+  isLoading = true;
   const script = make("script", { src: "/plotly.js" });
   script.addEventListener("load", () => {
     drawAll();
     setInterval(drawAll, 1000);
   });
-  script.addEventListener("error", () => charts.forEach(({ id }) => by(id).replaceChildren("charts are not available: /plotly.js is missing")));
+  script.addEventListener("error", () => charts.forEach(({ id }) => byId(id).replaceChildren("charts are not available: /plotly.js failed to load")));
   document.head.append(script);
 }
 
 function showLegend() {
   const entries = (store.hello?.cameras ?? []).map(({ name }, i) => {
     const swatch = make("span", { class: "swatch", style: `background:${colourOf(i)}` });
-    return make("span", {}, swatch, spoken(name));
+    return make("span", {}, swatch, displayName(name));
   });
-  by("legend").replaceChildren(...entries);
+  byId("legend").replaceChildren(...entries);
 }
 
 export function startCharts() {
-  const watcher = new IntersectionObserver((entries) => {
+  const observer = new IntersectionObserver((entries) => {
     for (const { target, isIntersecting } of entries) {
       if (isIntersecting) visible.add(target.id);
       else visible.delete(target.id);
       if (isIntersecting) draw(charts.find(({ id }) => id === target.id));
     }
   });
-  for (const { id } of charts) watcher.observe(by(id));
-  let first = false;
+  for (const { id } of charts) observer.observe(byId(id));
+  let isLive = false;
   listen("status", ({ status }) => {
-    if (first || status !== "live") return;
-    first = true;
-    setTimeout(load, SETTLE_MS);
+    if (isLive || status !== "live") return;
+    isLive = true;
+    setTimeout(loadPlotly, SETTLE_MS);
   });
-  setTimeout(load, AT_LATEST_MS);
+  setTimeout(loadPlotly, AT_LATEST_MS);
   listen("hello theme", showLegend);
   listen("theme selected", drawAll);
-  new ResizeObserver(drawAll).observe(by("side"));
+  new ResizeObserver(drawAll).observe(byId("side"));
 }

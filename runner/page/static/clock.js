@@ -13,23 +13,23 @@ export const now = () => performance.timeOrigin + performance.now();
 export class Clock {
   echoes = [];
   offset = 0;
-  bound = Infinity; // by how much the offset may be wrong, ms
+  bound = Infinity; // error bound of the offset, ms
 
-  /** @param {number} sent when the page asked (page clock)  @param {number} server the station's clock */
-  heard(sent, server) {
+  /** @param {number} sent when the page sent the request (page clock)  @param {number} server the station's clock */
+  onEcho(sent, server) {
     const received = now();
     const echo = { delay: received - sent, offset: server - (sent + received) / 2 };
     this.echoes.push(echo);
     if (this.echoes.length > KEPT) this.echoes.shift();
-    // An older echo that the newest one contradicts is from before a clock was set.
+    // An older echo that the newest one contradicts predates a clock change.
     const agreeing = this.echoes.filter((e) => Math.abs(e.offset - echo.offset) <= (e.delay + echo.delay) / 2 + DRIFT_MS);
     const best = agreeing.reduce((a, b) => (b.delay < a.delay ? b : a));
     this.offset = Math.min(Math.max(this.offset, best.offset - best.delay / 2), best.offset + best.delay / 2);
     this.bound = best.delay / 2 + Math.abs(this.offset - best.offset);
   }
 
-  /** A page time converted to the station's clock. */
-  server(page) {
-    return page + this.offset;
+  /** Convert a page time to the station's clock. */
+  toStation(pageTime) {
+    return pageTime + this.offset;
   }
 }

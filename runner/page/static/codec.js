@@ -9,10 +9,10 @@ export const nameOf = (codec) => NAMES[codec] ?? "video that is neither H.264 no
 export const isKnown = (codec) => codec in NAMES;
 
 /**
- * The sequence parameter set of a key unit, without its header; if it differs, so does the stream: a new decoder is needed.
+ * The sequence parameter set of a key unit, without its header. If it changes, a new decoder is needed.
  * @param {Uint8Array} unit one access unit, Annex B
  * @param {"h264"|"h265"} codec
- * @returns {Uint8Array|null} null if the unit holds none
+ * @returns {Uint8Array|null} null if the unit contains none
  */
 export function spsOf(unit, codec) {
   const starts = [];
@@ -32,7 +32,7 @@ const avc1 = (sps) => `avc1.${[...sps.subarray(0, 3)].map(hex).join("")}`;
 
 /**
  * "hev1.PROFILE.COMPATIBILITY.LEVEL.CONSTRAINTS" (ISO/IEC 14496-15, annex E) from profile_tier_level, which follows the
- * first byte of the parameter set (ITU-T H.265, 7.3.2.2.1 and 7.3.3). Parameter sets are in the stream: not "hvc1".
+ * first byte of the parameter set (ITU-T H.265, 7.3.2.2.1 and 7.3.3). Not "hvc1", since parameter sets are in-band.
  */
 function hev1(sps) {
   const bytes = withoutEmulation(sps.subarray(0, 24));

@@ -1,4 +1,4 @@
-/** One colour per camera, the same in every tile and chart; chosen so that colour-blind users tell them apart as well. */
+/** One colour per camera, the same in every tile and chart; chosen so that colour-blind users can tell them apart as well. */
 
 const NIGHT = ["#56b4e9", "#ecac00", "#53f3c5", "#fff269", "#b46b99", "#ff7847", "#828af9", "#c4def9"];
 const DAY = ["#0b6fae", "#6c2c00", "#10372c", "#8d744d", "#45154f", "#c24100", "#6106af", "#676d7f"];

@@ -1,5 +1,5 @@
 /**
- * A clock as a row of black and white cells, which a screen shows and a camera films, and its reading from the picture.
+ * A clock as a row of black and white cells, for a camera to film from a screen, and its decoding from the picture.
  * Only the low 18 bits of the time in ms are shown: it repeats after about four minutes. Pure.
  */
 
@@ -9,11 +9,11 @@ export const TAIL = [1, 0, 1, 1];
 const BITS = 18;
 const CHECK_BITS = 16;
 export const CELLS = HEAD.length + BITS + CHECK_BITS + TAIL.length;
-const ROWS = 48; // of a picture that are read
-const LEAST_CONTRAST = 40; // between the darkest and the brightest pixel of a row, of 255
-const LEAST_CELL_PX = 2.5;
-const HEAD_TOLERANCE = 0.25; // by which the first cells may be wider or narrower than the average
-const MOST_EDGES = 200; // in a row; one with more shows something else
+const ROWS = 48; // rows of a picture that are tried
+const MIN_CONTRAST = 40; // between the darkest and the brightest pixel of a row, of 255
+const MIN_CELL_PX = 2.5;
+const HEAD_TOLERANCE = 0.25; // relative deviation of the first cells' width from the average
+const MAX_EDGES = 200; // in a row; with more it shows something else
 
 /** The cells of a time: head, bits from the highest one, their checksum, tail. */
 export function cellsOf(ms) {
@@ -25,7 +25,7 @@ export function cellsOf(ms) {
 export const elapsed = (counter, ms) => (((ms - counter) % CYCLE_MS) + CYCLE_MS) % CYCLE_MS;
 
 /**
- * The counter that a picture shows, in ms within its cycle; null: none that can be read.
+ * The counter in a picture, in ms within its cycle; null: none is readable.
  * @param {Uint8Array} luma from the first row on
  */
 export function read(luma, width, height, stride) {
@@ -39,17 +39,17 @@ export function read(luma, width, height, stride) {
 }
 
 function readRow(row) {
-  const [least, most] = row.reduce(([low, high], y) => [Math.min(low, y), Math.max(high, y)], [255, 0]);
-  if (most - least < LEAST_CONTRAST) return null;
-  const middle = (least + most) / 2;
+  const [darkest, brightest] = row.reduce(([low, high], y) => [Math.min(low, y), Math.max(high, y)], [255, 0]);
+  if (brightest - darkest < MIN_CONTRAST) return null;
+  const middle = (darkest + brightest) / 2;
   const edges = edgesOf(row, middle);
-  if (edges.length > MOST_EDGES) return null;
+  if (edges.length > MAX_EDGES) return null;
   for (let i = 0; i + 1 < edges.length; i++) {
     if (!edges[i].black) continue;
     const first = edges[i + 1].x - edges[i].x; // two black cells
     for (let j = edges.length - 1; j > i; j--) {
       const cell = (edges[j].x - edges[i].x) / CELLS;
-      if (cell < LEAST_CELL_PX) break;
+      if (cell < MIN_CELL_PX) break;
       if (edges[j].black || Math.abs(first / 2 - cell) > HEAD_TOLERANCE * cell) continue;
       const found = readCells(row, middle, edges[i].x, cell);
       if (found !== null) return found;
@@ -58,7 +58,7 @@ function readRow(row) {
   return null;
 }
 
-/** Where a row turns black or white, between two pixels. */
+/** The edges between black and white in a row, at subpixel positions. */
 function edgesOf(row, middle) {
   const edges = [];
   for (let x = 1; x < row.length; x++) {

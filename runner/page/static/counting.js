@@ -1,4 +1,4 @@
-/** The page that shows the counter: drawn anew for each picture of the screen. */
+/** The page that shows the counter, redrawn in every frame of the display. */
 
 import { CELLS, CYCLE_MS, cellsOf } from "./counter.js";
 import { now } from "./clock.js";

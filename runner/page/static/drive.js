@@ -7,77 +7,77 @@ import { isGuided, nextChoice } from "./guides.js";
 import { toggleControl } from "./header.js";
 import { send, showGuides } from "./link.js";
 import { SHAPES } from "./tiles.js";
-import { whyLess } from "./total.js";
-import { by, latency, mark, spoken, whole, write } from "./format.js";
+import { limitReasons } from "./total.js";
+import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
 const ALARMS = ["lost", "frozen", "unsupported", "damaged", "late"]; // the worst first
 const WORDS = { unsupported: "NO PICTURE" };
-const STANDING = ["lost", "frozen", "unsupported"];
+const STALLED = ["lost", "frozen", "unsupported"];
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
-const SETTLED_MS = 2500; // by then what a hidden page did not draw counts no longer
+const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
 
 const attention = new Attention();
-let focused = document.hasFocus();
-let shown = -Infinity; // when the page was last hidden
-let told = ""; // what the station knows of it
+let isFocused = document.hasFocus();
+let hiddenAt = -Infinity; // when the page was last hidden
+let reported = ""; // attention last reported to the station
 const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
-const current = () => store.connected && store.state?.online;
+const isOnline = () => store.connected && store.state?.online;
 
 function refresh() {
   if (store.view !== "drive") return;
   refreshLatency();
   refreshSpeed();
-  write(by("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
+  setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
   refreshAlarms();
   refreshControl();
 }
 
-/** The worst latency of all pictures. A picture that stands still has none, and is worse than any. */
+/** The worst latency of all pictures. A stalled picture has none, and is worse than any. */
 function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf(store.ages, store.status, store.hello?.late_ms ?? 0);
-  const standing = names().filter((name) => STANDING.includes(store.status[name]));
-  const from = camera === null ? "no picture moves" : `${level === "unknown" ? "unknown" : "worst"}: ${spoken(camera)}`;
-  mark(by("latency"), "data-level", standing.length ? "late" : level);
-  write(by("worst"), latency(age_ms, bound_ms));
-  write(by("worst-of"), standing.length ? `${standing.length} of ${names().length} pictures stand still` : from);
+  const stalled = names().filter((name) => STALLED.includes(store.status[name]));
+  const from = camera === null ? "no moving picture" : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
+  setAttribute(byId("latency"), "data-level", stalled.length ? "late" : level);
+  setText(byId("worst"), latency(age_ms, bound_ms));
+  setText(byId("worst-of"), stalled.length ? `${stalled.length} of ${names().length} pictures not live` : from);
 }
 
 function refreshSpeed() {
-  const speed_mps = current() ? store.sample?.position?.speed_mps : undefined;
-  const factor = current() ? store.sample?.speed_factor : undefined;
-  write(by("driven"), `${whole(KMH * (speed_mps ?? NaN))} km/h`);
-  write(by("advised"), Number.isFinite(factor) ? `advised: ${whole(100 * (factor ?? 0))} % of full speed` : "no speed advised");
-  mark(by("speed-now"), "data-level", factor === 0 ? "late" : Number.isFinite(factor) && (factor ?? 1) < 1 ? "near" : "fine");
+  const speed_mps = isOnline() ? store.sample?.position?.speed_mps : undefined;
+  const factor = isOnline() ? store.sample?.speed_factor : undefined;
+  setText(byId("driven"), `${whole(KMH * (speed_mps ?? NaN))} km/h`);
+  setText(byId("advised"), Number.isFinite(factor) ? `advised: ${whole(100 * (factor ?? 0))} % of full speed` : "no speed advised");
+  setAttribute(byId("speed-now"), "data-level", factor === 0 ? "late" : Number.isFinite(factor) && (factor ?? 1) < 1 ? "near" : "fine");
 }
 
 function totalWords() {
-  const { total_kbps, asked_kbps } = (current() ? store.state : null) ?? {};
-  const less = total_kbps !== undefined && Number.isFinite(asked_kbps) && total_kbps < (asked_kbps ?? 0);
-  return `${whole(total_kbps)}${less ? ` of ${whole(asked_kbps)}` : ""} kbit/s`;
+  const { total_kbps, asked_kbps } = (isOnline() ? store.state : null) ?? {};
+  const isLimited = total_kbps !== undefined && Number.isFinite(asked_kbps) && total_kbps < (asked_kbps ?? 0);
+  return `${whole(total_kbps)}${isLimited ? ` of ${whole(asked_kbps)}` : ""} kbit/s`;
 }
 
-/** Whether the vehicle is reached, and by what its total is limited, if it is. */
+/** The state of the connection, or what limits the total. */
 function linkWords() {
   if (!store.connected) return "no station";
   if (!store.state) return "no state yet";
   if (!store.state.online) return "vehicle offline";
-  const reason = whyLess().at(-1);
+  const reason = limitReasons().at(-1);
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
 
-/** By word, which pictures are not as they should be: FROZEN front left, rear. */
+/** The pictures that are not live, by status: FROZEN front left, rear. */
 function refreshAlarms() {
   const found = ALARMS.map((status) => ({ status, cameras: names().filter((name) => store.status[name] === status) })).filter(({ cameras }) => cameras.length);
-  const words = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(spoken).join(", ")}`);
-  write(by("alarms"), words.join("  "));
-  mark(by("alarms"), "data-level", found.some(({ status }) => STANDING.includes(status)) ? "late" : "near");
+  const words = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(displayName).join(", ")}`);
+  setText(byId("alarms"), words.join("  "));
+  setAttribute(byId("alarms"), "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
 }
 
 function refreshControl() {
-  const button = by("drive-control", HTMLButtonElement);
-  write(button, store.holder === "you" ? "Release" : "Take control");
+  const button = byId("drive-control", HTMLButtonElement);
+  setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
 }
@@ -85,60 +85,60 @@ function refreshControl() {
 // --- lines on the ground ----------------------------------------------------------------------------------------------
 
 /** @returns {import("./guides.js").Choice} */
-const chosen = () => /** @type {any} */ (localStorage.getItem(GUIDES)) ?? "calibrated";
+const guidesChoice = () => /** @type {any} */ (localStorage.getItem(GUIDES)) ?? "calibrated";
 const placedCameras = () => (store.hello?.dimensions ? store.hello.cameras.filter(({ pose }) => pose) : []);
 
 export function toggleGuides() {
-  localStorage.setItem(GUIDES, nextChoice(placedCameras(), chosen()));
+  localStorage.setItem(GUIDES, nextChoice(placedCameras(), guidesChoice()));
   refreshGuides();
 }
 
 function refreshGuides() {
   const cameras = placedCameras();
-  const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, chosen())).map(({ name }) => name) : [];
+  const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, guidesChoice())).map(({ name }) => name) : [];
   for (const canvas of document.querySelectorAll("canvas.guides")) canvas.toggleAttribute("hidden", !guided.includes(canvas.getAttribute("data-guides") ?? ""));
   showGuides(guided);
-  by("guides").hidden = !cameras.length;
-  const some = chosen() === "calibrated" && guided.length < cameras.length;
-  write(by("guides"), guided.length ? `Guides on${some ? ` (${guided.length})` : ""}` : "Guides off");
+  byId("guides").hidden = !cameras.length;
+  const isPartial = guidesChoice() === "calibrated" && guided.length < cameras.length;
+  setText(byId("guides"), guided.length ? `Guides on${isPartial ? ` (${guided.length})` : ""}` : "Guides off");
 }
 
-// --- the driver looks elsewhere ---------------------------------------------------------------------------------------
+// --- the driver's attention -------------------------------------------------------------------------------------------
 
-function look() {
-  if (document.hidden) shown = performance.now();
-  const slow = store.slow && performance.now() - shown > SETTLED_MS;
-  const words = attention.changed({ hidden: document.hidden, focused, elsewhere: store.elsewhere, slow }, performance.now());
+function updateAttention() {
+  if (document.hidden) hiddenAt = performance.now();
+  const slow = store.slow && performance.now() - hiddenAt > SETTLED_MS;
+  const message = attention.update({ hidden: document.hidden, focused: isFocused, elsewhere: store.elsewhere, slow }, performance.now());
   const warning = inControl() ? attention.warning : null;
-  by("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
-  write(by("attention"), warning ?? "");
-  tellAttention();
-  if (words && inControl() && store.view !== "configure") publish("toast", { text: words, level: "problem" });
+  byId("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
+  setText(byId("attention"), warning ?? "");
+  reportAttention();
+  if (message && inControl() && store.view !== "configure") publish("toast", { text: message, level: "problem" });
 }
 
-/** Tell the station, which tells the vehicle while this page is in control. */
-function tellAttention() {
-  if (!store.connected || told === attention.state) return;
-  told = attention.state;
-  send({ attention: told });
+/** Report attention to the station, which passes it to the vehicle while this page is in control. */
+function reportAttention() {
+  if (!store.connected || reported === attention.state) return;
+  reported = attention.state;
+  send({ attention: reported });
 }
 
 export function startDrive() {
-  by("drive-control").addEventListener("click", toggleControl);
-  by("guides").addEventListener("click", toggleGuides);
-  by("drive-help").addEventListener("click", () => publish("help"));
+  byId("drive-control").addEventListener("click", toggleControl);
+  byId("guides").addEventListener("click", toggleGuides);
+  byId("drive-help").addEventListener("click", () => publish("help"));
   addEventListener("blur", () => {
-    focused = false;
-    look();
+    isFocused = false;
+    updateAttention();
   });
   addEventListener("focus", () => {
-    focused = true;
-    look();
+    isFocused = true;
+    updateAttention();
   });
-  document.addEventListener("visibilitychange", look);
+  document.addEventListener("visibilitychange", updateAttention);
   listen("hello state sample ages status control socket requests view", refresh);
-  listen("socket", () => (told = ""));
-  listen("control socket view ages", look);
+  listen("socket", () => (reported = ""));
+  listen("control socket view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window
   refresh();

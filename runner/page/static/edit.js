@@ -3,22 +3,22 @@
 import { enlarge, inControl, listen, store } from "./store.js";
 import { completed, moved, resized, sizeOf } from "./editing.js";
 import { GAP } from "./layout.js";
-import { complain, pending, request, requests, whyNoControl } from "./requests.js";
+import { pending, request, requests, showProblem, whyNoControl } from "./requests.js";
 import { showDraft } from "./tiles.js";
-import { by, make, mark, spoken, write } from "./format.js";
+import { byId, displayName, make, setAttribute, setText } from "./format.js";
 
 const STEPS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
 
-/** @type {import("./editing.js").Draft|null} null: nothing is edited */
+/** @type {import("./editing.js").Draft|null} null: not editing */
 let draft = null;
 let isOwn = false; // whether the draft is the vehicle's own layout, unchanged
 /** @type {string|undefined} the request that saves it */
 let saving;
-const target = make("div", { class: "target", hidden: true }); // where a tile that is dragged would be
-const movers = new Map(); // by camera, what its tile is dragged by
+const target = make("div", { class: "target", hidden: true }); // where the dragged tile would go
+const movers = new Map(); // by camera, the handle that drags its tile
 
 /** Whether the layout is being edited. */
-export const isEdited = () => draft !== null;
+export const isEditing = () => draft !== null;
 
 const cameras = () => store.hello?.cameras ?? [];
 
@@ -26,13 +26,13 @@ const cameras = () => store.hello?.cameras ?? [];
 
 function begin() {
   const why = store.hello?.layout.problem ?? (inControl() ? null : whyNoControl());
-  if (why) return complain(why);
+  if (why) return showProblem(why);
   if (draft || !store.hello) return;
   if (store.enlarged) enlarge(null);
   document.body.dataset.editing = "";
-  by("layout-bar").hidden = false;
+  byId("layout-bar").hidden = false;
   for (const { name } of cameras()) addMover(name);
-  change(completed(cameras(), store.hello.layout.places), false);
+  setDraft(completed(cameras(), store.hello.layout.places), false);
   movers.get(store.selected ?? cameras()[0]?.name)?.focus();
 }
 
@@ -41,12 +41,12 @@ function end() {
   draft = null;
   saving = undefined;
   delete document.body.dataset.editing;
-  by("layout-bar").hidden = true;
+  byId("layout-bar").hidden = true;
   movers.forEach((mover) => mover.remove());
   movers.clear();
   target.remove();
   showDraft(null);
-  by("edit-layout").focus();
+  byId("edit-layout").focus();
 }
 
 function save() {
@@ -56,57 +56,57 @@ function save() {
 }
 
 function reset() {
-  if (store.hello) change(completed(cameras(), store.hello.layout.own), true);
+  if (store.hello) setDraft(completed(cameras(), store.hello.layout.own), true);
 }
 
-/** Once the layout is saved there is nothing more to edit; a refusal leaves it as it is. */
-function heard() {
-  const answer = requests.answered.find(({ id }) => id === saving);
-  if (answer?.result === "applied") return end();
-  if (answer) saving = undefined;
+/** Leave editing once the layout is saved; a refusal keeps the draft. */
+function onRequests() {
+  const answered = requests.answered.find(({ id }) => id === saving);
+  if (answered?.result === "applied") return end();
+  if (answered) saving = undefined;
   refresh();
 }
 
 function refresh() {
-  mark(by("layout-save"), "data-pending", pending("layout") ? "" : null);
+  setAttribute(byId("layout-save"), "data-pending", pending("layout") ? "" : null);
 }
 
 // --- the draft --------------------------------------------------------------------------------------------------------
 
-function change(now, own) {
+function setDraft(next, own) {
   const focused = [...movers.values()].find((mover) => mover === document.activeElement);
-  draft = now;
+  draft = next;
   isOwn = own;
-  showDraft(now);
-  area()?.append(target);
+  showDraft(next);
+  grid()?.append(target);
   for (const [name, mover] of movers) describe(name, mover);
-  focused?.focus({ preventScroll: true }); // moving its tile took the focus away
+  focused?.focus({ preventScroll: true }); // moving its tile drops the focus
 }
 
-/** The grid of the tiles. */
-const area = () => by("tiles").querySelector(".grid");
+/** The element with the tiles. */
+const grid = () => byId("tiles").querySelector(".grid");
 
-function words(name) {
+function placeText(name) {
   const { row, column, row_span, column_span } = place(name);
   return `row ${row + 1}, column ${column + 1}, ${row_span} high, ${column_span} wide`;
 }
 
 function describe(name, mover) {
-  mark(mover, "aria-label", `${spoken(name)}: ${words(name)}`);
-  write(mover.firstChild, words(name));
+  setAttribute(mover, "aria-label", `${displayName(name)}: ${placeText(name)}`);
+  setText(mover.firstChild, placeText(name));
 }
 
 /** @returns {import("./layout.js").Place} */
 const place = (name) => /** @type {any} */ (draft)[name];
 
 function move(name, row, column) {
-  change(moved(/** @type {any} */ (draft), name, row, column), false);
-  write(by("announcer"), `${spoken(name)}: ${words(name)}`);
+  setDraft(moved(/** @type {any} */ (draft), name, row, column), false);
+  setText(byId("announcer"), `${displayName(name)}: ${placeText(name)}`);
 }
 
 function resize(name, row_span, column_span) {
-  change(resized(/** @type {any} */ (draft), name, row_span, column_span), false);
-  write(by("announcer"), `${spoken(name)}: ${words(name)}`);
+  setDraft(resized(/** @type {any} */ (draft), name, row_span, column_span), false);
+  setText(byId("announcer"), `${displayName(name)}: ${placeText(name)}`);
 }
 
 // --- keys and pointer -------------------------------------------------------------------------------------------------
@@ -114,24 +114,24 @@ function resize(name, row_span, column_span) {
 function addMover(name) {
   const grip = make("span", { class: "grip", "aria-hidden": "true" });
   const mover = make("button", { class: "mover", "data-mover": name, "aria-describedby": "layout-help" }, make("span", { class: "where" }), grip);
-  mover.addEventListener("keydown", (event) => pressed(event, name));
+  mover.addEventListener("keydown", (event) => onKeyDown(event, name));
   mover.addEventListener("pointerdown", (event) => drag(event, name, mover, event.target === grip));
   document.querySelector(`.tile[data-camera="${name}"]`)?.append(mover);
   movers.set(name, mover);
 }
 
-function pressed(event, name) {
+function onKeyDown(event, name) {
   if (event.key === "Escape") return end();
   const step = STEPS[event.key];
   if (!step || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
-  event.stopPropagation(); // these keys select cameras elsewhere
+  event.stopPropagation(); // otherwise these keys select cameras
   const { row, column, row_span, column_span } = place(name);
   if (event.shiftKey) resize(name, row_span + step[0], column_span + step[1]);
   else move(name, row + step[0], column + step[1]);
 }
 
-/** Follow the pointer from a press to its release: `done` gets the place that it points at. */
+/** Follow the pointer from press to release, then move or resize the tile. */
 function drag(event, name, mover, isGrip) {
   if (event.button !== 0 || !draft) return;
   const own = place(name);
@@ -139,38 +139,38 @@ function drag(event, name, mover, isGrip) {
   const across = (box.width + GAP) / own.column_span; // from one column to the next
   const down = (box.height + GAP) / own.row_span;
   const { rows, columns } = sizeOf(draft);
-  const pointed = (at) => {
+  const placeAt = (at) => {
     const [x, y] = [(at.clientX - event.clientX) / across, (at.clientY - event.clientY) / down];
-    if (isGrip) return { ...own, row_span: between(own.row_span + y, 1, rows + 1 - own.row), column_span: between(own.column_span + x, 1, columns + 1 - own.column) };
-    return { ...own, row: between(own.row + y, 0, rows), column: between(own.column + x, 0, columns) };
+    if (isGrip) return { ...own, row_span: clamped(own.row_span + y, 1, rows + 1 - own.row), column_span: clamped(own.column_span + x, 1, columns + 1 - own.column) };
+    return { ...own, row: clamped(own.row + y, 0, rows), column: clamped(own.column + x, 0, columns) };
   };
-  const show = (at) => {
-    const { row, column, row_span, column_span } = pointed(at);
+  const onMove = (at) => {
+    const { row, column, row_span, column_span } = placeAt(at);
     target.hidden = false;
     target.style.gridArea = `${row + 1} / ${column + 1} / span ${row_span} / span ${column_span}`;
   };
-  const release = (at) => {
+  const onRelease = (at) => {
     for (const [kind, listener] of Object.entries(listeners)) mover.removeEventListener(kind, listener);
     target.hidden = true;
     if (at.type !== "pointerup" || !draft) return;
-    const { row, column, row_span, column_span } = pointed(at);
+    const { row, column, row_span, column_span } = placeAt(at);
     if (isGrip) resize(name, row_span, column_span);
     else move(name, row, column);
   };
-  const listeners = { pointermove: show, pointerup: release, pointercancel: release };
+  const listeners = { pointermove: onMove, pointerup: onRelease, pointercancel: onRelease };
   for (const [kind, listener] of Object.entries(listeners)) mover.addEventListener(kind, listener);
   mover.setPointerCapture(event.pointerId);
 }
 
-const between = (value, least, most) => Math.max(least, Math.min(most, Math.round(value)));
+const clamped = (value, least, most) => Math.max(least, Math.min(most, Math.round(value)));
 
 export function startEdit() {
-  by("edit-layout").addEventListener("click", begin);
-  by("layout-save").addEventListener("click", save);
-  by("layout-reset").addEventListener("click", reset);
-  by("layout-cancel").addEventListener("click", end);
-  by("layout-bar").addEventListener("keydown", ({ key }) => key === "Escape" && end());
-  listen("requests", heard);
+  byId("edit-layout").addEventListener("click", begin);
+  byId("layout-save").addEventListener("click", save);
+  byId("layout-reset").addEventListener("click", reset);
+  byId("layout-cancel").addEventListener("click", end);
+  byId("layout-bar").addEventListener("keydown", ({ key }) => key === "Escape" && end());
+  listen("requests", onRequests);
   listen("view", end);
   listen("hello", () => cameras().every(({ name }) => movers.get(name)?.isConnected) || end()); // of another vehicle
 }

@@ -2,8 +2,8 @@
 
 import { covered } from "./layout.js";
 
-export const MOST_SPAN = 12;
-const MOST = 40; // rows, and columns
+export const MAX_SPAN = 12;
+const MAX_INDEX = 40; // of rows and columns
 
 /** @typedef {import("./layout.js").Place} Place */
 /** @typedef {Record<string, Place>} Draft by camera */
@@ -26,37 +26,37 @@ export function completed(cameras, places) {
 }
 
 /**
- * A tile at another place. If only one other tile is there and fits where this one was, both change places; else those that
- * are there move down.
+ * A tile at another place. If a single other tile is in the way and fits where this one was, the two swap; otherwise the tiles
+ * in the way move down.
  * @param {Draft} draft  @param {string} name  @param {number} row  @param {number} column
  * @returns {Draft}
  */
 export function moved(draft, name, row, column) {
-  const own = { ...draft[name], row: limited(row, 0, MOST), column: limited(column, 0, MOST) };
+  const own = { ...draft[name], row: clamped(row, 0, MAX_INDEX), column: clamped(column, 0, MAX_INDEX) };
   const under = Object.keys(draft).filter((other) => other !== name && overlap(own, draft[other]));
   const { row: up, column: left } = draft[name];
-  const exchanged = { ...draft, [name]: own, ...Object.fromEntries(under.map((other) => [other, { ...draft[other], row: up, column: left }])) };
-  return under.length === 1 && isFree(exchanged, under[0]) && isFree(exchanged, name) ? exchanged : settled({ ...draft, [name]: own }, name);
+  const swapped = { ...draft, [name]: own, ...Object.fromEntries(under.map((other) => [other, { ...draft[other], row: up, column: left }])) };
+  return under.length === 1 && isFree(swapped, under[0]) && isFree(swapped, name) ? swapped : withoutOverlaps({ ...draft, [name]: own }, name);
 }
 
 /**
- * A tile with other spans; tiles that it then covers move down.
+ * A resized tile; tiles that it covers move down.
  * @param {Draft} draft  @param {string} name  @param {number} row_span  @param {number} column_span
  * @returns {Draft}
  */
 export function resized(draft, name, row_span, column_span) {
-  const spans = { row_span: limited(row_span, 1, MOST_SPAN), column_span: limited(column_span, 1, MOST_SPAN) };
-  return settled({ ...draft, [name]: { ...draft[name], ...spans } }, name);
+  const spans = { row_span: clamped(row_span, 1, MAX_SPAN), column_span: clamped(column_span, 1, MAX_SPAN) };
+  return withoutOverlaps({ ...draft, [name]: { ...draft[name], ...spans } }, name);
 }
 
-/** Rows and columns up to the last that a tile covers. */
+/** Rows and columns up to the last one that a tile covers. */
 export function sizeOf(draft) {
   const ends = (side) => Object.values(draft).map((place) => place[side] + place[`${side}_span`]);
   return { rows: Math.max(0, ...ends("row")), columns: Math.max(0, ...ends("column")) };
 }
 
 /** One tile stays; the others, from the top, move down as far as they must. */
-function settled(draft, first) {
+function withoutOverlaps(draft, first) {
   const done = { [first]: draft[first] };
   const others = Object.keys(draft).filter((name) => name !== first);
   for (const name of others.sort((a, b) => draft[a].row - draft[b].row || draft[a].column - draft[b].column)) {
@@ -75,4 +75,4 @@ function overlap(a, b) {
   return meet("row") && meet("column");
 }
 
-const limited = (value, least, most) => Math.max(least, Math.min(most, Math.round(value)));
+const clamped = (value, least, most) => Math.max(least, Math.min(most, Math.round(value)));

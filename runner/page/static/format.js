@@ -5,7 +5,7 @@ const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0, useGroupin
 /** A whole number, "–" where unknown. */
 export const whole = (value) => (Number.isFinite(value) ? WHOLE.format(value) : "–");
 
-/** To a tenth, "–" where unknown; below 0 only because of the clocks, and shown as 0. */
+/** To a tenth, "–" where unknown. Values below 0 are clock errors, and shown as 0. */
 export const tenth = (value) => (Number.isFinite(value) ? Math.max(0, value).toFixed(1) : "–");
 
 /** A factor in its shortest exact form: 0.25, 0.125. */
@@ -13,7 +13,7 @@ export const factor = (value) => (Number.isFinite(value) ? String(Math.round(val
 
 export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
 
-/** A latency in ms and by how much it may be wrong: 48 ± 6 ms. */
+/** A latency in ms and its error bound: 48 ± 6 ms. */
 export const latency = (ms, bound) => (Number.isFinite(ms) && Number.isFinite(bound) ? `${whole(ms)} ± ${whole(Math.ceil(bound))} ms` : "– ms");
 
 export const region = (roi) => (roi ? `${size(roi.width, roi.height)} at ${roi.x}, ${roi.y}` : "–");
@@ -22,8 +22,8 @@ export const sameRegion = (a, b) => ["x", "y", "width", "height"].every((key) =>
 
 export const clockTime = (seconds) => new Date(seconds * 1000).toTimeString().slice(0, 8);
 
-/** Words for a camera's name: front_left -> front left. */
-export const spoken = (name) => name.replaceAll("_", " ");
+/** A camera's name for display: front_left -> front left. */
+export const displayName = (name) => name.replaceAll("_", " ");
 
 /**
  * The page's element with an id.
@@ -32,7 +32,7 @@ export const spoken = (name) => name.replaceAll("_", " ");
  * @param {new () => E} [kind]
  * @returns {E}
  */
-export function by(id, kind) {
+export function byId(id, kind) {
   const element = document.getElementById(id);
   if (!(element instanceof (kind ?? HTMLElement))) throw new Error(`index.html: no ${kind?.name ?? "element"} #${id}`);
   return /** @type {E} */ (element);
@@ -57,13 +57,13 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Write a text only if it differs: the page is updated four times a second, mostly with the same values. */
-export function write(element, text) {
+/** Set the text only if it differs: the page is updated four times a second, mostly with unchanged values. */
+export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
 /** Set or remove an attribute, only if it differs. */
-export function mark(element, name, value) {
+export function setAttribute(element, name, value) {
   const text = value === false || value === null || value === undefined ? null : String(value);
   if (element.getAttribute(name) === text) return;
   if (text === null) element.removeAttribute(name);

@@ -1,10 +1,10 @@
-/** How a picture lies in its box on the screen: whole or cropped, as in a mirror or not. Pure; lengths in px. */
+/** How a picture is placed in its box on the screen: whole or cropped, mirrored or not. Pure; lengths in px. */
 
 /**
  * @typedef {object} View
  * @property {"contain"|"cover"} fit the whole picture, or the whole box
- * @property {number} align which part of a picture that is too wide stays: 0 its left, 1 its right
- * @property {boolean} mirrored left and right are exchanged on the screen
+ * @property {number} align which part of a picture that is too wide is kept: 0 its left, 1 its right
+ * @property {boolean} mirrored left and right are swapped on the screen
  * @typedef {{width: number, height: number}} Size
  * @typedef {{x: number, y: number, width: number, height: number}} Rectangle
  */
@@ -16,7 +16,7 @@ export const WHOLE = { fit: "contain", align: 0.5, mirrored: false };
  * The picture's rectangle, in px of the box; larger than the box where the picture is cropped.
  * @param {Size} box  @param {Size} picture  @param {View} view
  */
-export function placed(box, picture, { fit, align, mirrored }) {
+export function placement(box, picture, { fit, align, mirrored }) {
   const ratios = [box.width / picture.width, box.height / picture.height];
   const scale = fit === "cover" ? Math.max(...ratios) : Math.min(...ratios);
   const width = picture.width * scale;
@@ -25,11 +25,11 @@ export function placed(box, picture, { fit, align, mirrored }) {
 }
 
 /**
- * The point of the picture that is shown at a point of the box.
+ * The point of the picture that a point of the box shows.
  * @param {{x: number, y: number}} point  @param {Size} box  @param {Size} picture  @param {View} view
  */
 export function toPicture(point, box, picture, view) {
-  const { scale, x, y } = placed(box, picture, view);
+  const { scale, x, y } = placement(box, picture, view);
   const across = (point.x - x) / scale;
   return { x: view.mirrored ? picture.width - across : across, y: (point.y - y) / scale };
 }
@@ -39,7 +39,7 @@ export function toPicture(point, box, picture, view) {
  * @param {Rectangle} part  @param {Size} box  @param {Size} picture  @param {View} view
  */
 export function toBox(part, box, picture, view) {
-  const { scale, x, y } = placed(box, picture, view);
+  const { scale, x, y } = placement(box, picture, view);
   const left = view.mirrored ? picture.width - part.x - part.width : part.x;
   return { x: x + left * scale, y: y + part.y * scale, width: part.width * scale, height: part.height * scale };
 }
@@ -49,7 +49,7 @@ export function toBox(part, box, picture, view) {
  * @param {Size} box  @param {Size} picture  @param {View} view  @param {Rectangle} region of the full image that the picture shows
  */
 export function imageToBox(box, picture, view, region) {
-  const { scale, x, y } = placed(box, picture, view);
+  const { scale, x, y } = placement(box, picture, view);
   const [across, down] = [picture.width / region.width, picture.height / region.height];
   return (point) => {
     const right = (point.x - region.x) * across;
@@ -58,10 +58,10 @@ export function imageToBox(box, picture, view, region) {
 }
 
 /**
- * What of the picture is shown, in words; "" where that is all of it, as it is.
+ * States which part of the picture is shown, and whether mirrored; "" for a whole picture that is not mirrored.
  * @param {Size} box  @param {Size} picture  @param {View} view
  */
-export function shownWords(box, picture, view) {
+export function framingText(box, picture, view) {
   const { width, height } = visible(box, picture, view);
   const across = width < 0.995 * picture.width ? `${{ 0: "left", 1: "right" }[view.align] ?? "middle"} ${Math.round((100 * width) / picture.width)} % shown` : "";
   const down = height < 0.995 * picture.height ? `middle ${Math.round((100 * height) / picture.height)} % of the height shown` : "";
@@ -73,7 +73,7 @@ export function shownWords(box, picture, view) {
  * @param {Size} box  @param {Size} picture  @param {View} view
  */
 export function visible(box, picture, view) {
-  const { scale } = placed(box, picture, view);
+  const { scale } = placement(box, picture, view);
   const width = Math.min(picture.width, box.width / scale);
   const height = Math.min(picture.height, box.height / scale);
   return { x: (picture.width - width) * view.align, y: (picture.height - height) / 2, width, height };

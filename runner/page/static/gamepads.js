@@ -1,42 +1,42 @@
-/** Buttons of gamepads and wheels, by the browser's Gamepad API, which states what is held: it has to be asked. */
+/** Buttons of gamepads and wheels, through the browser's Gamepad API, which must be polled. */
 
 import { listen, note, publish, store } from "./store.js";
 import { ACTIONS } from "./actions.js";
 import { actionOf, Presses } from "./presses.js";
 
-const LOOK_MS = 15;
+const POLL_MS = 15;
 const EFFECTS = {
   lost: { duration: 600, strongMagnitude: 1, weakMagnitude: 1 },
   late: { duration: 200, strongMagnitude: 0.3, weakMagnitude: 0.6 },
 };
 
 const presses = new Presses();
-/** @type {ReturnType<typeof setInterval>|undefined} while there is a pad */
-let looking;
+/** @type {ReturnType<typeof setInterval>|undefined} set while a pad is connected */
+let pollTimer;
 
 const pads = () => navigator.getGamepads().flatMap((pad) => (pad?.connected ? [pad] : []));
 const nameOf = ({ id }) => id.replace(/\s*\(.*/, "") || "gamepad";
 
-function look() {
-  if (!document.hasFocus()) return presses.forget(); // browsers report no change meanwhile
-  for (const button of presses.look(pads())) {
+function poll() {
+  if (!document.hasFocus()) return presses.reset(); // browsers report no change meanwhile
+  for (const button of presses.poll(pads())) {
     const action = ACTIONS[actionOf(store.hello?.inputs.buttons ?? {}, button) ?? ""];
     if (!document.querySelector("dialog[open]")) action?.run();
   }
 }
 
-function came({ gamepad }) {
+function onConnected({ gamepad }) {
   publish("toast", { text: `${nameOf(gamepad)} connected`, level: "hint" });
-  looking ??= setInterval(look, LOOK_MS);
+  pollTimer ??= setInterval(poll, POLL_MS);
 }
 
-function went({ gamepad }) {
-  const text = `${nameOf(gamepad)} is gone: its buttons no longer work`;
+function onDisconnected({ gamepad }) {
+  const text = `${nameOf(gamepad)} disconnected: its buttons no longer work`;
   note({ text, level: "problem" });
   publish("toast", { text, level: "problem" });
   if (pads().length) return;
-  clearInterval(looking);
-  looking = undefined;
+  clearInterval(pollTimer);
+  pollTimer = undefined;
 }
 
 /** Vibrate for a picture that is lost or late. */
@@ -45,7 +45,7 @@ function vibrate(kind) {
 }
 
 export function startGamepads() {
-  addEventListener("gamepadconnected", came);
-  addEventListener("gamepaddisconnected", went);
+  addEventListener("gamepadconnected", onConnected);
+  addEventListener("gamepaddisconnected", onDisconnected);
   listen("alarm", vibrate);
 }

@@ -1,11 +1,11 @@
-/** The ground around the vehicle as seen from above: what each camera shows of it, and whose picture counts where. Pure; m and px. */
+/** The ground around the vehicle seen from above: what each camera sees of it, and which picture is used where. Pure; m and px. */
 
 import { projection } from "./projection.js";
 
 export const REACH_M = 9; // beyond the vehicle, on every side
-const CELL_M = 0.3; // of the lattice; between its vertices the image is taken for linear, off by 1 cm near a camera 1 m high
-const FEATHER = 0.12; // of the shorter side of a region: within it a picture fades out
-const NEARER = 10; // power of the distance by which a camera counts less: the seam between two is about 1 m wide
+const CELL_M = 0.3; // of the lattice; the image is interpolated between its vertices, with an error of 1 cm near a camera 1 m high
+const FEATHER = 0.12; // of the shorter side of a region: width of the edge in which a picture fades out
+const FALLOFF = 10; // power of the distance by which a camera's weight falls: a seam is about 1 m wide
 
 /** @typedef {import("./projection.js").Place} Place */
 /** @typedef {import("./projection.js").Point} Point */
@@ -14,7 +14,7 @@ const NEARER = 10; // power of the distance by which a camera counts less: the s
 /** @typedef {import("./framing.js").Rectangle} Rectangle */
 /** @typedef {{rear: number, front: number, right: number, left: number}} Extent along x from rear to front, along y from right to left */
 /** @typedef {{places: Place[], columns: number, rows: number}} Lattice rows from the rear to the front, each from right to left */
-/** @typedef {{points: (Point|null)[], near: number[]}} Sight of a camera, for each vertex: its point in the full image, and how much it counts there */
+/** @typedef {{points: (Point|null)[], near: number[]}} Sight of a camera, for each vertex: its point in the full image, and its weight there */
 
 /**
  * The vehicle's outline on the ground, with a margin.
@@ -51,8 +51,8 @@ export function latticeOf({ rear, front, right, left }) {
 }
 
 /**
- * What a camera sees of the ground. The vehicle hides from a camera at its outside what lies behind it, and is taken to
- * be as high as the camera; one above it sees everything.
+ * What a camera sees of the ground. The vehicle, assumed to be as high as the camera, hides what is behind it from a camera
+ * on its outside; a camera above the vehicle sees everything.
  * @param {Optics} optics  @param {Dimensions} dimensions  @param {Place[]} places
  * @returns {Sight}
  */
@@ -61,11 +61,11 @@ export function sightOf(optics, dimensions, places) {
   const { x_m, y_m, z_m } = optics.pose;
   const [body, eye] = [outline(dimensions), { x: x_m, y: y_m }];
   const outside = !crosses(eye, eye, body);
-  const near = places.map((place) => (outside && crosses(eye, place, body) ? 0 : Math.hypot(place.x - x_m, place.y - y_m, z_m) ** -NEARER));
+  const near = places.map((place) => (outside && crosses(eye, place, body) ? 0 : Math.hypot(place.x - x_m, place.y - y_m, z_m) ** -FALLOFF));
   return { points: places.map(toImage), near };
 }
 
-/** Whether a line from a to b leads through the inside of an extent. */
+/** Whether a line from a to b passes through the inside of an extent. */
 export function crosses(a, b, { rear, front, right, left }) {
   let [enter, leave] = [0, 1];
   for (const [from, to, low, high] of [[a.x, b.x, rear, front], [a.y, b.y, right, left]]) {
@@ -81,26 +81,26 @@ export function crosses(a, b, { rear, front, right, left }) {
 }
 
 /**
- * Each camera's share of the picture at each vertex; they add up to 1 where any camera sees the ground, and fade out
- * towards the edge of what a picture shows.
+ * Each camera's share of the picture at each vertex. Shares add up to 1 where any camera sees the ground, and fade out
+ * towards the edges of a picture.
  * @param {Sight[]} sights
  * @param {Rectangle[]} regions of the full images that the pictures show
  * @returns {Float32Array[]}
  */
 export function sharesOf(sights, regions) {
-  const wished = sights.map(({ points, near }, i) => {
+  const weights = sights.map(({ points, near }, i) => {
     const fade = fading(regions[i]);
     return Float64Array.from(points, (point, vertex) => (point ? near[vertex] * fade(point) : 0));
   });
-  const shares = wished.map(({ length }) => new Float32Array(length));
-  for (let vertex = 0; vertex < (wished[0]?.length ?? 0); vertex++) {
-    const total = wished.reduce((sum, each) => sum + each[vertex], 0);
-    if (total > 0) for (const [i, each] of wished.entries()) shares[i][vertex] = each[vertex] / total;
+  const shares = weights.map(({ length }) => new Float32Array(length));
+  for (let vertex = 0; vertex < (weights[0]?.length ?? 0); vertex++) {
+    const total = weights.reduce((sum, each) => sum + each[vertex], 0);
+    if (total > 0) for (const [i, each] of weights.entries()) shares[i][vertex] = each[vertex] / total;
   }
   return shares;
 }
 
-/** 1 inside a rectangle, 0 outside, and between them near its edges. */
+/** 1 inside a rectangle, 0 outside, with a ramp inside its edges. */
 function fading({ x, y, width, height }) {
   const wide = FEATHER * Math.min(width, height);
   return (point) => {
@@ -110,7 +110,7 @@ function fading({ x, y, width, height }) {
 }
 
 /**
- * Two triangles for each cell of a lattice, as indices of vertices; none with a vertex that has no image, or without a share.
+ * Two triangles for each cell of a lattice, as indices of vertices; none with a vertex without an image, or without any share.
  * @param {number} columns  @param {number} rows of vertices
  * @param {(Point|null)[]} points  @param {Float32Array} shares
  */
@@ -129,10 +129,10 @@ export function trianglesOf(columns, rows, points, shares) {
 }
 
 /**
- * How the ground lies in a box on the screen: px for each metre, and where the ground below the rear axle is, the front up.
+ * Placement of the ground in a box on the screen, front up: px per metre, and the point of the ground below the rear axle.
  * @param {{width: number, height: number}} box  @param {Dimensions} dimensions
  */
-export function laidOut(box, dimensions) {
+export function groundPlacement(box, dimensions) {
   const { extent, width, height } = groundOf(dimensions);
   const px_per_m = Math.min(box.width / width, box.height / height);
   return { px_per_m, x: box.width / 2 + ((extent.left + extent.right) / 2) * px_per_m, y: box.height / 2 + ((extent.front + extent.rear) / 2) * px_per_m };

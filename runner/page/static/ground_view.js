@@ -1,21 +1,21 @@
 /**
- * The bird's-eye view, drawn by the worker from the pictures of the cameras that look down, and above it, in a canvas of its
- * own, what does not change with every picture: the vehicle, distances, and which picture is not as it should be.
+ * The bird's-eye view, drawn by the worker from the pictures of the cameras that look down. A second canvas above it holds
+ * what does not change with every picture: the vehicle, distances, and which pictures are not live.
  */
 
-import { groundOf, laidOut, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
+import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
 import { now } from "./clock.js";
-import { COLOURS, namePicture, RAD } from "./guide_layer.js";
+import { COLOURS, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
 import { hasGpu } from "./picture.js";
-import { MOVING, STANDING } from "./status.js";
+import { MOVING, STALLED } from "./status.js";
 import { Warp } from "./warp.js";
 
 const DISTANCES_M = [1, 2, 5]; // from the vehicle
-const AWAY_M = 4; // from its camera the state of a picture is written
-// Without a GPU a processor draws: a picture of a million px would take it for a fifth of a second.
-const SOFTWARE = { every_ms: 200, most_px: 200_000 };
+const LABEL_M = 4; // distance from a camera to the label of its status
+// Without a GPU the CPU draws: a picture of a million px would occupy it for a fifth of a second.
+const SOFTWARE = { every_ms: 200, max_px: 200_000 };
 const FONT = 'system-ui, "DejaVu Sans", sans-serif';
 
 /** @typedef {import("./stream.js").Stream} Stream */
@@ -28,9 +28,9 @@ export class GroundView {
   drawn = { picture: "", frames: "", lines: "", states: [] }; // what the canvases show
   count = 0; // of the pictures drawn
   /** @type {string[]} */
-  finished = []; // what was said of the cameras when the picture on show was drawn
-  at = -Infinity; // when the last one was
-  why = ""; // there is none, for people to read
+  drawn_labels = []; // labels of the cameras when the displayed picture was drawn
+  drawn_at = -Infinity; // when the last picture was drawn
+  why = ""; // why there is no picture, for the operator
   /** @type {Warp|null} */
   warp = null;
   /** @type {Stream[]} */
@@ -41,7 +41,7 @@ export class GroundView {
   sights = [];
   /** @type {import("./ground.js").Lattice|null} */
   lattice = null;
-  shared = ""; // regions for which the shares hold
+  shared_regions = ""; // for which the shares were computed
   /** @type {OffscreenCanvas|null} */
   canvas = null;
   /** @type {OffscreenCanvasRenderingContext2D|null} */
@@ -61,38 +61,38 @@ export class GroundView {
   }
 
   /**
-   * The vehicle has these cameras that look down.
+   * Set the vehicle's cameras that look down.
    * @param {Stream[]} streams  @param {Dimensions|null} dimensions
    */
-  know(streams, dimensions) {
-    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared: "", drawn: { picture: "", frames: "", lines: "", states: [] } });
-    this.use();
+  setCameras(streams, dimensions) {
+    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared_regions: "", drawn: { picture: "", frames: "", lines: "", states: [] } });
+    this.updateStreams();
   }
 
-  /** Show it in a box on the screen, or not. @param {{shown: boolean, width: number, height: number, ratio: number}} display */
+  /** Show it in a box on the screen, or hide it. @param {{shown: boolean, width: number, height: number, ratio: number}} display */
   show({ shown, ...display }) {
     Object.assign(this, { shown, display, drawn: { picture: "", frames: "", lines: "", states: [] } });
-    this.use();
+    this.updateStreams();
     if (this.isOn()) this.draw();
     else this.clear();
   }
 
-  /** What was on show would be old when it is shown again. */
+  /** Otherwise a stale picture would appear when it is shown again. */
   clear() {
     this.warp?.draw(this.warp.canvas, { x: 0, y: 0, width: 1, height: 1 }, []);
     this.context?.reset();
   }
 
-  /** Tell the streams whether their whole pictures are needed. */
-  use() {
-    for (const stream of this.streams) stream.above = this.isOn();
+  /** Set whether the streams' full-size pictures are needed. */
+  updateStreams() {
+    for (const stream of this.streams) stream.isInBirdseye = this.isOn();
   }
 
   isOn() {
     return this.shown && this.streams.length > 0 && this.display.width > 0 && this.display.height > 0;
   }
 
-  /** Draw what has changed: a new picture, or the state of one. */
+  /** Draw what has changed: pictures or their status. */
   draw() {
     if (!this.isOn() || !this.canvas || !this.context) return;
     const seen = this.streams.map((stream) => stream.fromAbove());
@@ -104,13 +104,13 @@ export class GroundView {
     try {
       this.prepare();
       this.drawPictures(seen);
-      if (this.warp?.lost) throw new Error("the browser has taken its graphics away; load the page again");
+      if (this.warp?.lost) throw new Error("the browser dropped the WebGL context; reload the page");
     } catch (error) {
       this.why = error instanceof Error ? error.message : String(error);
     }
   }
 
-  /** What takes a while is done when it is first needed. */
+  /** Slow initialisation, done when first needed. */
   prepare() {
     this.warp ??= new Warp(/** @type {OffscreenCanvas} */ (this.canvas));
     if (this.layers.length || !this.dimensions) return;
@@ -127,32 +127,32 @@ export class GroundView {
     const size = this.size();
     const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
     const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
-    const isDue = hasGpu || now() - this.at >= SOFTWARE.every_ms;
+    const isDue = hasGpu || now() - this.drawn_at >= SOFTWARE.every_ms;
     const isBusy = warp.isBusy();
-    if (!isBusy) this.finished = drawn.states;
+    if (!isBusy) this.drawn_labels = drawn.states;
     if (isBusy || (picture === drawn.picture && (frames === drawn.frames || !isDue))) return;
-    Object.assign(drawn, { picture, frames, states: seen.map(({ words }) => words) });
-    this.at = now();
+    Object.assign(drawn, { picture, frames, states: seen.map(({ label }) => label) });
+    this.drawn_at = now();
     this.share(seen.map(({ region }) => region));
-    const { px_per_m } = laidOut(size, dimensions);
+    const { px_per_m } = groundPlacement(size, dimensions);
     const { extent } = groundOf(dimensions);
     const middle = { x: -(extent.left + extent.right) / 2, y: (extent.front + extent.rear) / 2 };
     warp.draw(size, { ...middle, width: size.width / px_per_m, height: size.height / px_per_m }, seen.map((each, i) => ({ ...each, layer: layers[i] })));
     this.count++;
   }
 
-  /** Of the picture, px. */
+  /** Size of the picture, px. */
   size() {
     const { width, height, ratio } = this.display;
-    const scale = hasGpu ? ratio : Math.min(ratio, Math.sqrt(SOFTWARE.most_px / (width * height)));
+    const scale = hasGpu ? ratio : Math.min(ratio, Math.sqrt(SOFTWARE.max_px / (width * height)));
     return { width: Math.round(width * scale), height: Math.round(height * scale) };
   }
 
-  /** Decide which camera shows what. @param {import("./framing.js").Rectangle[]} regions that the pictures show */
+  /** Set which camera shows which part of the ground. @param {import("./framing.js").Rectangle[]} regions that the pictures show */
   share(regions) {
     const { lattice, sights, layers } = this;
-    if (!lattice || JSON.stringify(regions) === this.shared) return;
-    this.shared = JSON.stringify(regions);
+    if (!lattice || JSON.stringify(regions) === this.shared_regions) return;
+    this.shared_regions = JSON.stringify(regions);
     for (const [i, shares] of sharesOf(sights, regions).entries()) layers[i].share(shares, trianglesOf(lattice.columns, lattice.rows, sights[i].points, shares));
   }
 
@@ -161,22 +161,22 @@ export class GroundView {
   drawLines(seen) {
     const { context, display, dimensions, why } = this;
     if (!context || !dimensions) return;
-    const states = seen.map(({ words, status }) => [words, status]);
-    const rad = this.steering.when(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
-    const described = JSON.stringify([display, states, rad && Math.round(rad / RAD), why]);
+    const states = seen.map(({ label, status }) => [label, status]);
+    const rad = this.steering.angleAt(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
+    const described = JSON.stringify([display, states, rad && Math.round(rad / STEERING_STEP_RAD), why]);
     if (described === this.drawn.lines) return;
     this.drawn.lines = described;
     const { canvas } = context;
-    Object.assign(canvas, { width: Math.round(display.width * display.ratio), height: Math.round(display.height * display.ratio) }); // clears it, too
+    Object.assign(canvas, { width: Math.round(display.width * display.ratio), height: Math.round(display.height * display.ratio) }); // this also clears it
     context.scale(display.ratio, display.ratio);
     const size = Math.round(Math.min(22, Math.max(10, 0.045 * Math.min(display.width, display.height))));
-    const laid = laidOut(display, dimensions);
+    const laid = groundPlacement(display, dimensions);
     if (!why) drawDistances(context, dimensions, laid, size);
     if (!why && rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
     drawVehicle(context, dimensions, laid);
-    if (why) return sign(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
+    if (why) return drawLabel(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
     drawScale(context, display, laid, size);
-    if (this.streams.some(({ camera }) => !camera.calibrated)) namePicture(context, "ESTIMATED", { left: 0, top: 0, bottom: display.height });
+    if (this.streams.some(({ camera }) => !camera.calibrated)) labelPicture(context, "ESTIMATED", { left: 0, top: 0, bottom: display.height });
     this.drawStates(context, laid, size, seen);
   }
 
@@ -184,27 +184,27 @@ export class GroundView {
     const { width, height } = this.display;
     const { dimensions } = this;
     if (!dimensions) return;
-    for (const [i, { words, status }] of seen.entries()) {
-      if (!words) continue;
+    for (const [i, { label, status }] of seen.entries()) {
+      if (!label) continue;
       const { pose, name } = this.streams[i].camera;
       const yaw = (pose.yaw_deg * Math.PI) / 180;
-      const at = toBox({ x: pose.x_m + AWAY_M * Math.cos(yaw), y: pose.y_m + AWAY_M * Math.sin(yaw) }, laid);
-      const [back, fore] = STANDING.includes(status) ? [RED, "#fff"] : MOVING.includes(status) ? [AMBER, "#000"] : ["#2b333c", "#e6ebf0"];
-      sign(context, at.x, at.y, size, `${words} ${name.replaceAll("_", " ")}`, back, fore, width);
+      const at = toBox({ x: pose.x_m + LABEL_M * Math.cos(yaw), y: pose.y_m + LABEL_M * Math.sin(yaw) }, laid);
+      const [back, fore] = STALLED.includes(status) ? [RED, "#fff"] : MOVING.includes(status) ? [AMBER, "#000"] : ["#2b333c", "#e6ebf0"];
+      drawLabel(context, at.x, at.y, size, `${label} ${name.replaceAll("_", " ")}`, back, fore, width);
     }
     const thick = 0.4 * size;
-    if (seen.some(({ status }) => STANDING.includes(status))) frame(context, width, height, thick, RED, []);
-    else if (seen.some(({ words, status }) => words && MOVING.includes(status))) frame(context, width, height, thick, AMBER, [2 * size, size]);
+    if (seen.some(({ status }) => STALLED.includes(status))) frame(context, width, height, thick, RED, []);
+    else if (seen.some(({ label, status }) => label && MOVING.includes(status))) frame(context, width, height, thick, AMBER, [2 * size, size]);
   }
 
-  /** For tests: how it lies in its box, CSS px; what is said of the cameras, and what was when the picture was drawn. */
+  /** For tests: its placement in its box, CSS px; the cameras' labels now, and when the picture was drawn. */
   measure() {
-    const laid = this.dimensions && laidOut(this.display, this.dimensions);
-    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().words), drawn: this.finished };
+    const laid = this.dimensions && groundPlacement(this.display, this.dimensions);
+    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().label), drawn: this.drawn_labels };
   }
 }
 
-/** Where a place on the ground is in the box: x ahead is up, y to the left. */
+/** A place on the ground in px of the box: x is up, y to the left. */
 const toBox = ({ x, y }, laid) => ({ x: laid.x - y * laid.px_per_m, y: laid.y - x * laid.px_per_m });
 
 /** Lines at equal distances from the vehicle. */
@@ -230,7 +230,7 @@ function drawDistances(context, dimensions, laid, size) {
   }
 }
 
-/** Where the wheels go. */
+/** The paths of the wheels. */
 function drawPaths(context, paths, laid) {
   context.lineWidth = 2;
   context.strokeStyle = COLOURS.path;
@@ -259,13 +259,13 @@ function drawVehicle(context, dimensions, laid) {
   context.fill();
 }
 
-/** How many px a metre has, and 5 m as a bar. */
+/** A scale bar of 5 m, and the px per metre. */
 function drawScale(context, { width, height }, { px_per_m }, size) {
   const [right, bottom, long] = [width - size, height - size, 5 * px_per_m];
   context.font = `600 ${size}px ${FONT}`;
   context.textAlign = "right";
   context.textBaseline = "bottom";
-  const words = `5 m · ${px_per_m.toFixed(1)} px/m`;
+  const label = `5 m · ${px_per_m.toFixed(1)} px/m`;
   for (const [thick, colour] of /** @type {[number, string][]} */ ([[size / 4 + 3, "#000"], [size / 4, "#fff"]])) {
     context.strokeStyle = colour;
     context.lineWidth = thick;
@@ -276,22 +276,22 @@ function drawScale(context, { width, height }, { px_per_m }, size) {
   }
   context.strokeStyle = "rgba(0,0,0,0.7)";
   context.lineWidth = size / 4;
-  context.strokeText(words, right, bottom - size / 3);
+  context.strokeText(label, right, bottom - size / 3);
   context.fillStyle = "#fff";
-  context.fillText(words, right, bottom - size / 3);
+  context.fillText(label, right, bottom - size / 3);
 }
 
-/** Words on a plate, inside of the box. */
-function sign(context, x, y, size, words, back, fore, width) {
+/** A label, kept inside the box. */
+function drawLabel(context, x, y, size, label, back, fore, width) {
   context.font = `700 ${size}px ${FONT}`;
   context.textAlign = "center";
   context.textBaseline = "middle";
-  const wide = Math.min(width, context.measureText(words).width + size);
+  const wide = Math.min(width, context.measureText(label).width + size);
   const middle = Math.min(width - wide / 2, Math.max(wide / 2, x));
   context.fillStyle = back;
   context.fillRect(middle - wide / 2, y - 0.8 * size, wide, 1.6 * size);
   context.fillStyle = fore;
-  context.fillText(words, middle, y, wide);
+  context.fillText(label, middle, y, wide);
 }
 
 function boxOf({ rear, front, right, left }, laid) {

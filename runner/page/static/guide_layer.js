@@ -3,14 +3,14 @@
  * the picture, and drawn only when they change.
  */
 
-import { imageToBox, placed } from "./framing.js";
+import { imageToBox, placement } from "./framing.js";
 import { imageOf, pathGuides, straightGuides } from "./guides.js";
 import { projection } from "./projection.js";
 
 export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
-const THICK = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
+const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
 const USUAL_PX = 960;
-export const RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
+export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{width: number, height: number, ratio: number, view: import("./framing.js").View}} Display a box on the screen, CSS px */
 /**
@@ -24,7 +24,7 @@ export class GuideLayer {
   shown = false;
   drawn = "nothing yet"; // what the canvas shows
   /** @type {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}[]} */
-  lines = []; // the same for tests, CSS px of the box
+  lines = []; // for tests: the drawn lines, CSS px of the box
   /** @type {OffscreenCanvas|null} */
   canvas = null;
   /** @type {OffscreenCanvasRenderingContext2D|null} */
@@ -41,15 +41,15 @@ export class GuideLayer {
     this.straight = this.straightLines();
   }
 
-  /** The picture is that of other optics: straightened, or as it comes. @param {import("./projection.js").Optics} optics */
-  look(optics) {
+  /** Set the picture's optics: straightened, or the original. @param {import("./projection.js").Optics} optics */
+  setOptics(optics) {
     this.toImage = projection(optics);
     this.straight = this.straightLines();
     this.drawn = "nothing yet";
   }
 
   straightLines() {
-    return straightGuides(this.dimensions).map((guide) => this.imaged(guide));
+    return straightGuides(this.dimensions).map((guide) => this.project(guide));
   }
 
   attach(canvas) {
@@ -58,45 +58,45 @@ export class GuideLayer {
     this.drawn = "nothing yet";
   }
 
-  imaged({ kind, metres, places }) {
+  project({ kind, metres, places }) {
     return { kind, metres, pieces: imageOf(places, this.toImage) };
   }
 
   /**
    * Draw the guides that belong to a picture.
    * @param {Display} display
-   * @param {Seen|null} seen null: no picture that moves, or of an unknown region
+   * @param {Seen|null} seen null: no moving picture, or an unknown region
    */
   draw(display, seen) {
     const { canvas, context } = this;
     if (!canvas || !context) return;
-    const wanted = this.shown && seen && display.width && display.height ? { ...seen, rad: seen.rad && RAD * Math.round(seen.rad / RAD) } : null;
-    const described = JSON.stringify(wanted && [display, wanted]);
+    const target = this.shown && seen && display.width && display.height ? { ...seen, rad: seen.rad && STEERING_STEP_RAD * Math.round(seen.rad / STEERING_STEP_RAD) } : null;
+    const described = JSON.stringify(target && [display, target]);
     if (described === this.drawn) return;
     this.drawn = described;
     const width = Math.round(display.width * display.ratio);
     const height = Math.round(display.height * display.ratio);
     if (canvas.width === width && canvas.height === height) context.reset();
-    else Object.assign(canvas, { width, height }); // clears it, too
+    else Object.assign(canvas, { width, height }); // this also clears it
     this.lines = [];
-    if (wanted) this.drawOn(context, display, wanted);
+    if (target) this.drawOn(context, display, target);
   }
 
   drawOn(context, display, { picture, region, rad }) {
-    const shown = placed(display, picture, display.view);
+    const shown = placement(display, picture, display.view);
     const toBox = imageToBox(display, picture, display.view, region);
     const thick = Math.min(1.5, Math.max(0.6, shown.width / USUAL_PX));
-    const paths = rad === null ? [] : pathGuides(this.dimensions, rad).map((guide) => this.imaged(guide));
+    const paths = rad === null ? [] : pathGuides(this.dimensions, rad).map((guide) => this.project(guide));
     context.scale(display.ratio, display.ratio);
     context.beginPath();
     context.rect(shown.x, shown.y, shown.width, shown.height);
     context.clip();
     const lines = (this.lines = [...this.straight, ...paths].map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toBox)) })));
-    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * (THICK[kind] + 2), "rgba(0,0,0,0.55)");
-    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * THICK[kind], COLOURS[kind]);
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * (LINE_WIDTHS[kind] + 2), "rgba(0,0,0,0.55)");
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * LINE_WIDTHS[kind], COLOURS[kind]);
     const visible = visibleIn(display, shown);
-    nameDistances(context, lines, visible);
-    if (this.label) namePicture(context, this.label, visible);
+    labelDistances(context, lines, visible);
+    if (this.label) labelPicture(context, this.label, visible);
   }
 }
 
@@ -115,20 +115,20 @@ function stroke(context, points, thick, colour) {
   context.stroke();
 }
 
-/** The distances beside the right ends of their lines, as far as there is room between them. */
-function nameDistances(context, lines, visible) {
+/** Write the distances next to the right ends of their lines, where there is room. */
+function labelDistances(context, lines, visible) {
   const size = fontSize(visible, 0.028);
   context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   context.textBaseline = "middle";
   /** @type {{x: number, y: number}[]} */
-  const named = [];
+  const labelled = [];
   for (const { metres, pieces } of lines.filter((line) => line.kind === "distance")) {
     const words = `${metres} m`;
     const ends = pieces.flatMap((piece) => [piece[0], piece[piece.length - 1]]).sort((a, b) => b.x - a.x);
     const wide = context.measureText(words).width + size;
     const at = ends.find(({ x, y }) => x >= visible.left && x + wide <= visible.right && y >= visible.top + size && y <= visible.bottom - size);
-    if (!at || named.some(({ x, y }) => Math.abs(at.x - x) < wide && Math.abs(at.y - y) < 1.2 * size)) continue;
-    named.push(at);
+    if (!at || labelled.some(({ x, y }) => Math.abs(at.x - x) < wide && Math.abs(at.y - y) < 1.2 * size)) continue;
+    labelled.push(at);
     context.lineWidth = size / 4;
     context.strokeStyle = "rgba(0,0,0,0.7)";
     context.strokeText(words, at.x + size / 2, at.y);
@@ -137,8 +137,8 @@ function nameDistances(context, lines, visible) {
   }
 }
 
-/** Words in the lower left corner of what is visible. */
-export function namePicture(context, words, { left, top, bottom }) {
+/** A label in the lower left corner of the visible part. */
+export function labelPicture(context, words, { left, top, bottom }) {
   const size = fontSize({ top, bottom }, 0.035);
   context.font = `700 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   context.textAlign = "start";

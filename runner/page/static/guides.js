@@ -1,4 +1,4 @@
-/** Lines on the ground that help to drive: how wide the vehicle is, how far away things are, where its wheels go. Pure; m, rad. */
+/** Guide lines on the ground: the vehicle's width, distances, and the paths of its wheels. Pure; m, rad. */
 
 /** @typedef {import("./projection.js").Place} Place */
 /** @typedef {import("./projection.js").Point} Point */
@@ -16,11 +16,11 @@ const REACH_M = 15; // beyond both ends of the vehicle
 const DISTANCES_M = [1, 2, 5, 10, 15];
 const PIECES = 48; // of a line along the drive, shorter ones near the vehicle
 const ACROSS = 12; // of a line across it
-const QUARTER = Math.PI / 2; // a path ends after that turn
+const QUARTER = Math.PI / 2; // a path ends after a quarter turn
 
 const ground = (x, y) => ({ x, y, z: 0 });
 
-/** From 0 to a length, denser at the beginning: what is near is large in a picture. */
+/** From 0 to a length, denser near the start: close things are large in a picture. */
 const along = (length) => Array.from({ length: PIECES + 1 }, (_, i) => length * (i / PIECES) ** 2);
 
 /**
@@ -45,8 +45,8 @@ const across = (x, half) => Array.from({ length: ACROSS + 1 }, (_, i) => ground(
 const guide = (kind, places, metres = null) => ({ kind, metres, places });
 
 /**
- * Where the front wheels go ahead, and the rear wheels backwards, if the steering stays: single-track (bicycle) model
- * without slip, all points turn about one centre on the line of the rear axle, at wheelbase / tan(angle).
+ * The paths of the front wheels ahead, and of the rear wheels backwards, at constant steering: single-track (bicycle) model
+ * without slip; all points turn about one centre on the line of the rear axle, at wheelbase / tan(angle).
  * @param {Dimensions} dimensions
  * @param {number} rad angle of the front wheels, to the left
  * @returns {Guide[]}
@@ -62,11 +62,11 @@ export function pathGuides({ wheelbase_m, track_m, front_m, rear_m }, rad) {
   return [...line(wheelbase_m, front_m - wheelbase_m, 1), ...line(0, rear_m, -1)];
 }
 
-/** Where a point of the vehicle is once the middle of the rear axle has gone a way, backwards if that is negative. */
-function moved({ x, y }, way, curvature) {
-  const turn = curvature * way;
+/** Where a point of the vehicle is once the centre of the rear axle has travelled a distance, negative backwards. */
+function moved({ x, y }, distance, curvature) {
+  const turn = curvature * distance;
   const [sin, cos] = [Math.sin(turn), Math.cos(turn)];
-  const [ahead, aside] = curvature ? [sin / curvature, (1 - cos) / curvature] : [way, 0];
+  const [ahead, aside] = curvature ? [sin / curvature, (1 - cos) / curvature] : [distance, 0];
   return ground(ahead + x * cos - y * sin, aside + x * sin + y * cos);
 }
 
@@ -93,14 +93,14 @@ export function imageOf(places, toImage) {
 const CHOICES = /** @type {Choice[]} */ (["calibrated", "all", "none"]);
 
 /**
- * Whether a camera's guides are shown: those of a camera that is not calibrated only where asked for.
+ * Whether a camera's guides are shown; an uncalibrated camera's only on request.
  * @param {{pose: object|null, calibrated: boolean}} camera
  * @param {Choice} choice
  */
 export const isGuided = ({ pose, calibrated }, choice) => pose !== null && (choice === "all" || (choice === "calibrated" && calibrated));
 
 /**
- * The next choice that shows the guides of other cameras than the one before.
+ * The next choice that changes which cameras have guides.
  * @param {{pose: object|null, calibrated: boolean}[]} cameras
  * @param {Choice} choice
  * @returns {Choice}

@@ -4,7 +4,7 @@ import { listen, publish, store } from "./store.js";
 import { ACTIONS, selectCamera } from "./actions.js";
 import { selectMode } from "./header.js";
 import { actionOf, keyOf } from "./presses.js";
-import { by, make } from "./format.js";
+import { byId, make } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
 const ARROWS = { ArrowLeft: "←", ArrowUp: "↑", ArrowRight: "→", ArrowDown: "↓", Escape: "Esc" };
@@ -15,62 +15,62 @@ const FIXED = [
   ["m, then s, a or c", "", "mode Single, Automatic, Collective"],
   ["drag on a picture", "", "choose the ROI (mode S)"],
   ["wheel or pinch on a picture", "", "zoom the ROI (mode S); drag with the middle button or two fingers to move it"],
-  ["Tab", "", "from control to control; arrows within modes, tabs and sliders"],
+  ["Tab", "", "next control; arrow keys within modes, tabs and sliders"],
 ];
 
-let chord = -Infinity;
+let chordAt = -Infinity; // when "m" was pressed
 
 const keys = () => store.hello?.inputs.keys ?? {};
 
 /** Whether a key is meant for the cameras: Enter on a button presses the button, arrows move a slider. */
-const forCameras = ({ target }) => target === document.body || target.classList.contains("tile");
+const isForCameras = ({ target }) => target === document.body || target.classList.contains("tile");
 
-const typing = ({ target }) =>
+const isTyping = ({ target }) =>
   target.matches?.("textarea, select, input:not([type=range]):not([type=checkbox]):not([type=radio])");
 
-function pressed(event) {
+function onKeyDown(event) {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  if (document.querySelector("dialog[open]") || (typing(event) && event.key !== "Escape")) return;
+  if (document.querySelector("dialog[open]") || (isTyping(event) && event.key !== "Escape")) return;
   const key = keyOf(event);
-  const mode = performance.now() - chord < CHORD_MS ? MODES[key.toLowerCase()] : undefined;
-  if (key !== "Shift") chord = -Infinity;
+  const mode = performance.now() - chordAt < CHORD_MS ? MODES[key.toLowerCase()] : undefined;
+  if (key !== "Shift") chordAt = -Infinity;
   if (mode) return selectMode(mode);
   const action = ACTIONS[actionOf(keys(), key) ?? ""];
-  if (!action) return fixed(key);
-  if (action.onCameras && !forCameras(event)) return;
+  if (!action) return onFixedKey(key);
+  if (action.onCameras && !isForCameras(event)) return;
   if (action.onCameras) event.preventDefault();
   action.run();
 }
 
-function fixed(key) {
+function onFixedKey(key) {
   if (/^[1-9]$/.test(key)) return selectCamera(store.hello?.cameras.find(({ index }) => index === +key - 1)?.name);
   if (key !== "m") return;
-  chord = performance.now();
+  chordAt = performance.now();
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
 }
 
-function listed() {
+function keyTable() {
   const buttons = store.hello?.inputs.buttons ?? {};
   /** @type {[string, string, string][]} */
-  const rows = Object.entries(ACTIONS).map(([name, { words }]) => [written(keys()[name]), `${buttons[name] ?? ""}`, words]);
-  /** @param {[string, string, string]} of */
-  const row = ([key, button, what]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, what));
+  const rows = Object.entries(ACTIONS).map(([name, { description }]) => [labelOf(keys()[name]), `${buttons[name] ?? ""}`, description]);
+  /** @param {[string, string, string]} cells */
+  const row = ([key, button, description]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, description));
   const heads = ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));
   return make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...[...rows, ...FIXED].filter(([key, button]) => key || button).map(row)));
 }
 
-function written(key) {
+function labelOf(key) {
   if (!key) return "";
   return ARROWS[key] ?? (/^\p{Lu}$/u.test(key) ? `Shift+${key}` : key);
 }
 
 export function startKeys() {
-  const help = by("help", HTMLDialogElement);
+  const help = byId("help", HTMLDialogElement);
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
   listen("help", () => {
     if (help.open) return;
-    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), listed(), close);
+    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTable(), close);
     help.showModal();
   });
-  addEventListener("keydown", pressed);
+  addEventListener("keydown", onKeyDown);
 }

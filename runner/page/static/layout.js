@@ -6,13 +6,13 @@
  */
 
 export const GAP = 8;
-const EVEN = 1.25; // a row is at most this much higher than the highest row limited by the width
-const LEAST = 24; // of a picture's height
+const EVEN = 1.25; // a row is at most this many times as high as the highest row limited by the width
+const MIN_HEIGHT = 24; // of a picture
 
 /** @typedef {{row: number, column: number, row_span: number, column_span: number}} Place */
 /** @typedef {Record<string, Place|null>} Places by camera; null: none */
 /** @typedef {{name: string, width: number, height: number}} Camera */
-/** @typedef {{camera: Camera} & Place} Tile its place is counted within the band, without rows and columns that no tile covers */
+/** @typedef {{camera: Camera} & Place} Tile its place counts within the band, without rows and columns that no tile covers */
 /** @typedef {{rows: number, columns: number, grid: boolean, tiles: Tile[]}} Band */
 
 /**
@@ -63,7 +63,7 @@ export function gridOf(cameras, places) {
   return { rows: free("row"), columns: free("column"), grid: true, tiles };
 }
 
-/** The rows or columns that any tile covers, rising. */
+/** The rows or columns that any tile covers, in ascending order. */
 export function covered(tiles, side) {
   const numbers = tiles.flatMap((tile) => Array.from({ length: tile[`${side}_span`] }, (_, i) => tile[side] + i));
   return [...new Set(numbers)].sort((a, b) => a - b);
@@ -82,7 +82,7 @@ export function heightsOf(bands, width, height, chrome) {
   const level = waterLevel(bands.flatMap(({ rows }, i) => Array(rows).fill(highest[i])), available);
   const limited = highest.filter((each) => each <= level);
   const cap = limited.length ? Math.max(...limited) * EVEN : Infinity;
-  return highest.map((each) => Math.max(LEAST, Math.floor(Math.min(each, level, cap))));
+  return highest.map((each) => Math.max(MIN_HEIGHT, Math.floor(Math.min(each, level, cap))));
 }
 
 /** Height of the pictures in a row at which a band is as wide as the area. */
@@ -97,8 +97,8 @@ const rowFor = ({ camera, row_span, column_span }, column, chrome) =>
   ((column * column_span + GAP * (column_span - 1)) / aspectOf(camera) - (row_span - 1) * (chrome + GAP)) / row_span;
 
 /**
- * The boxes of a band's pictures, in the order of its tiles, and the width of a grid's columns (0: it has none). A box of
- * a grid may have another shape than its picture, which is then whole within it.
+ * The boxes of a band's pictures, in the order of its tiles, and the width of a grid's columns (0: no grid). In
+ * a grid, a box may have a different shape from its picture, which is then shown whole.
  * @param {Band} band  @param {number} height of the pictures in one of its rows  @param {number} width of the area  @param {number} chrome
  * @returns {{column: number, boxes: {width: number, height: number}[]}}
  */
@@ -114,7 +114,7 @@ export function boxesOf(band, height, width, chrome) {
 /** Width of the columns at which a tile's picture fills its height. */
 const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * aspectOf(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
 
-/** Height of a tile's picture, with the gaps and the rest of the tiles that it spans. */
+/** Height of a tile's picture, with the gaps and the chrome of the tiles that it spans. */
 const heightOf = ({ row_span }, height, chrome) => height * row_span + (chrome + GAP) * (row_span - 1);
 
 const aspectOf = ({ width, height }) => width / height;

@@ -1,19 +1,19 @@
-/** The page's end of the worker: messages from the station come in here, requests and canvases go out. */
+/** The page's side of the worker link: messages from the station come in, requests and canvases go out. */
 
-import { publish, store, take } from "./store.js";
+import { onStationMessage, publish, store } from "./store.js";
 
 const { canShowVideo, early, worker } = globalThis.boot;
 const HUNG_MS = 1500; // the worker reports four times a second
 const CHECK_MS = 250;
 const questions = new Map();
-let asked = 0;
-let told = performance.now(); // when the worker last reported
-let checked = told;
+let lastQuestion = 0;
+let reportedAt = performance.now(); // when the worker last reported
+let checkedAt = reportedAt;
 /** @type {{connected: boolean}|null} */
-let hung = null; // while it does not: what it last stated
+let hung = null; // while the worker hangs: its last connection state
 
-const heard = {
-  server: ({ message }) => take(message),
+const handlers = {
+  server: ({ message }) => onStationMessage(message),
   socket({ open }) {
     if (hung) return void (hung.connected = open);
     store.connected = open;
@@ -26,8 +26,8 @@ const heard = {
     publish("status", { camera, status });
   },
   ages({ ages, skew_ms, slow }) {
-    told = performance.now();
-    if (hung) revive(ages);
+    reportedAt = performance.now();
+    if (hung) onWorkerRecovered(ages);
     store.ages = ages;
     store.skew_ms = skew_ms;
     store.slow = slow;
@@ -41,42 +41,42 @@ const heard = {
   },
 };
 
-/** Pass on the worker's messages, from its first one on. */
+/** Handle the worker's messages, from its first one on. */
 export function start() {
-  for (const data of early) heard[data.kind](data);
-  worker.onmessage = ({ data }) => heard[data.kind](data);
-  setInterval(supervise, CHECK_MS);
+  for (const data of early) handlers[data.kind](data);
+  worker.onmessage = ({ data }) => handlers[data.kind](data);
+  setInterval(checkWorker, CHECK_MS);
 }
 
-/** A worker that hangs or has died shows standing pictures as live: its page must not. */
-function supervise() {
+/** If the worker hangs or has died, its last pictures still look live: mark them as lost. */
+function checkWorker() {
   const time = performance.now();
-  const late = time - checked > 2 * CHECK_MS; // this page has stood still itself: the worker's messages are about to come
-  checked = time;
-  if (hung || late || time - told < HUNG_MS || !Object.keys(store.status).length) return;
+  const hasStalled = time - checkedAt > 2 * CHECK_MS; // the page itself: the worker's messages are still queued
+  checkedAt = time;
+  if (hung || hasStalled || time - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
   hung = { connected: store.connected };
   store.connected = false;
   publish("socket", false);
-  for (const camera of Object.keys(store.status)) heard.status({ camera, status: "lost", why: store.refused[camera] });
+  for (const camera of Object.keys(store.status)) handlers.status({ camera, status: "lost", why: store.refused[camera] });
 }
 
-function revive(ages) {
+function onWorkerRecovered(ages) {
   store.connected = hung?.connected ?? false;
   hung = null;
   publish("socket", store.connected);
-  for (const [camera, { status }] of Object.entries(ages)) heard.status({ camera, status, why: store.refused[camera] });
+  for (const [camera, { status }] of Object.entries(ages)) handlers.status({ camera, status, why: store.refused[camera] });
 }
 
 export const send = (message) => worker.postMessage({ order: "send", message });
 
-export function giveCanvas(name, element) {
+export function transferCanvas(name, element) {
   if (!canShowVideo) return;
   const canvas = element.transferControlToOffscreen();
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
-/** Give the worker the canvas of a camera's guides. */
-export function giveGuides(name, element) {
+/** Transfer the canvas of a camera's guides to the worker. */
+export function transferGuides(name, element) {
   if (!canShowVideo) return;
   const canvas = element.transferControlToOffscreen();
   worker.postMessage({ order: "guides", name, canvas }, [canvas]);
@@ -87,27 +87,28 @@ export const showGuides = (names) => worker.postMessage({ order: "guided", names
 
 /** @param {string|null} name of the camera whose picture is drawn first */
 export const drawFirst = (name) => worker.postMessage({ order: "first", name });
-/** Give the worker the canvases of the bird's-eye view: of its picture, and of the lines above it. */
-export function giveGround(...elements) {
+
+/** Transfer the canvases of the bird's-eye view to the worker: one for its picture, one for the lines above it. */
+export function transferGround(...elements) {
   if (!canShowVideo) return;
   const [picture, lines] = elements.map((element) => element.transferControlToOffscreen());
   worker.postMessage({ order: "ground", picture, lines }, [picture, lines]);
 }
 
-/** Show the bird's-eye view in a box on the screen, or not. */
+/** Show the bird's-eye view in a box on the screen, or hide it. */
 export const showGround = (shown, { clientWidth: width, clientHeight: height }) =>
   worker.postMessage({ order: "above", shown, width, height, ratio: devicePixelRatio });
 
 /** @param {string[]} names of the cameras whose pictures are straightened */
 export const showStraight = (names) => worker.postMessage({ order: "straight", names });
 
-/** Report the size of a picture's box on the screen, in CSS pixels, and how the picture lies in it. */
-export const tellSize = (name, { clientWidth: width, clientHeight: height }, view) =>
+/** Report the size of a picture's box on the screen, in CSS pixels, and how the picture is placed in it. */
+export const reportSize = (name, { clientWidth: width, clientHeight: height }, view) =>
   worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view });
 
 /** Ask the worker; for tests and benchmarks. */
 export function ask(what, name) {
-  const id = ++asked;
+  const id = ++lastQuestion;
   worker.postMessage({ order: "ask", id, what, name });
   return new Promise((resolve) => questions.set(id, resolve));
 }

@@ -1,4 +1,4 @@
-/** The page that asks for the token: it answers the server's challenge, so that the token stays in this browser. */
+/** The login page. It answers the server's challenge, so that the token never leaves this browser. */
 
 const form = /** @type {HTMLFormElement} */ (document.getElementById("login"));
 const field = /** @type {HTMLInputElement} */ (document.getElementById("token"));
@@ -18,16 +18,16 @@ async function answerTo(token, challenge) {
 }
 
 async function logIn() {
-  const asked = await fetch("/login/challenge", { method: "POST" });
-  const { challenge } = await asked.json();
+  const response = await fetch("/login/challenge", { method: "POST" });
+  const { challenge } = await response.json();
   const answer = await answerTo(field.value.trim(), challenge);
-  const done = await fetch("/login", { method: "POST", body: JSON.stringify({ challenge, answer }) });
-  if (done.ok) location.assign(`/${location.search}`);
-  else problem.textContent = done.status === 403 ? "This is not the token of this page." : `Not opened: ${await done.text()}`;
+  const result = await fetch("/login", { method: "POST", body: JSON.stringify({ challenge, answer }) });
+  if (result.ok) location.assign(`/${location.search}`);
+  else problem.textContent = result.status === 403 ? "Wrong token." : `Login failed: ${await result.text()}`;
 }
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
   problem.textContent = "";
-  logIn().catch((error) => { problem.textContent = `Not opened: ${error.message}`; });
+  logIn().catch((error) => { problem.textContent = `Login failed: ${error.message}`; });
 });

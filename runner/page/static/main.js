@@ -36,11 +36,11 @@ startGamepads();
 if (store.view !== "monitor") for (const part of [startSound, startTotal, startPanel, startTabs, startCharts]) part();
 start();
 
-/** For tests and benchmarks. With #measure in the address the first picture of each camera is kept as well. */
-const answers = new Map();
+/** For tests and benchmarks. With #measure in the address, the first picture of each camera is kept as well. */
+const resolvers = new Map();
 listen("reply", ({ id, result, reason }) => {
-  answers.get(id)?.({ result, reason });
-  answers.delete(id);
+  resolvers.get(id)?.({ result, reason });
+  resolvers.delete(id);
 });
 globalThis.tod = {
   measure: () => ask("measure"),
@@ -52,7 +52,7 @@ globalThis.tod = {
   request: (event) =>
     new Promise((resolve) => {
       const id = crypto.randomUUID();
-      answers.set(id, resolve);
+      resolvers.set(id, resolve);
       send({ id, ...event });
     }),
   get state() {

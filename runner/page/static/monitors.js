@@ -1,14 +1,14 @@
 /**
- * Monitors: further windows of this page, each with some of the cameras, for other screens. They share its selection and its
- * control, which only the page itself takes and releases.
+ * Monitors: additional windows of this page for other screens, each with some of the cameras. They share the page's selection
+ * and control, which only the page itself takes and releases.
  */
 
 import { camera, listen, store } from "./store.js";
 import { bandsOf } from "./layout.js";
 import { send } from "./link.js";
-import { by, make, spoken, write } from "./format.js";
+import { byId, displayName, make, setText } from "./format.js";
 
-const dialog = by("monitors", HTMLDialogElement);
+const dialog = byId("monitors", HTMLDialogElement);
 const path = (names) => `/?show=${names.map(encodeURIComponent).join()}`;
 
 /** The rows of the layout with more than one picture, and each camera. */
@@ -18,7 +18,7 @@ function groups({ cameras, layout }) {
 }
 
 function link(names) {
-  const anchor = make("a", { href: path(names), target: "_blank", rel: "noopener" }, names.map(spoken).join(", "));
+  const anchor = make("a", { href: path(names), target: "_blank", rel: "noopener" }, names.map(displayName).join(", "));
   return make("li", {}, anchor, make("code", {}, location.origin + path(names)));
 }
 
@@ -27,25 +27,25 @@ export function listMonitors() {
   if (!store.hello || store.view === "monitor" || dialog.open) return;
   dialog.replaceChildren(
     make("h2", { id: "monitors-title" }, "Monitors"),
-    make("p", {}, "Open one of these addresses in a window on another screen. In this browser it shares selection and control with this page."),
+    make("p", {}, "Open one of these addresses in a window on another screen. In this browser, it shares selection and control with this page."),
     make("ul", {}, ...groups(store.hello).map(link)),
     make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close")),
   );
   dialog.showModal();
 }
 
-/** State which cameras of this monitor's address the vehicle does not have. */
-function refuse({ vehicle, layout }) {
+/** Report cameras in this monitor's address that the vehicle does not have. */
+function reportUnknownCameras({ vehicle, layout }) {
   const shown = globalThis.boot.shown ?? [];
   const unknown = shown.filter((name) => !camera(name));
-  const what = shown.length ? `${vehicle} has no camera ${unknown.join(", ")}` : "the address names no camera";
-  by("no-such-camera").hidden = shown.length > 0 && !unknown.length;
-  write(by("no-such-camera"), `${what}; cameras are ${Object.keys(layout.places).join(", ")}`);
+  const problem = shown.length ? `${vehicle} has no camera ${unknown.join(", ")}` : "the address names no camera";
+  byId("no-such-camera").hidden = shown.length > 0 && !unknown.length;
+  setText(byId("no-such-camera"), `${problem}; cameras are ${Object.keys(layout.places).join(", ")}`);
 }
 
 export function startMonitors() {
-  by("open-monitors").addEventListener("click", listMonitors);
+  byId("open-monitors").addEventListener("click", listMonitors);
   listen("chosen", (name) => send({ select: name }));
   listen("hello", ({ selected }) => !selected && store.selected && send({ select: store.selected }));
-  if (globalThis.boot.shown) listen("hello", refuse);
+  if (globalThis.boot.shown) listen("hello", reportUnknownCameras);
 }

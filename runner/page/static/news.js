@@ -1,15 +1,15 @@
-/** News, newest first, and toasts for what needs immediate attention. */
+/** News, newest first, and toasts for events that need immediate attention. */
 
 import { listen, store } from "./store.js";
-import { by, clockTime, make, write } from "./format.js";
+import { byId, clockTime, make, setText } from "./format.js";
 
 const TOAST_MS = { hint: 4000, problem: 8000 };
-const MOST = 4;
+const MAX_TOASTS = 4;
 
-const list = by("news");
-const toasts = by("toasts");
+const list = byId("news");
+const toasts = byId("toasts");
 const latest = make("p", { id: "latest" });
-const roomy = matchMedia("(min-width: 1700px) and (min-height: 900px)");
+const largeScreen = matchMedia("(min-width: 1700px) and (min-height: 900px)");
 
 const line = ({ time, text, level }) =>
   make("li", { "data-level": level }, make("time", {}, clockTime(time)), " ", level === "problem" ? `✕ ${text}` : text);
@@ -17,40 +17,40 @@ const line = ({ time, text, level }) =>
 function refresh() {
   list.replaceChildren(...store.notes.map(line));
   const [newest] = store.notes;
-  write(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no news yet");
+  setText(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no news yet");
 }
 
-function toast({ text, level }) {
+function showToast({ text, level }) {
   [...toasts.children].find((each) => each.getAttribute("data-text") === text)?.remove();
   const shape = level === "problem" ? "✕ " : "";
   const element = make("div", { class: "toast", "data-level": level, "data-text": text }, shape + text);
   element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
   toasts.append(element);
-  while (toasts.children.length > MOST) toasts.firstChild?.remove();
+  while (toasts.children.length > MAX_TOASTS) toasts.firstChild?.remove();
   setTimeout(() => element.remove(), TOAST_MS[level]);
 }
 
-/** If there is room, the whole list is below the tiles; otherwise only its newest line, and the list has a tab. */
-function place() {
-  const strip = by("strip");
-  if (roomy.matches) strip.replaceChildren(list);
+/** On a large screen the whole list is below the tiles; otherwise only its newest line, and the list has a tab. */
+function placeNews() {
+  const strip = byId("strip");
+  if (largeScreen.matches) strip.replaceChildren(list);
   else {
-    by("news-panel").append(list);
+    byId("news-panel").append(list);
     strip.replaceChildren(latest);
   }
 }
 
 export function startNews() {
-  roomy.addEventListener("change", place);
-  place();
-  let waits = false;
+  largeScreen.addEventListener("change", placeNews);
+  placeNews();
+  let isScheduled = false;
   listen("note hello", () => {
-    if (waits) return;
-    waits = true; // several come at once after hello
+    if (isScheduled) return;
+    isScheduled = true; // several arrive together after hello
     requestAnimationFrame(() => {
-      waits = false;
+      isScheduled = false;
       refresh();
     });
   });
-  listen("toast", toast);
+  listen("toast", showToast);
 }

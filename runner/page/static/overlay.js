@@ -1,16 +1,16 @@
 /**
  * Alarms, drawn by the worker into the picture itself: they appear even when the page's main thread is busy.
- * Colour, word and shape agree: LOST a cross, FROZEN a hatch, DAMAGED and LATE a dashed frame: the picture below it moves.
+ * Each alarm has a colour, a word and a shape: LOST a cross, FROZEN a hatch, DAMAGED and LATE, whose picture moves, a dashed frame.
  */
 
 export const RED = "#e01b24";
 export const AMBER = "#ffb000";
 
 /**
- * Draw the alarm or notice of a status over what the canvas shows.
+ * Draw the alarm or notice of a status over the picture in the canvas.
  * @param {OffscreenCanvasRenderingContext2D} context
  * @param {{x: number, y: number, width: number, height: number}} area the part of the canvas that is on the screen
- * @param {boolean} mirrored whether the canvas is: words are written so that they can be read there
+ * @param {boolean} mirrored whether the canvas is mirrored: text is drawn so that it reads correctly
  * @param {string} status
  * @param {string} text
  */
@@ -27,7 +27,7 @@ function drawStatus(context, { width, height }, status, text) {
   if (status === "late" || status === "damaged") return drawWarning(context, width, height, side, text);
   if (status === "frozen" || status === "lost") return drawAlarm(context, width, height, side, status, text);
   dim(context, width, height, 0.72);
-  plate(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
+  drawLabel(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
 }
 
 function drawAlarm(context, width, height, side, status, text) {
@@ -35,12 +35,12 @@ function drawAlarm(context, width, height, side, status, text) {
   if (status === "frozen") hatch(context, width, height, side);
   else cross(context, width, height, side);
   frame(context, width, height, side * 0.06, RED, []);
-  plate(context, width, height / 2, side * 0.17, text, RED, "#fff");
+  drawLabel(context, width, height / 2, side * 0.17, text, RED, "#fff");
 }
 
 function drawWarning(context, width, height, side, text) {
   frame(context, width, height, side * 0.06, AMBER, [side * 0.16, side * 0.08]);
-  plate(context, width, height - side * 0.15, side * 0.13, text, AMBER, "#000");
+  drawLabel(context, width, height - side * 0.15, side * 0.13, text, AMBER, "#000");
 }
 
 /** Desaturate and darken the last picture, so that it is not mistaken for a live one. */
@@ -85,13 +85,13 @@ function stroke(context, thick, colour, path) {
   context.stroke();
 }
 
-/** Words in the middle of the width, smaller where they would be wider than that. */
-function plate(context, width, y, wished, text, back, fore) {
-  const set = (size) => (context.font = `700 ${Math.round(size)}px system-ui, "DejaVu Sans", sans-serif`);
-  set(wished);
-  const needed = context.measureText(text).width + wished;
-  const size = wished * Math.min(1, (0.96 * width) / needed);
-  set(size);
+/** A horizontally centred label, scaled down to fit the width. */
+function drawLabel(context, width, y, preferred, text, back, fore) {
+  const setSize = (size) => (context.font = `700 ${Math.round(size)}px system-ui, "DejaVu Sans", sans-serif`);
+  setSize(preferred);
+  const needed = context.measureText(text).width + preferred;
+  const size = preferred * Math.min(1, (0.96 * width) / needed);
+  setSize(size);
   context.textAlign = "center";
   context.textBaseline = "middle";
   const wide = context.measureText(text).width + size;

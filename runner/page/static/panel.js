@@ -1,15 +1,15 @@
-/** The side panel of the selected camera: what is decided, why, what was read back, and what the operator may set. */
+/** The side panel of the selected camera: decided values and why, values read back, and what the operator may set. */
 
-import { camera, decided, inControl, listen, mode, store } from "./store.js";
-import { pending, request, whyNoControl, complain } from "./requests.js";
-import { fullRegion, isLocked, seenRegion, sendRegion, toggleLocked, waiting } from "./roi.js";
+import { camera, decisionOf, inControl, listen, mode, store } from "./store.js";
+import { pending, request, showProblem, whyNoControl } from "./requests.js";
+import { fullRegion, isLocked, pendingRegion, sendRegion, shownRegion, toggleLocked } from "./roi.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
-import { SHAPES, STILL, switchCamera, unapplied } from "./tiles.js";
+import { SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { colourOf } from "./colours.js";
-import { by, factor, latency, make, mark, region, size, tenth, whole, write } from "./format.js";
+import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
 const SIDES = ["x", "y", "width", "height"];
 const WHY = {
@@ -19,7 +19,7 @@ const WHY = {
 
 /** The selected camera; "" before the first hello, when nothing is shown here. */
 const name = () => store.selected ?? "";
-const whyNot = () => (!decided(name()) ? "The vehicle is offline." : inControl() ? null : `${capital(whyNoControl())}.`);
+const whyNot = () => (!decisionOf(name()) ? "The vehicle is offline." : inControl() ? null : `${capital(whyNoControl())}.`);
 const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 
@@ -29,15 +29,15 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
-const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show it as it comes (l)", onclick: () => toggleStraight() }, "Straighten");
+const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show the original (l)", onclick: () => toggleStraight() }, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
   label: "bitrate",
   data: "kbps",
   control: () => `kbps:${name()}`,
-  about: name,
-  send: (kbps, about) => configure("kbps", kbps, `${kbps} kbit/s`, about),
+  target: name,
+  send: (kbps, target) => configure("kbps", kbps, `${kbps} kbit/s`, target),
 });
 const choices = make("span", { class: "choices", role: "group", "aria-label": "factors of this camera" });
 const free = number("scaling", "factor", { min: 0.01, max: 1, step: "any" });
@@ -46,8 +46,8 @@ const weightNote = make("span", { class: "muted" });
 const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
 const full = make("button", { "data-control": "roi-full", onclick: () => sendFull(), title: "full image (f)" }, "Full image");
-const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "a region that is dragged has the aspect ratio of the full image" }, "Lock aspect");
-const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), is: make("i", { class: "is" }), wish: make("i", { class: "wish" }) };
+const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image" }, "Lock aspect");
+const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), shown: make("i", { class: "is" }), requested: make("i", { class: "wish" }) };
 const differing = make("p", { class: "differing" });
 const rows = new Map();
 const STAGES = {
@@ -56,12 +56,12 @@ const STAGES = {
   link: ["Link", "from the encoder to the station; accurate to within the error bound of the clocks"],
   buffer: ["Jitter buffer", "wait for late, reordered or retransmitted packets"],
   page: ["To this page", "from the station to this page"],
-  decode: ["Decode", "in this browser; in a page without video, at the station"],
-  draw: ["Draw", "until the picture was drawn; the screen adds its own delay"],
+  decode: ["Decode", "in this browser; on a page without video, at the station"],
+  draw: ["Draw", "until the picture is drawn; the screen adds its own delay"],
 };
 const latencies = new Map(); // by stage
 const age = make("td");
-let edited = new Set(); // inputs that the operator is changing: not to be overwritten
+let edited = new Set(); // inputs that the operator is editing: not to be overwritten
 
 function number(control, label, limits) {
   const input = make("input", { type: "number", "data-control": control, "aria-label": label, ...limits });
@@ -96,38 +96,38 @@ function stageTable() {
 
 // --- requests ---------------------------------------------------------------------------------------------------------
 
-function configure(key, value, words, about = name()) {
-  request(`${key}:${about}`, { event: "camera_configured", camera: about, [key]: value }, `${about} ${words}`);
+function configure(key, value, description, target = name()) {
+  request(`${key}:${target}`, { event: "camera_configured", camera: target, [key]: value }, `${target} ${description}`);
 }
 
 function setFactor(value) {
   edited.delete(free);
-  if (!(value > 0 && value <= 1)) return complain("the factor must be above 0 and at most 1");
+  if (!(value > 0 && value <= 1)) return showProblem("the factor must be above 0 and at most 1");
   configure("scaling", value, `factor ${factor(value)}`);
 }
 
 function setWeight() {
   edited.delete(weight);
   const value = +weight.value;
-  if (weight.value === "" || !(value >= 0)) return complain("the weight must be a number from 0");
+  if (weight.value === "" || !(value >= 0)) return showProblem("the weight must be a number of at least 0");
   request(`weight:${name()}`, { event: "weights_set", weights: { [name()]: value } }, `${name()} weight ${value}`);
 }
 
 function sendSides() {
   const { width, height } = fullRegion(name());
   const roi = Object.fromEntries(SIDES.map((side) => [side, Math.round(+sides[side].value)]));
-  const inside = roi.x >= 0 && roi.y >= 0 && roi.x + roi.width <= width && roi.y + roi.height <= height;
-  if (!inside) return complain(`the ROI exceeds the ${width}×${height} image`);
-  if (Math.min(roi.width, roi.height) < SMALLEST) return complain(`the ROI must be at least ${SMALLEST}×${SMALLEST} pixels`);
+  const isInside = roi.x >= 0 && roi.y >= 0 && roi.x + roi.width <= width && roi.y + roi.height <= height;
+  if (!isInside) return showProblem(`the ROI exceeds the ${width}×${height} image`);
+  if (Math.min(roi.width, roi.height) < SMALLEST) return showProblem(`the ROI must be at least ${SMALLEST}×${SMALLEST} pixels`);
   sendRegion(name(), roi);
   edited = new Set();
 }
 
-/** Ask for the full image of the selected camera. */
+/** Request the full image of the selected camera. */
 export function sendFull() {
   if (!store.selected) return;
   const why = whyNotByHand();
-  if (why) return complain(why);
+  if (why) return showProblem(why);
   sendRegion(name(), fullRegion(name()));
   edited = new Set();
 }
@@ -135,70 +135,70 @@ export function sendFull() {
 // --- what is shown ----------------------------------------------------------------------------------------------------
 
 function refresh() {
-  const about = camera(name());
-  if (!about) return;
-  const now = decided(name());
+  const info = camera(name());
+  if (!info) return;
+  const now = decisionOf(name());
   refreshHead(now);
-  straight.hidden = !canStraighten(about);
-  mark(straight, "aria-pressed", isStraight(name()));
-  refreshSettings(about, now);
+  straight.hidden = !canStraighten(info);
+  setAttribute(straight, "aria-pressed", isStraight(name()));
+  refreshSettings(info, now);
   refreshComparison(now);
-  refreshDiagram(about);
+  refreshDiagram(info);
   refreshStages();
 }
 
 function refreshHead(now) {
   const word = store.status[name()] ?? "synchronising";
-  const asked = pending(`on:${name()}`);
-  write(title, name());
+  const requested = pending(`on:${name()}`);
+  setText(title, name());
   swatch.style.background = colourOf(store.hello?.cameras.findIndex((each) => each.name === name()) ?? 0);
-  write(status, `${SHAPES[word]} ${word === "unsupported" ? "NO PICTURE" : word.toUpperCase()}`);
-  mark(status, "data-status", word);
-  mark(on, "aria-checked", now?.on === true);
-  mark(on, "aria-label", `${name()} on`);
-  mark(on, "data-pending", asked ? "" : null);
+  setText(status, `${SHAPES[word]} ${word === "unsupported" ? "NO PICTURE" : word.toUpperCase()}`);
+  setAttribute(status, "data-status", word);
+  setAttribute(on, "aria-checked", now?.on === true);
+  setAttribute(on, "aria-label", `${name()} on`);
+  setAttribute(on, "data-pending", requested ? "" : null);
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? "switch this camera on or off (o)";
-  write(on, asked ? (asked.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  write(reason, [word === "unsupported" ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
+  setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
+  setText(reason, [word === "unsupported" ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
 }
 
-function refreshSettings(about, now) {
+function refreshSettings(info, now) {
   const why = whyNotByHand();
-  write(byHand, why ?? "Set by you in mode S.");
-  bitrate.update({ value: now?.kbps, max: about.b_full_kbps, why });
-  refreshFactors(about, now, why);
+  setText(byHand, why ?? "Set by you in mode S.");
+  bitrate.update({ value: now?.kbps, max: info.b_full_kbps, why });
+  refreshFactors(info, now, why);
   fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
   for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
-  mark(locked, "aria-pressed", isLocked());
+  setAttribute(locked, "aria-pressed", isLocked());
   apply.disabled = full.disabled = Boolean(why);
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
-  fill(weight, now?.weight ?? about.weight, whyNot(), pending(`weight:${name()}`));
-  write(weightNote, whyNot() ?? (mode() === "single" ? "acts in A and C, not in S" : "share of the total"));
+  fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
+  setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "share of the total"));
 }
 
-/** A number shows the value in force, except while it is being edited or requested. */
-function fill(input, value, why, asked) {
+/** A number field shows the value in force, except while it is being edited or a request is pending. */
+function fill(input, value, why, isPending) {
   input.disabled = Boolean(why);
   input.title = why ?? "";
-  mark(input, "data-pending", asked ? "" : null);
+  setAttribute(input, "data-pending", isPending ? "" : null);
   if (why) edited.delete(input);
-  if (!edited.has(input) && !asked && input.value !== String(value)) input.value = value;
+  if (!edited.has(input) && !isPending && input.value !== String(value)) input.value = value;
 }
 
-function refreshFactors(about, now, why) {
-  const text = about.scaling.join();
+function refreshFactors(info, now, why) {
+  const text = info.scaling.join();
   if (choices.dataset.of !== text) {
     choices.dataset.of = text;
     const button = (value) => make("button", { "data-factor": value, onclick: () => setFactor(value) }, factor(value));
-    choices.replaceChildren(...about.scaling.map(button));
+    choices.replaceChildren(...info.scaling.map(button));
   }
-  const asked = pending(`scaling:${name()}`)?.event.scaling;
+  const requested = pending(`scaling:${name()}`)?.event.scaling;
   for (const button of choices.querySelectorAll("button")) {
     const value = Number(button.dataset.factor);
     button.disabled = Boolean(why);
-    mark(button, "aria-pressed", now?.scaling === value);
-    mark(button, "data-pending", asked === value ? "" : null);
+    setAttribute(button, "aria-pressed", now?.scaling === value);
+    setAttribute(button, "data-pending", requested === value ? "" : null);
   }
 }
 
@@ -215,49 +215,49 @@ function refreshComparison(now) {
     ROI: [region(now?.roi), region(applied.roi)],
   };
   for (const [key, { row, cells }] of rows) {
-    write(cells[0], values[key][0]);
-    write(cells[1], differs.includes(key) ? `◌ ${values[key][1]}` : values[key][1]);
-    mark(row, "data-differs", differs.includes(key) ? "" : null);
+    setText(cells[0], values[key][0]);
+    setText(cells[1], differs.includes(key) ? `◌ ${values[key][1]}` : values[key][1]);
+    setAttribute(row, "data-differs", differs.includes(key) ? "" : null);
   }
-  write(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
+  setText(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
 }
 
-/** Where the time goes between capture and drawing. Stages are sampled one by one: their sum is about the latency. */
+/** Latency by stage. Stages are sampled on different pictures, so their sum only approximates the latency. */
 function refreshStages() {
-  const silent = !store.connected || !decided(name())?.sending || STILL.includes(store.status[name()]);
-  const drawn = silent ? undefined : store.ages[name()];
-  const stages = silent ? undefined : store.sample?.cameras[name()]?.stages_ms;
+  const isSilent = !store.connected || !decisionOf(name())?.sending || STALE.includes(store.status[name()]);
+  const drawn = isSilent ? undefined : store.ages[name()];
+  const stages = isSilent ? undefined : store.sample?.cameras[name()]?.stages_ms;
   const parts = { ...stages, ...(Number.isFinite(drawn?.age_ms) ? drawn?.parts_ms : {}) };
-  for (const [stage, cell] of latencies) write(cell, tenth(parts[stage]));
-  write(age, latency(drawn?.age_ms, drawn?.bound_ms));
+  for (const [stage, cell] of latencies) setText(cell, tenth(parts[stage]));
+  setText(age, latency(drawn?.age_ms, drawn?.bound_ms));
 }
 
-/** Position of the region in the full image: solid as shown, dashed as requested. */
-function refreshDiagram(about) {
-  diagram.box.style.aspectRatio = `${about.width} / ${about.height}`;
+/** The region in the full image: solid as shown, dashed as requested. */
+function refreshDiagram(info) {
+  diagram.box.style.aspectRatio = `${info.width} / ${info.height}`;
   const place = (element, roi) => {
     element.hidden = !roi;
     if (!roi) return;
     const percent = (part, of) => `${(100 * part) / of}%`;
     Object.assign(element.style, {
-      left: percent(roi.x, about.width),
-      top: percent(roi.y, about.height),
-      width: percent(roi.width, about.width),
-      height: percent(roi.height, about.height),
+      left: percent(roi.x, info.width),
+      top: percent(roi.y, info.height),
+      width: percent(roi.width, info.width),
+      height: percent(roi.height, info.height),
     });
   };
-  place(diagram.is, seenRegion(name()));
-  place(diagram.wish, waiting(name()));
+  place(diagram.shown, shownRegion(name()));
+  place(diagram.requested, pendingRegion(name()));
 }
 
-function forget() {
+function onSelected() {
   edited = new Set();
   bitrate.reset();
   refresh();
 }
 
 export function startPanel() {
-  diagram.box.append(diagram.is, diagram.wish);
+  diagram.box.append(diagram.shown, diagram.requested);
   free.addEventListener("change", () => setFactor(+free.value));
   weight.addEventListener("change", setWeight);
   for (const side of SIDES) sides[side].addEventListener("keydown", ({ key }) => key === "Enter" && sendSides());
@@ -272,7 +272,7 @@ export function startPanel() {
       diagram.box),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
-  by("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
+  byId("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
   listen("hello state sample control requests socket status theme straight aspect", refresh);
-  listen("selected", forget);
+  listen("selected", onSelected);
 }

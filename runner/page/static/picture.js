@@ -1,7 +1,7 @@
 /**
  * A decoded picture that can be painted, in one of two ways. With a GPU the VideoFrame itself is drawn. Without one,
  * Chromium's drawImage(VideoFrame) in a worker waits for the page's main thread, so that a busy page would stop all
- * video and its alarms: then the planes are copied out of the frame and converted to pixels here, without waiting.
+ * video and its alarms. So the planes are copied out of the frame and converted to pixels here, without waiting.
  */
 
 import { toRgba } from "./yuv.js";
@@ -9,12 +9,12 @@ import { toRgba } from "./yuv.js";
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 /** @typedef {"I420"|"NV12"} Format */
 const FORMATS = ["I420", "NV12"];
-const SPARES = 16;
-const ASK_MS = 3000;
+const MAX_SPARES = 16;
+const GPU_CHECK_MS = 3000;
 
 /** @typedef {{bytes: Uint8Array, image: ImageData}} Memory */
 /** @type {Memory[]} */
-const spare = []; // memory of closed pictures
+const spare = []; // memory of closed pictures, for reuse
 
 /** A frame, unchanged; closed when the next one is shown. */
 class FramePicture {
@@ -30,7 +30,7 @@ class FramePicture {
     context.drawImage(this.frame, 0, 0, width, height);
   }
 
-  /** Into the texture that is bound. @param {WebGL2RenderingContext} gl */
+  /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
   upload(gl) {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, this.frame);
   }
@@ -81,7 +81,7 @@ class PlanePicture {
     context.drawImage(still, 0, 0, width, height);
   }
 
-  /** Into the texture that is bound. @param {WebGL2RenderingContext} gl */
+  /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
   upload(gl) {
     const { width, height, data } = this.pixels();
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, data);
@@ -94,19 +94,19 @@ class PlanePicture {
 
   close() {
     spare.push(this.memory);
-    if (spare.length > SPARES) spare.shift(); // of another size, most likely
+    if (spare.length > MAX_SPARES) spare.shift(); // the oldest, most likely of another size
   }
 }
 
 /** Whether this browser draws with a GPU. The check takes a while: the first pictures are drawn without it. */
 export let hasGpu = false;
-setTimeout(() => (hasGpu = askForGpu()), ASK_MS);
+setTimeout(() => (hasGpu = detectGpu()), GPU_CHECK_MS);
 
-function askForGpu() {
+function detectGpu() {
   const context = typeof OffscreenCanvas === "undefined" ? null : new OffscreenCanvas(1, 1).getContext("webgl");
   if (!context) return false;
-  const more = context.getExtension("WEBGL_debug_renderer_info");
-  const name = context.getParameter(more ? more.UNMASKED_RENDERER_WEBGL : context.RENDERER);
+  const info = context.getExtension("WEBGL_debug_renderer_info");
+  const name = context.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : context.RENDERER);
   context.getExtension("WEBGL_lose_context")?.loseContext();
   return !SOFTWARE.test(name);
 }
@@ -117,7 +117,7 @@ function memoryFor(width, height, size) {
   return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
 }
 
-/** Whether a frame has square pixels in a known format, and can be converted to pixels here. */
+/** Whether a frame has square pixels in a known format, so that it can be converted here. */
 function isPlain({ displayWidth, displayHeight, visibleRect, format }) {
   return FORMATS.includes(format) && visibleRect.width === displayWidth && visibleRect.height === displayHeight;
 }

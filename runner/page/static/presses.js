@@ -1,26 +1,26 @@
-/** Which buttons of gamepads and wheels were just pressed. Pure. */
+/** Detects button presses of gamepads and wheels. Pure. */
 
-/** @typedef {{index: number, buttons: readonly {pressed: boolean}[]}} Pad as the browser states it */
+/** @typedef {{index: number, buttons: readonly {pressed: boolean}[]}} Pad as the Gamepad API reports it */
 
 export class Presses {
-  /** @type {Map<number, Set<number>>} by pad, the buttons that are held */
+  /** @type {Map<number, Set<number>>} by pad, the buttons held at the last poll */
   held = new Map();
 
   /**
-   * The buttons that are pressed and were not at the last look, each once. What is held when a pad comes counts after it
-   * was released.
-   * @param {Pad[]} pads all that are there
+   * The buttons pressed since the last poll, each once. A button that is held when a pad connects counts only after it was
+   * released.
+   * @param {Pad[]} pads all connected pads
    * @returns {number[]}
    */
-  look(pads) {
+  poll(pads) {
     const before = this.held;
     this.held = new Map(pads.map(({ index, buttons }) => [index, new Set(buttons.flatMap(({ pressed }, i) => (pressed ? [i] : [])))]));
     const pressed = [...this.held].flatMap(([index, held]) => [...held].filter((button) => before.has(index) && !before.get(index)?.has(button)));
     return [...new Set(pressed)];
   }
 
-  /** Count nothing that is held at the next look: the page was out of focus, and browsers reported no change meanwhile. */
-  forget() {
+  /** Ignore buttons that are held at the next poll: browsers report no changes while the page is out of focus. */
+  reset() {
     this.held = new Map();
   }
 }

@@ -11,7 +11,7 @@
  * @property {{width: number, height: number, left: number, top: number}} native the source's image, and where the full image begins in it
  */
 
-const BESIDE = 1e-6; // a pinhole sees nothing whose depth is a smaller part of its distance from the axis
+const MIN_DEPTH = 1e-6; // smallest ratio of depth to distance from the axis that a pinhole sees
 const BEHIND = 0.9 * Math.PI; // rad from the axis: beyond it a line through the back of a fisheye would cross its image
 
 /**
@@ -30,7 +30,7 @@ export function projection({ pose, fov_deg, lens, native }) {
     const [depth, across, below] = [dot(ray, forward), dot(ray, right), dot(ray, down)];
     const aside = Math.hypot(across, below);
     const angle = Math.atan2(aside, depth);
-    if (lens === "fisheye" ? angle > BEHIND : depth <= BESIDE * aside) return null;
+    if (lens === "fisheye" ? angle > BEHIND : depth <= MIN_DEPTH * aside) return null;
     if (aside === 0) return { ...middle };
     const radius = focal * (lens === "fisheye" ? angle : aside / depth);
     return { x: middle.x + (across / aside) * radius, y: middle.y + (below / aside) * radius };
@@ -38,7 +38,7 @@ export function projection({ pose, fov_deg, lens, native }) {
 }
 
 /**
- * The inverse, of a pinhole: a function from a point of the full image to a place that is seen there, 1 m deep.
+ * The inverse for a pinhole: a function from a point of the full image to the place seen there at a depth of 1 m.
  * @param {Optics} optics
  * @returns {(point: Point) => Place}
  */

@@ -1,4 +1,4 @@
-/** Regions of interest, chosen by hand: zoomed, moved, in the full image's aspect ratio. Pure; px of the full image. */
+/** Regions of interest set by hand: zoomed, moved, kept in the full image's aspect ratio. Pure; px of the full image. */
 
 export const SMALLEST = 16;
 
@@ -18,8 +18,8 @@ export function inside({ x, y, width, height }, full) {
 const limit = (value, low, high) => Math.max(low, Math.min(value, high));
 
 /**
- * A region larger by a factor, in which a point stays where it was. It keeps its aspect ratio, until a side is as long as
- * the image's: then the other one grows alone, up to the full image.
+ * A region scaled by a factor about a point, which stays where it is. It keeps its aspect ratio until one side reaches the
+ * image's; then only the other one grows, up to the full image.
  * @param {Rectangle} region  @param {{x: number, y: number}} point  @param {number} factor  @param {Size} full
  */
 export function zoomed({ x, y, width, height }, point, factor, full) {
@@ -29,12 +29,12 @@ export function zoomed({ x, y, width, height }, point, factor, full) {
   return inside({ x: x + share(point.x, x, width) * (width - wide), y: y + share(point.y, y, height) * (height - high), width: wide, height: high }, full);
 }
 
-/** @param {Rectangle} region  @param {{x: number, y: number}} way  @param {Size} full */
-export const moved = ({ x, y, ...size }, way, full) => inside({ x: x + way.x, y: y + way.y, ...size }, full);
+/** @param {Rectangle} region  @param {{x: number, y: number}} offset  @param {Size} full */
+export const moved = ({ x, y, ...size }, offset, full) => inside({ x: x + offset.x, y: y + offset.y, ...size }, full);
 
 /**
  * The largest part of a region with an aspect ratio, at the corner where a drag began.
- * @param {Rectangle} region  @param {number} aspect width of a height  @param {{right: boolean, down: boolean}} towards where the drag went
+ * @param {Rectangle} region  @param {number} aspect width / height  @param {{right: boolean, down: boolean}} towards where the drag went
  * @returns {Rectangle}
  */
 export function withAspect({ x, y, width, height }, aspect, { right, down }) {

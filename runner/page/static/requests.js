@@ -6,11 +6,11 @@
 import { inControl, listen, note, publish, store } from "./store.js";
 import { send } from "./link.js";
 
-const GIVE_UP_MS = 2000; // after the station itself would have answered "timed out"
+const GIVE_UP_MS = 2000; // after the station should have answered "timed out" itself
 const PREFIX = Math.random().toString(36).slice(2, 8);
 
 /**
- * @typedef {{id: string, control: string, event: Record<string, any>, words: string, sent: number, timer: any}} Request
+ * @typedef {{id: string, control: string, event: Record<string, any>, description: string, sent: number, timer: any}} Request
  * @typedef {Omit<Request, "timer"> & {result: string, reason: string, answered: number}} Answered
  * @type {{pending: Map<string, Request>, answered: Answered[]}}
  */
@@ -21,20 +21,20 @@ let count = 0;
  * Send an event.
  * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it replaces an older one
  * @param {object} event without id
- * @param {string} words what is requested, for the news if it fails
- * @returns {string|undefined} its id; undefined: this page may not ask
+ * @param {string} description for the news if the request fails
+ * @returns {string|undefined} its id; undefined: this page is not in control
  */
-export function request(control, event, words) {
-  if (!inControl()) return void complain(whyNoControl());
+export function request(control, event, description) {
+  if (!inControl()) return void showProblem(whyNoControl());
   const id = `${PREFIX}-${++count}`;
-  const timer = setTimeout(() => answer({ id, result: "timed out", reason: "no answer from the station" }), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
-  requests.pending.set(id, { id, control, event, words, timer, sent: Date.now() });
+  const timer = setTimeout(() => onReply({ id, result: "timed out", reason: "no answer from the station" }), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
+  requests.pending.set(id, { id, control, event, description, timer, sent: Date.now() });
   send({ id, ...event });
   publish("requests");
   return id;
 }
 
-/** The newest request that waits for an answer and sets this control. */
+/** The newest unanswered request of a control. */
 export function pending(control) {
   return [...requests.pending.values()].findLast((each) => each.control === control);
 }
@@ -45,26 +45,26 @@ export function whyNoControl() {
   return store.view === "monitor" ? "the page of this monitor does not hold control" : "take control first (t)";
 }
 
-/** Report a problem in a toast. */
-export function complain(text) {
+/** Show a problem in a toast. */
+export function showProblem(text) {
   publish("toast", { text, level: "problem" });
 }
 
-function answer({ id, result, reason }) {
-  const asked = requests.pending.get(id);
-  if (!asked) return;
-  clearTimeout(asked.timer);
+function onReply({ id, result, reason }) {
+  const entry = requests.pending.get(id);
+  if (!entry) return;
+  clearTimeout(entry.timer);
   requests.pending.delete(id);
-  const { timer, ...kept } = asked;
+  const { timer, ...kept } = entry;
   requests.answered = [...requests.answered, { ...kept, result, reason, answered: Date.now() }].slice(-200);
-  if (result !== "applied") failed(`${asked.words}: ${result}${reason ? `: ${reason}` : ""}`);
+  if (result !== "applied") reportFailure(`${entry.description}: ${result}${reason ? `: ${reason}` : ""}`);
   publish("requests");
 }
 
-function failed(text) {
+function reportFailure(text) {
   note({ text, level: "problem" });
-  complain(text);
+  showProblem(text);
 }
 
-listen("reply", answer);
-listen("unsent", (id) => answer({ id, result: "timed out", reason: "no connection to the station" }));
+listen("reply", onReply);
+listen("unsent", (id) => onReply({ id, result: "timed out", reason: "no connection to the station" }));

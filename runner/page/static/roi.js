@@ -1,23 +1,23 @@
 /** Choosing a region of interest by dragging a rectangle on the picture, in mode S. */
 
-import { camera, decided, inControl, listen, mode, publish } from "./store.js";
+import { camera, decisionOf, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { toBox, toPicture, visible } from "./framing.js";
 import { isStraight } from "./straighten.js";
 import { inside, SMALLEST, withAspect } from "./region.js";
 import { make, sameRegion } from "./format.js";
 
-const START_PX = 6; // the pointer moves less than this in a click
+const DRAG_START_PX = 6; // a click moves the pointer less than this
 const ASPECT = "tod-roi-aspect";
-const views = new Map(); // by camera: shows the region that is pending
+const refreshers = new Map(); // by camera: shows the pending region
 
-/** The region on the picture: the one read back, otherwise the one decided. */
-export const seenRegion = (name) => {
-  const now = decided(name);
+/** The region that the picture shows: as read back, otherwise as decided. */
+export const shownRegion = (name) => {
+  const now = decisionOf(name);
   return now?.applied.roi ?? now?.roi ?? null;
 };
 
-/** Whether a region that is dragged has the full image's aspect ratio. */
+/** Whether dragged regions keep the full image's aspect ratio. */
 export const isLocked = () => localStorage.getItem(ASPECT) === "locked";
 
 export function toggleLocked() {
@@ -27,7 +27,7 @@ export function toggleLocked() {
 
 const sizeOf = ({ clientWidth: width, clientHeight: height }) => ({ width, height });
 
-/** A region of the full image from two corners on the box, in whole pixels, inside what is visible and not too small. */
+/** A region of the full image from two corners in the box, in whole pixels, within the visible part and not too small. */
 function regionOf(box, view, roi, full, a, b) {
   const corners = [a, b].map((corner) => toPicture(corner, sizeOf(box), roi, view));
   const seen = visible(sizeOf(box), roi, view);
@@ -56,7 +56,7 @@ export function sendRegion(name, roi) {
   request(`roi:${name}`, { event: "roi_set", camera: name, x, y, width, height }, `ROI of ${name}`);
 }
 
-/** The whole image of a camera of the vehicle. */
+/** The full image of a camera. */
 export function fullRegion(name) {
   const full = camera(name);
   if (!full) throw new Error(`no camera ${name}`);
@@ -66,7 +66,7 @@ export function fullRegion(name) {
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
-  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; straighten it no longer (l), or type its numbers";
+  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; turn straightening off (l), or type the numbers";
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
@@ -77,15 +77,15 @@ export function whyNoRegion(name) {
 export function dragRegion(name, box, view) {
   const rectangle = make("div", { class: "roi-drag", hidden: true });
   box.append(rectangle);
-  let from = null;
-  let dragging = false;
+  let origin = null;
+  let isDragging = false;
 
   const point = (event) => {
     const bounds = box.getBoundingClientRect();
     return { x: event.clientX - bounds.x, y: event.clientY - bounds.y };
   };
   const place = (roi) => {
-    const seen = seenRegion(name);
+    const seen = shownRegion(name);
     if (!seen) return;
     const shown = toBox({ ...roi, x: roi.x - seen.x, y: roi.y - seen.y }, sizeOf(box), seen, view());
     Object.assign(rectangle.style, {
@@ -93,55 +93,55 @@ export function dragRegion(name, box, view) {
     });
     rectangle.hidden = false;
   };
-  const region = (event) => regionOf(box, view(), seenRegion(name), fullRegion(name), from, point(event));
+  const region = (event) => regionOf(box, view(), shownRegion(name), fullRegion(name), origin, point(event));
   const end = () => {
-    from = null;
-    dragging = false;
+    origin = null;
+    isDragging = false;
     refresh();
   };
   const refresh = () => {
-    if (dragging) return;
-    const wish = waiting(name);
-    if (wish && seenRegion(name) && !isStraight(name)) place(wish);
+    if (isDragging) return;
+    const wanted = pendingRegion(name);
+    if (wanted && shownRegion(name) && !isStraight(name)) place(wanted);
     else rectangle.hidden = true;
   };
 
   box.addEventListener("pointerdown", (event) => {
-    dragging = false;
+    isDragging = false;
     if (!event.isPrimary) return end(); // a second finger: zoom.js
-    from = event.button === 0 && seenRegion(name) ? point(event) : null;
+    origin = event.button === 0 && shownRegion(name) ? point(event) : null;
   });
   box.addEventListener("pointermove", (event) => {
-    if (!from || !event.isPrimary) return;
-    if (!(event.buttons & 1) || !seenRegion(name)) return end(); // released elsewhere, or the vehicle is offline
+    if (!origin || !event.isPrimary) return;
+    if (!(event.buttons & 1) || !shownRegion(name)) return end(); // released elsewhere, or the vehicle is offline
     const here = point(event);
-    if (!dragging && Math.hypot(here.x - from.x, here.y - from.y) < START_PX) return;
-    if (!dragging && whyNoRegion(name)) {
+    if (!isDragging && Math.hypot(here.x - origin.x, here.y - origin.y) < DRAG_START_PX) return;
+    if (!isDragging && whyNoRegion(name)) {
       publish("toast", { text: `${name}: ${whyNoRegion(name)}`, level: "hint" });
       return end();
     }
-    dragging = true;
+    isDragging = true;
     box.setPointerCapture(event.pointerId);
     place(region(event));
   });
   box.addEventListener("pointerup", (event) => {
-    const wish = dragging && seenRegion(name) ? region(event) : null;
+    const chosen = isDragging && shownRegion(name) ? region(event) : null;
     end();
-    if (wish) sendRegion(name, wish);
+    if (chosen) sendRegion(name, chosen);
   });
   box.addEventListener("pointercancel", end);
-  views.set(name, refresh);
+  refreshers.set(name, refresh);
 }
 
-listen("requests state straight", () => views.forEach((refresh) => refresh()));
+listen("requests state straight", () => refreshers.forEach((refresh) => refresh()));
 
 /**
- * The region that was requested or decided, and is not yet the one on the picture.
+ * The region that was requested or decided but that the picture does not show yet.
  * @returns {import("./framing.js").Rectangle|null}
  */
-export function waiting(name) {
-  const asked = pending(`roi:${name}`)?.event;
-  if (asked) return { x: asked.x, y: asked.y, width: asked.width, height: asked.height };
-  const now = decided(name);
+export function pendingRegion(name) {
+  const requested = pending(`roi:${name}`)?.event;
+  if (requested) return { x: requested.x, y: requested.y, width: requested.width, height: requested.height };
+  const now = decisionOf(name);
   return now?.applied.roi && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
 }

@@ -1,68 +1,68 @@
 /**
- * A slider and a number for one value in kbit/s. The thumb follows the hand; the value in force is shown beside it as a
- * mark and a number; after the vehicle's answer the thumb moves to the value in force.
+ * A slider and a number field for one value in kbit/s. The thumb follows the pointer; a tick and a number next to it show
+ * the value in force, to which the thumb moves after the vehicle's answer.
  */
 
 import { pending } from "./requests.js";
-import { make, mark, whole, write } from "./format.js";
+import { make, setAttribute, setText, whole } from "./format.js";
 import { STEPS, throttle, toKbps, toStep } from "./scale.js";
 
 const SEND_EVERY_MS = 200;
 const HAND_MS = 400;
 
 /**
- * @param {object} what label, data (value of data-control), id of the number, about() what the value is of, send(kbps, about),
+ * @param {object} options label, data (value of data-control), id of the number field, target() of the value, send(kbps, target),
  *   control() name of the request
  * @returns {{element, update({value, max, why}), reset()}}
  */
-export function makeSlider({ label, data, id, about, send, control }) {
+export function makeSlider({ label, data, id, target, send, control }) {
   const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": `${label}, slider`, "data-control": `${data}-slider` });
   const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, "aria-label": `${label}, kbit/s`, "data-control": data });
   const tick = make("i", { class: "tick", "aria-hidden": "true" });
   const inForce = make("span", { class: "in-force" });
   const element = make("div", { class: "slider" }, make("div", { class: "track" }, range, tick), number, inForce);
   let max = 1;
-  let edited = false;
-  let touched = -Infinity;
-  let held = false;
+  let isEdited = false;
+  let touchedAt = -Infinity;
+  let isHeld = false;
 
   const chosen = () => toKbps(+range.value, max);
-  const wish = throttle((value) => send(value.kbps, value.about), SEND_EVERY_MS);
-  range.addEventListener("pointerdown", () => (held = true));
-  range.addEventListener("pointerup", () => (held = false));
-  range.addEventListener("pointercancel", () => (held = false));
+  const sendSoon = throttle((value) => send(value.kbps, value.target), SEND_EVERY_MS);
+  range.addEventListener("pointerdown", () => (isHeld = true));
+  range.addEventListener("pointerup", () => (isHeld = false));
+  range.addEventListener("pointercancel", () => (isHeld = false));
   range.addEventListener("input", () => {
-    touched = performance.now();
+    touchedAt = performance.now();
     number.value = String(chosen());
-    wish({ kbps: chosen(), about: about?.() }); // sent a moment later, when another camera may be selected
+    sendSoon({ kbps: chosen(), target: target?.() }); // by the time it is sent, another camera may be selected
   });
-  number.addEventListener("input", () => (edited = true));
-  number.addEventListener("blur", () => (edited = false));
+  number.addEventListener("input", () => (isEdited = true));
+  number.addEventListener("blur", () => (isEdited = false));
   number.addEventListener("change", () => {
-    edited = false;
+    isEdited = false;
     if (number.value === "") return;
     const kbps = Math.max(1, Math.min(max, Math.round(+number.value)));
     range.value = String(toStep(kbps, max));
-    send(kbps, about?.());
+    send(kbps, target?.());
   });
 
   return {
     element,
-    reset: () => (edited = held = false),
-    update({ value, max: most, why }) {
-      max = most || 1;
-      mark(number, "max", max);
+    reset: () => (isEdited = isHeld = false),
+    update({ value, max: limit, why }) {
+      max = limit || 1;
+      setAttribute(number, "max", max);
       range.disabled = number.disabled = Boolean(why);
       range.title = number.title = why ?? "";
-      const asked = pending(control());
-      mark(element, "data-pending", asked ? "" : null);
+      const isPending = Boolean(pending(control()));
+      setAttribute(element, "data-pending", isPending ? "" : null);
       tick.hidden = !Number.isFinite(value);
       tick.style.setProperty("--at", String(toStep(value || 1, max) / STEPS));
-      write(inForce, asked ? `◌ now ${whole(value)}` : `now ${whole(value)}`);
-      mark(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(value)}`);
-      if (held || asked || performance.now() - touched < HAND_MS) return;
+      setText(inForce, isPending ? `◌ now ${whole(value)}` : `now ${whole(value)}`);
+      setAttribute(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(value)}`);
+      if (isHeld || isPending || performance.now() - touchedAt < HAND_MS) return;
       range.value = String(toStep(value || 1, max));
-      if (!edited) number.value = Number.isFinite(value) ? String(Math.round(value)) : "";
+      if (!isEdited) number.value = Number.isFinite(value) ? String(Math.round(value)) : "";
     },
   };
 }

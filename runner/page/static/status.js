@@ -1,20 +1,20 @@
-/** The status of a tile's stream: judged from times alone, so that it can be tested without video. */
+/** The status of a tile's stream, judged from times alone so that it can be tested without video. */
 
 export const MOVING = ["live", "late", "damaged"];
-export const STANDING = ["frozen", "lost"]; // though pictures should come
+export const STALLED = ["frozen", "lost"]; // no new pictures although they are due
 
 const LOST_MS = 1000;
 const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
- * @typedef {object} Times what is known of a stream
+ * @typedef {object} Times the known state of a stream
  * @property {boolean} connected
  * @property {boolean} online
  * @property {boolean|null} on
  * @property {boolean|null} sending
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
- * @property {boolean} faulty whether the source has a fault: pictures that arrive may be repeated ones
+ * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
  * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream
  * @property {number} decoded likewise
@@ -40,12 +40,12 @@ export function judge(s, limits, now) {
 }
 
 /**
- * The words on an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
+ * The text of an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
  * @param {string} status
- * @param {number} since_ms since the newest unit, or since its source has a fault
+ * @param {number} since_ms since the newest unit, or since the source failed
  * @param {number} age_ms of the last late picture
  */
-export function words(status, since_ms, age_ms) {
+export function alarmText(status, since_ms, age_ms) {
   if (status === "frozen") return `FROZEN ${(Math.floor(since_ms / 200) / 5).toFixed(1)} s`;
   if (status === "late") return `LATE ${Math.round(age_ms / 10) * 10} ms`;
   if (status === "lost") return since_ms < 1e8 ? `LOST ${Math.floor(since_ms / 1000)} s` : "LOST";

@@ -1,24 +1,24 @@
 /** The steering angle at the time of a picture. Pure; rad, and ms on the station's clock. */
 
-const VALID_MS = 300; // an older angle says nothing
-const KEPT_MS = 5000; // a picture is not older
+const VALID_MS = 300; // an older angle is stale
+const KEPT_MS = 5000; // no picture is older
 
 export class Steering {
   /** @type {{at: number, rad: number}[]} rising in time */
   reported = [];
 
   /** @param {number} at when it was reported  @param {number} rad to the left */
-  heard(at, rad) {
+  onReport(at, rad) {
     this.reported = this.reported.filter((each) => each.at < at && at - each.at < KEPT_MS); // a clock may have been set back
     this.reported.push({ at, rad });
   }
 
   /**
-   * The angle when a picture was captured: between two reports in proportion, after the last one the same for 300 ms.
+   * The angle when a picture was captured: interpolated between two reports, and held for 300 ms after the last one.
    * @param {number} captured NaN if unknown
    * @returns {number|null}
    */
-  when(captured) {
+  angleAt(captured) {
     const after = this.reported.find(({ at }) => at >= captured);
     const before = this.reported.findLast(({ at }) => at < captured);
     if (after?.at === captured) return after.rad;

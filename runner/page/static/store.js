@@ -1,4 +1,4 @@
-/** The page's state, as received from the station; views listen for the kinds of message that they show. */
+/** The page's state, as received from the station; views listen for the kinds of messages that they show. */
 
 import { BIRDSEYE } from "./arrange.js";
 
@@ -6,7 +6,7 @@ const SHOWN_S = 300;
 const listeners = new Map();
 
 /**
- * What the station sends, as far as the page reads it.
+ * The part of the station's messages that the page uses.
  * @typedef {{x: number, y: number, width: number, height: number}} Region in px of the full image
  * @typedef {object} Camera of hello
  * @property {string} name
@@ -19,18 +19,18 @@ const listeners = new Map();
  * @property {"pinhole"|"fisheye"} lens
  * @property {{width: number, height: number, left: number, top: number}} native
  * @property {boolean} calibrated whether these were measured
- * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: by its place
+ * @property {"fit"|"fill"|null} framing of its picture in the Drive view; null: depends on its place
  * @property {string|null} codec
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello selected: in another window of this page; answer_s: by then the station has
- *   answered a request; late_ms: an older picture is late
+ * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello selected: in another window of this page; answer_s: the station
+ *   answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|null>}} Inputs by action
- * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: in force, the vehicle's own, and
- *   why another one cannot be saved
+ * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: places in force, the vehicle's own,
+ *   and why a layout cannot be saved
  * @typedef {import("./layout.js").Places} Places
- * @typedef {object} Applied what was read back from the elements
+ * @typedef {object} Applied the values read back from the elements
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
  * @property {{width: number, height: number}} [size] px
@@ -58,7 +58,7 @@ const listeners = new Map();
  * @property {number} allocated_kbps
  * @property {number} actual_kbps
  * @property {{lat: number, lon: number, speed_mps?: number}|null} position
- * @property {number|null} clock_bound_ms by how much latencies may be wrong; null: they are unknown
+ * @property {number|null} clock_bound_ms error bound of the latencies; null: they are unknown
  * @property {number|null} speed_factor advised share of full speed
  * @property {Record<string, CameraSample>} cameras
  * @typedef {{time: number, text: string, level: string}} Note
@@ -93,21 +93,21 @@ export const store = {
   state: null,
   sample: null,
   holder: "nobody",
-  elsewhere: false, // whether keys reach another window of this page
+  elsewhere: false, // whether another window of this page has the keyboard focus
   connected: false,
   notes: [],
   series: emptySeries([]),
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
-  ages: {}, // by camera, capture to drawing, by how much that may be wrong, and its parts on the page
-  slow: false, // whether too few of the pictures that come are drawn
-  skew_ms: null, // between the capture times of the oldest and of the newest picture on show
+  ages: {}, // by camera, latency from capture to drawing, its error bound, and its parts on the page
+  slow: false, // whether too few of the received pictures are drawn
+  skew_ms: null, // between the capture times of the oldest and the newest picture shown
   selected: null,
   enlarged: null,
   view: "configure",
 };
 
-/** Call `listener(payload)` for each of the kinds of message (separated by spaces). */
+/** Call `listener(payload)` for messages of these kinds (separated by spaces). */
 export function listen(kinds, listener) {
   for (const kind of kinds.split(" ")) listeners.set(kind, [...(listeners.get(kind) ?? []), listener]);
 }
@@ -116,21 +116,21 @@ export function publish(kind, payload) {
   for (const listener of listeners.get(kind) ?? []) listener(payload);
 }
 
-/** Store a text message from the station. */
-export function take(message) {
+/** Store a text message from the station, and publish it. */
+export function onStationMessage(message) {
   const { kind } = message;
-  if (kind === "hello") hello(message);
+  if (kind === "hello") onHello(message);
   else if (kind === "state" || kind === "sample") store[kind] = message;
   else if (kind === "control") Object.assign(store, { holder: message.holder, elsewhere: message.elsewhere });
   else if (kind === "layout" && store.hello) store.hello.layout = message;
-  else if (kind === "selection") return follow(message.camera);
-  else if (kind === "history") history(message);
+  else if (kind === "selection") return setSelected(message.camera);
+  else if (kind === "history") onHistory(message);
   else if (kind === "note") return note(message);
-  if (kind === "sample") extend(message);
+  if (kind === "sample") appendSample(message);
   publish(kind, message);
 }
 
-function hello(message) {
+function onHello(message) {
   store.hello = message;
   store.notes = [];
   const names = message.cameras.map(({ name }) => name);
@@ -141,7 +141,7 @@ function hello(message) {
 }
 
 /**
- * One line of news, newest first; lines from the page itself are added here too.
+ * Add a line of news, from the station or from the page itself; newest first.
  * @param {{time?: number, text: string, level?: string}} note
  */
 export function note({ time = Date.now() / 1000, text, level = "note" }) {
@@ -155,19 +155,19 @@ export const camera = (name) => store.hello?.cameras.find((each) => each.name ==
  * @param {string|null} name
  * @returns {Decision|undefined}
  */
-export const decided = (name) => (store.state?.online && name ? store.state.cameras[name] : undefined);
+export const decisionOf = (name) => (store.state?.online && name ? store.state.cameras[name] : undefined);
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
-/** Select a camera in this window, and thereby in the others of this page. */
+/** Select a camera in all windows of this page. */
 export function select(name) {
   if (!camera(name) || store.selected === name) return;
-  follow(name);
+  setSelected(name);
   publish("chosen", name);
 }
 
-/** A camera was selected, which a monitor need not show. */
-function follow(name) {
+/** Set the selection; a monitor may not show that camera. */
+function setSelected(name) {
   store.selected = name;
   publish("selected", name);
 }
@@ -178,7 +178,7 @@ export function enlarge(name) {
   publish("enlarged", name);
 }
 
-// --- the last five minutes, once a second -----------------------------------------------------------------------------
+// --- the last five minutes, one sample per second ---------------------------------------------------------------------
 
 /** @param {string[]} names */
 function emptySeries(names) {
@@ -189,16 +189,16 @@ function emptySeries(names) {
   return { ...columns, cameras };
 }
 
-function history(message) {
+function onHistory(message) {
   store.series = emptySeries(Object.keys(store.series.cameras));
   for (const key of Object.keys(store.series)) if (key !== "cameras") store.series[key] = [...(message[key] ?? [])];
   for (const [name, columns] of Object.entries(store.series.cameras))
     for (const key of Object.keys(columns)) columns[key] = [...(message.cameras?.[name]?.[key] ?? [])];
 }
 
-function extend(sample) {
+function appendSample(sample) {
   const last = store.series.time.at(-1);
-  if (last !== undefined && sample.time < last - 0.99) store.series = emptySeries(Object.keys(store.series.cameras)); // the clock was set
+  if (last !== undefined && sample.time < last - 0.99) store.series = emptySeries(Object.keys(store.series.cameras)); // the clock was set back
   else if (last !== undefined && sample.time < last + 0.99) return;
   const { series } = store;
   push(series, "time", sample.time);

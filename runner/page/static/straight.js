@@ -1,10 +1,10 @@
-/** A fisheye's image as a lens without distortion would have shown it from the same place: lines stay straight. Pure; px. */
+/** A fisheye's image as a rectilinear lens in the same place would show it: straight lines stay straight. Pure; px. */
 
 import { projection, sightline } from "./projection.js";
 import { trianglesOf } from "./ground.js";
 
-const STRAIGHT_DEG = 100; // more is stretched too much towards the sides
-const COLUMNS = 64; // of cells; between their vertices the image is taken for linear, off by 0.1 px of 1280
+const MAX_FOV_DEG = 100; // a wider image is stretched too much towards the sides
+const COLUMNS = 64; // of cells; interpolation between their vertices has an error of 0.1 px of 1280
 
 /** @typedef {import("./projection.js").Optics} Optics */
 
@@ -12,19 +12,19 @@ const COLUMNS = 64; // of cells; between their vertices the image is taken for l
 export const canStraighten = ({ lens }) => lens === "fisheye";
 
 /**
- * The lens without distortion. Its image is as large as the camera's, whose middle it magnifies.
+ * The rectilinear lens. Its image has the camera's size, and magnifies the middle.
  * @template {{pose: Optics["pose"]|null, fov_deg: number, native: Optics["native"]}} C
  * @param {C} camera
  */
 export const straightOptics = (camera) => ({
   ...camera,
-  pose: camera.pose ?? { x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0 }, // whatever it is, it cancels out
-  fov_deg: Math.min(STRAIGHT_DEG, camera.fov_deg),
+  pose: camera.pose ?? { x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0 }, // any pose will do: it cancels out
+  fov_deg: Math.min(MAX_FOV_DEG, camera.fov_deg),
   lens: /** @type {const} */ ("pinhole"),
 });
 
 /**
- * Points of the straight image, and which points of the camera's image are shown there.
+ * Points of the straightened image, and the points of the camera's image shown there.
  * @param {{pose: Optics["pose"]|null, fov_deg: number, lens: Optics["lens"], native: Optics["native"], width: number, height: number}} camera
  */
 export function straightMesh(camera) {

@@ -6,7 +6,7 @@ import { FILLS, Warp } from "./warp.js";
 export class StraightView {
   /**
    * @param {any} camera as in hello
-   * @throws {Error} for people to read
+   * @throws {Error} with a message for the operator
    */
   constructor(camera) {
     const { places, points, shares, triangles } = straightMesh(camera);
@@ -18,14 +18,14 @@ export class StraightView {
   }
 
   /**
-   * Fill a canvas with the straight image; black is what the picture does not show.
+   * Fill a canvas with the straightened image; parts that the picture does not show are black.
    * @param {import("./picture.js").Picture} picture
    * @param {import("./framing.js").Rectangle} region of the full image that it shows
-   * @throws {Error} for people to read
+   * @throws {Error} with a message for the operator
    */
   paint(context, picture, region) {
     const { width, height } = context.canvas;
-    if (this.warp.lost) throw new Error("the browser has taken its graphics away");
+    if (this.warp.lost) throw new Error("the browser dropped the WebGL context");
     this.warp.draw({ width, height }, this.frame, [{ layer: this.layer, fill: FILLS.picture, picture, region }]);
     context.drawImage(this.warp.canvas, 0, 0);
   }

@@ -1,4 +1,4 @@
-/** Which fisheyes' pictures are straightened: the operator's choice, for each camera. The worker does it. */
+/** Which fisheye pictures are straightened: the operator's choice per camera. The worker straightens them. */
 
 import { camera, listen, publish, store } from "./store.js";
 import { canStraighten } from "./straight.js";
@@ -9,33 +9,33 @@ const chosen = new Set(localStorage.getItem(CHOICE)?.split(" "));
 
 /** @param {string|null} name */
 export function isStraight(name) {
-  const about = camera(name);
-  return about !== undefined && canStraighten(about) && chosen.has(about.name);
+  const info = camera(name);
+  return info !== undefined && canStraighten(info) && chosen.has(info.name);
 }
 
-/** Straighten a camera's picture, or show it as it comes. @param {string|null} name */
+/** Straighten a camera's picture, or show the original. @param {string|null} name */
 export function toggleStraight(name = store.selected) {
-  const about = camera(name);
-  if (!about) return;
-  if (!canStraighten(about)) return publish("toast", { text: `${about.name}: lines are straight already; only a fisheye bends them`, level: "hint" });
-  if (!chosen.delete(about.name)) chosen.add(about.name);
-  tell();
+  const info = camera(name);
+  if (!info) return;
+  if (!canStraighten(info)) return publish("toast", { text: `${info.name}: lines are already straight; only a fisheye bends them`, level: "hint" });
+  if (!chosen.delete(info.name)) chosen.add(info.name);
+  applyChoice();
 }
 
-function tell() {
+function applyChoice() {
   localStorage.setItem(CHOICE, [...chosen].join(" "));
   showStraight([...chosen]);
   publish("straight");
 }
 
-/** The worker could not. */
-function crooked({ camera: name, why }) {
+/** The worker could not straighten a picture. */
+function onStraightenFailed({ camera: name, why }) {
   chosen.delete(name);
-  tell();
+  applyChoice();
   publish("toast", { text: `${name}: the picture cannot be straightened: ${why}`, level: "problem" });
 }
 
 export function startStraight() {
-  listen("hello", tell);
-  listen("crooked", crooked);
+  listen("hello", applyChoice);
+  listen("crooked", onStraightenFailed);
 }

@@ -1,22 +1,22 @@
-/** The tabs of the side panel, for when there is no room for everything at once. */
+/** The tabs of the side panel, used when there is no room for all panels. */
 
 import { publish } from "./store.js";
-import { by, mark } from "./format.js";
+import { byId, setAttribute } from "./format.js";
 
-const tabs = [...by("tabs").querySelectorAll("button")];
-const side = by("side");
+const tabs = [...byId("tabs").querySelectorAll("button")];
+const side = byId("side");
 
 export function openTab(name) {
   side.dataset.tab = name;
   for (const tab of tabs) {
     const open = tab.dataset.tab === name;
-    mark(tab, "aria-selected", open);
-    mark(tab, "tabindex", open ? 0 : -1);
+    setAttribute(tab, "aria-selected", open);
+    setAttribute(tab, "tabindex", open ? 0 : -1);
   }
   publish("tab", name);
 }
 
-function move(event) {
+function onKeyDown(event) {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
   if (!step) return;
   const at = tabs.findIndex((tab) => tab.dataset.tab === side.dataset.tab);
@@ -27,6 +27,6 @@ function move(event) {
 
 export function startTabs() {
   for (const tab of tabs) tab.addEventListener("click", () => openTab(tab.dataset.tab));
-  by("tabs").addEventListener("keydown", move);
+  byId("tabs").addEventListener("keydown", onKeyDown);
   openTab("camera");
 }

@@ -1,94 +1,94 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
-import { camera, decided, enlarge, inControl, listen, publish, select, store } from "./store.js";
-import { drawFirst, giveCanvas, giveGuides, tellSize } from "./link.js";
+import { camera, decisionOf, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { drawFirst, reportSize, transferCanvas, transferGuides } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
-import { dragRegion, seenRegion } from "./roi.js";
+import { dragRegion, shownRegion } from "./roi.js";
 import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
 import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
 import { birdseyeSize, placeBirdseye } from "./birdseye.js";
-import { shownWords, WHOLE } from "./framing.js";
+import { framingText, WHOLE } from "./framing.js";
 import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
 import { colourOf } from "./colours.js";
-import { by, factor, latency, make, mark, size, spoken, whole, write } from "./format.js";
+import { byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
-const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the picture has the whole word
+const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
 const ALARMS = ["late", "damaged", "frozen", "lost", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
-export const STILL = [...SILENT, "frozen"]; // what is on show has another age than when it was drawn
+export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
-const UNCERTAIN_MS = 20; // a latency that may be wrong by more is marked
+const UNCERTAIN_MS = 20; // a latency with a larger error bound is marked
 const HEAD = 28; // header and border of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
-const area = by("tiles");
-const scene = by("scene");
+const area = byId("tiles");
+const scene = byId("scene");
 const tiles = new Map();
 /** @type {import("./layout.js").Band[]} */
 let bands = [];
-let described = ""; // the cameras for which there are tiles
-let grouped = ""; // the bands that they are in
+let camerasKey = ""; // the cameras that the tiles were built for
+let bandsKey = ""; // the bands that they were grouped into
 /** @type {Record<string, import("./layout.js").Place>|null} */
 let draft = null; // the layout that is being edited
-let hinted = false; // whether the way back from an enlarged picture was shown
+let wasHinted = false; // whether the hint on how to leave an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
-  for (const { target } of entries) tellFrame(target.getAttribute("data-name"));
+  for (const { target } of entries) reportFrame(target.getAttribute("data-name"));
 });
 
 // --- building ---------------------------------------------------------------------------------------------------------
 
 function build({ cameras }) {
-  const text = JSON.stringify(cameras);
-  if (text !== described) {
-    described = text;
-    grouped = "";
+  const key = JSON.stringify(cameras);
+  if (key !== camerasKey) {
+    camerasKey = key;
+    bandsKey = "";
     draft = null;
     sizes.disconnect();
     tiles.clear();
-    cameras.forEach(tile);
+    cameras.forEach(buildTile);
   }
-  group();
+  groupTiles();
   refreshAll();
 }
 
 /** Show a layout that is being edited; null: the one in force. */
 export function showDraft(places) {
   draft = places;
-  group();
+  groupTiles();
 }
 
 /** Put the tiles into bands. */
-function group() {
+function groupTiles() {
   const cameras = store.hello?.cameras ?? [];
   bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
-  const text = JSON.stringify(bands);
-  if (text === grouped) return lay();
-  grouped = text; // moving a tile takes the focus away
-  const row = ({ grid, tiles: those }) => make("div", { class: grid ? "row grid" : "row" }, ...those.map((its) => tiles.get(its.camera.name).element));
+  const key = JSON.stringify(bands);
+  if (key === bandsKey) return layOut();
+  bandsKey = key; // only if changed: moving a tile drops the focus
+  const row = ({ grid, tiles: bandTiles }) => make("div", { class: grid ? "row grid" : "row" }, ...bandTiles.map((tile) => tiles.get(tile.camera.name).element));
   area.replaceChildren(...bands.map(row));
-  lay();
+  layOut();
 }
 
 /** Height of a tile without its picture, as in the style sheet. */
-function chrome() {
+function chromeHeight() {
   if (store.view === "monitor") return 0;
   const style = getComputedStyle(document.documentElement);
   const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
   return (HEAD + below) * scale;
 }
 
-function sayNoVideo() {
+function showNoVideo() {
   const text = "Video needs a browser with WebCodecs: Chromium, Chrome or Edge 94 or newer, on localhost or over TLS.";
   area.before(make("p", { class: "no-video", role: "alert" }, text));
 }
 
-function tile({ name, pose }) {
-  const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${spoken(name)}` });
+function buildTile({ name, pose }) {
+  const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${displayName(name)}` });
   const parts = {
     view: WHOLE,
     canvas,
@@ -108,68 +108,68 @@ function tile({ name, pose }) {
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
     "article",
-    { class: "tile", "data-camera": name, "data-status": "synchronising", tabindex: "0", "aria-label": `camera ${spoken(name)}`,
+    { class: "tile", "data-camera": name, "data-status": "synchronising", tabindex: "0", "aria-label": `camera ${displayName(name)}`,
       onclick: () => select(name), onfocus: () => select(name) },
     head, parts.box, foot,
   );
   parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, reason, refused, ...parts });
-  giveCanvas(name, canvas);
+  transferCanvas(name, canvas);
   if (pose) {
     const guides = make("canvas", { class: "guides", "data-guides": name, "aria-hidden": "true" });
     canvas.after(guides);
-    giveGuides(name, guides);
+    transferGuides(name, guides);
   }
   dragRegion(name, parts.box, () => tiles.get(name).view);
   zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
 }
 
-/** Ask to switch a camera on or off: the opposite of the state that the vehicle reports. */
+/** Request to switch a camera on or off: the opposite of the state that the vehicle reports. */
 export function switchCamera(name) {
-  const on = !decided(name)?.on;
+  const on = !decisionOf(name)?.on;
   request(`on:${name}`, { event: "camera_switched", camera: name, on }, `${name} ${on ? "on" : "off"}`);
 }
 
 // --- layout -----------------------------------------------------------------------------------------------------------
 
-function lay() {
+function layOut() {
   drawFirst(store.enlarged ?? rolesOf(store.hello?.cameras ?? []).front?.name ?? null);
-  if (store.view === "drive") return layDrive();
+  if (store.view === "drive") return layOutDrive();
   placeBirdseye(undefined);
   for (const [name, { element }] of tiles) {
-    const its = camera(name);
+    const info = camera(name);
     element.hidden = false;
     Object.assign(element.style, { left: "", top: "" });
-    frame(name, its && store.view === "monitor" ? viewOf(its) : WHOLE);
+    setView(name, info && store.view === "monitor" ? viewOf(info) : WHOLE);
   }
-  layBands();
-  layEnlarged();
+  layOutBands();
+  layOutEnlarged();
 }
 
-/** Bands as the layout places them. */
-function layBands() {
-  const rest = chrome();
+/** The bands of the layout. */
+function layOutBands() {
+  const rest = chromeHeight();
   const heights = heightsOf(bands, area.clientWidth, area.clientHeight, rest);
   for (const [i, band] of bands.entries()) {
     const { column, boxes } = boxesOf(band, heights[i], area.clientWidth, rest);
     const tracks = band.grid ? { gridTemplateColumns: `repeat(${band.columns}, ${column}px)`, gridTemplateRows: `repeat(${band.rows}, ${heights[i] + rest}px)` } : {};
     Object.assign(/** @type {HTMLElement} */ (area.children[i]).style, tracks);
-    for (const [j, its] of band.tiles.entries()) {
-      const { box, element } = tiles.get(its.camera.name);
-      const gridArea = `${its.row + 1} / ${its.column + 1} / span ${its.row_span} / span ${its.column_span}`;
+    for (const [j, tile] of band.tiles.entries()) {
+      const { box, element } = tiles.get(tile.camera.name);
+      const gridArea = `${tile.row + 1} / ${tile.column + 1} / span ${tile.row_span} / span ${tile.column_span}`;
       Object.assign(element.style, { width: `${boxes[j].width}px`, gridArea: band.grid ? gridArea : "" });
       box.style.height = `${boxes[j].height}px`;
     }
   }
 }
 
-/** A place for each camera by where it looks; the enlarged one has changed places with the front camera. */
-function layDrive() {
+/** Place each camera by its direction; the enlarged one swaps places with the front camera. */
+function layOutDrive() {
   const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged, birdseyeSize());
-  by("drive").style.height = `${band.height}px`;
-  by("drive").style.setProperty("--mirror", `${mirror.width}px`);
+  byId("drive").style.height = `${band.height}px`;
+  byId("drive").style.setProperty("--mirror", `${mirror.width}px`);
   placeBirdseye(pictures.get(BIRDSEYE));
   for (const [name, { element }] of tiles) element.hidden = !pictures.has(name);
   for (const [name, { x, y, width, height, view }] of pictures) {
@@ -178,43 +178,43 @@ function layDrive() {
     Object.assign(element.style, { left: `${x}px`, top: `${y}px`, width: `${width}px` });
     element.classList.remove("enlarged");
     box.style.height = `${height}px`;
-    frame(name, view);
+    setView(name, view);
   }
   area.classList.remove("has-enlarged");
 }
 
 /** Show a camera's picture whole, cropped or mirrored. */
-function frame(name, view) {
+function setView(name, view) {
   const part = tiles.get(name);
   part.view = view;
   Object.assign(part.canvas.style, { objectFit: view.fit, objectPosition: `${100 * view.align}% 50%`, transform: view.mirrored ? "scaleX(-1)" : "" });
-  tellFrame(name);
+  reportFrame(name);
 }
 
-function tellFrame(name) {
+function reportFrame(name) {
   const part = tiles.get(name);
   if (!part) return;
-  tellSize(name, part.box, part.view);
-  refreshShown(name, part);
+  reportSize(name, part.box, part.view);
+  refreshFraming(name, part);
 }
 
-/** State what is cropped. */
-function refreshShown(name, { box, shown, view }) {
-  const about = camera(name);
-  const picture = (isStraight(name) ? null : seenRegion(name)) ?? about;
-  const laid = about && picture && box.clientWidth && box.clientHeight;
-  const words = laid ? shownWords({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
-  const straight = about && isStraight(name) ? `straight, ${straightOptics(about).fov_deg}° of ${about.fov_deg}°` : "";
-  write(shown, [words, straight].filter(Boolean).join(", "));
+/** State which part of the picture is shown. */
+function refreshFraming(name, { box, shown, view }) {
+  const info = camera(name);
+  const picture = (isStraight(name) ? null : shownRegion(name)) ?? info;
+  const isLaidOut = info && picture && box.clientWidth && box.clientHeight;
+  const framing = isLaidOut ? framingText({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
+  const straight = info && isStraight(name) ? `straight, ${straightOptics(info).fov_deg}° of ${info.fov_deg}°` : "";
+  setText(shown, [framing, straight].filter(Boolean).join(", "));
 }
 
-function layEnlarged() {
+function layOutEnlarged() {
   for (const [name, { element, box }] of tiles) {
     const large = store.enlarged === name;
     element.classList.toggle("enlarged", large);
     if (!large) continue;
     element.style.width = "";
-    box.style.height = `${scene.clientHeight - chrome()}px`;
+    box.style.height = `${scene.clientHeight - chromeHeight()}px`;
   }
   area.classList.toggle("has-enlarged", tiles.has(store.enlarged));
 }
@@ -230,41 +230,41 @@ function refresh(name, index) {
   if (!part) return;
   part.swatch.style.background = colourOf(index);
   part.element.classList.toggle("selected", store.selected === name);
-  mark(part.element, "aria-current", store.selected === name ? "true" : null);
-  mark(part.element, "data-straight", isStraight(name) ? "" : null);
+  setAttribute(part.element, "aria-current", store.selected === name ? "true" : null);
+  setAttribute(part.element, "data-straight", isStraight(name) ? "" : null);
   refreshStatus(name, part);
   refreshSwitch(name, part);
   refreshCaption(name, part);
-  refreshShown(name, part);
+  refreshFraming(name, part);
 }
 
 function refreshStatus(name, { element, status, refused }) {
   const word = store.status[name] ?? "synchronising";
-  const why = word === "unsupported" ? store.refused[name] : decided(name)?.fault;
+  const why = word === "unsupported" ? store.refused[name] : decisionOf(name)?.fault;
   refused.hidden = !why;
-  write(refused, why ?? "");
-  mark(element, "data-status", word);
-  mark(status, "data-quiet", word === "live" ? "" : null);
-  write(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
+  setText(refused, why ?? "");
+  setAttribute(element, "data-status", word);
+  setAttribute(status, "data-quiet", word === "live" ? "" : null);
+  setText(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
 }
 
 function refreshSwitch(name, { on }) {
-  const asked = pending(`on:${name}`);
-  const now = decided(name);
-  mark(on, "aria-checked", now?.on === true);
-  mark(on, "aria-label", `${spoken(name)} on`);
-  mark(on, "data-pending", asked ? "" : null);
+  const requested = pending(`on:${name}`);
+  const now = decisionOf(name);
+  setAttribute(on, "aria-checked", now?.on === true);
+  setAttribute(on, "aria-label", `${displayName(name)} on`);
+  setAttribute(on, "data-pending", requested ? "" : null);
   on.disabled = !inControl() || !now;
-  write(on, asked ? (asked.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
-  mark(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : "switch this camera on or off (o)");
+  setText(on, requested ? (requested.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
+  setAttribute(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : "switch this camera on or off (o)");
 }
 
 function refreshCaption(name, { rates, form, reason }) {
-  const now = decided(name);
-  const silent = !store.connected || SILENT.includes(store.status[name]);
-  const sample = silent ? undefined : store.sample?.cameras[name];
-  const still = silent || STILL.includes(store.status[name]);
-  const { age_ms, bound_ms } = still ? NO_AGE : ageOf(name, sample);
+  const now = decisionOf(name);
+  const isSilent = !store.connected || SILENT.includes(store.status[name]);
+  const sample = isSilent ? undefined : store.sample?.cameras[name];
+  const isStale = isSilent || STALE.includes(store.status[name]);
+  const { age_ms, bound_ms } = isStale ? NO_AGE : ageOf(name, sample);
   const differs = now ? unapplied(now) : [];
   const bitrate = differs.includes("bitrate") || differs.includes("sending");
   const region = differs.includes("size") || differs.includes("ROI");
@@ -275,56 +275,56 @@ function refreshCaption(name, { rates, form, reason }) {
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`);
-  mark(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
-  write(reason, now?.reason ?? "");
+  setAttribute(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
+  setText(reason, now?.reason ?? "");
 }
 
-/** Capture to drawing; in a page that shows no video, capture to decoding at the station. */
+/** From capture to drawing; on a page without video, from capture to decoding at the station. */
 function ageOf(name, sample) {
   const drawn = store.ages[name];
   return Number.isFinite(drawn?.age_ms) ? drawn : { age_ms: sample?.latency_ms, bound_ms: store.sample?.clock_bound_ms };
 }
 
-/** One line of a caption; marked if a decided value was not yet read back. */
+/** One line of a caption, marked if a decided value has not been read back yet. */
 function caption(element, differs, text, title) {
-  write(element, differs ? `◌ ${text}` : text);
-  mark(element, "data-differs", differs ? "" : null);
-  mark(element, "title", differs ? `pending: decided, not yet read back; ${title}` : title);
+  setText(element, differs ? `◌ ${text}` : text);
+  setAttribute(element, "data-differs", differs ? "" : null);
+  setAttribute(element, "title", differs ? `pending: decided, not yet read back; ${title}` : title);
 }
 
-/** The decided values that were not yet read back from the elements. */
+/** The decided values that have not been read back from the elements yet. */
 export function unapplied({ on, sending, roi, width, height, kbps, applied }) {
   const found = [];
   if (applied.sending !== undefined && applied.sending !== sending) found.push("sending");
   if (!on || !sending) return found;
   if (applied.bitrate !== undefined && applied.bitrate !== kbps) found.push("bitrate");
-  const { size: is, roi: seen } = applied;
-  if (is && (is.width !== width || is.height !== height)) found.push("size");
-  if (seen && ["x", "y", "width", "height"].some((key) => seen[key] !== roi[key])) found.push("ROI");
+  const { size: appliedSize, roi: appliedRoi } = applied;
+  if (appliedSize && (appliedSize.width !== width || appliedSize.height !== height)) found.push("size");
+  if (appliedRoi && ["x", "y", "width", "height"].some((key) => appliedRoi[key] !== roi[key])) found.push("ROI");
   return found;
 }
 
-function announce({ camera: name, status }) {
+function onStatus({ camera: name, status }) {
   const part = tiles.get(name);
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (ALARMS.includes(status)) write(by("announcer"), `${spoken(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
+  if (ALARMS.includes(status)) setText(byId("announcer"), `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
 }
 
 export function startTiles() {
   listen("hello", build);
-  listen("layout", () => draft || group());
+  listen("layout", () => draft || groupTiles());
   listen("state sample requests control socket theme selected straight", refreshAll);
-  listen("status", announce);
-  listen("view birdseye", lay);
+  listen("status", onStatus);
+  listen("view birdseye", layOut);
   listen("enlarged", (name) => {
-    lay();
-    if (name && !hinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });
-    hinted = true;
+    layOut();
+    if (name && !wasHinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });
+    wasHinted = true;
   });
-  if (!canShowVideo) sayNoVideo();
-  new ResizeObserver(lay).observe(scene);
+  if (!canShowVideo) showNoVideo();
+  new ResizeObserver(layOut).observe(scene);
 }
 
 /** Move the focus to the tile of a camera. */

@@ -1,9 +1,9 @@
 /** The total bitrate: where it comes from in each mode, and the operator's slider for mode C. */
 
 import { inControl, listen, mode, store } from "./store.js";
-import { complain, pending, request, whyNoControl } from "./requests.js";
+import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
-import { by, make, write, whole } from "./format.js";
+import { byId, make, setText, whole } from "./format.js";
 
 const WHY = {
   single: "sum of the bitrates set in mode S; choose C to set it",
@@ -11,7 +11,7 @@ const WHY = {
 };
 
 const figure = make("b", { class: "large" });
-const limited = make("span", { class: "muted" }); // what prediction or operator asked for, where it is more
+const requested = make("span", { class: "muted" }); // the total before rules lowered it
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
 const slider = makeSlider({
@@ -22,11 +22,11 @@ const slider = makeSlider({
   send,
 });
 
-/** What the total is set to, which a rule may lower. */
-const wished = () => (mode() ? (store.state?.asked_kbps ?? store.state?.total_kbps) : undefined);
-const most = () => (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
+/** The total as set, which a rule may lower. */
+const requestedTotal = () => (mode() ? (store.state?.asked_kbps ?? store.state?.total_kbps) : undefined);
+const maxTotal = () => (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
 
-/** Why the operator cannot set it; null: they can. */
+/** Why the operator cannot set the total; null: they can. */
 function whyNot() {
   const now = mode();
   return !now ? "the vehicle is offline" : WHY[now] ?? (inControl() ? null : whyNoControl());
@@ -36,36 +36,36 @@ function send(kbps) {
   request("total", { event: "total_set", kbps }, `total ${kbps} kbit/s`);
 }
 
-/** Set the total to so many times what it is about to be; a lower one to less than what a rule has left of it. */
-export function changeTotal(times) {
+/** Scale the total, or the one already requested; a reduction starts from what the rules have left of it. */
+export function scaleTotal(scale) {
   const reason = whyNot();
-  if (reason) return complain(reason);
-  const from = pending("total")?.event.kbps ?? (times < 1 ? store.state?.total_kbps : wished());
-  send(Math.max(1, Math.min(most(), Math.round(times * from))));
+  if (reason) return showProblem(reason);
+  const from = pending("total")?.event.kbps ?? (scale < 1 ? store.state?.total_kbps : requestedTotal());
+  send(Math.max(1, Math.min(maxTotal(), Math.round(scale * from))));
 }
 
 function refresh() {
   const total = mode() ? store.state?.total_kbps : undefined;
-  const asked = wished();
+  const wanted = requestedTotal();
   const reason = whyNot();
-  const less = total !== undefined && asked !== undefined && total < asked;
-  write(figure, whole(total));
-  write(limited, less ? ` of ${whole(asked)}` : "");
-  write(prediction, whole(store.sample?.predicted_kbps));
-  write(why, less ? whyLess().join("; ") || "limited by a rule" : reason ?? "shared among the cameras by demand and weight");
-  slider.update({ value: asked, max: most(), why: reason });
+  const isLimited = total !== undefined && wanted !== undefined && total < wanted;
+  setText(figure, whole(total));
+  setText(requested, isLimited ? ` of ${whole(wanted)}` : "");
+  setText(prediction, whole(store.sample?.predicted_kbps));
+  setText(why, isLimited ? limitReasons().join("; ") || "limited by a rule" : reason ?? "shared among the cameras by demand and weight");
+  slider.update({ value: wanted, max: maxTotal(), why: reason });
 }
 
-/** Why the total is less than asked for: the parts of the reason that concern all cameras. */
-export function whyLess() {
+/** Why the total is limited: the parts of the reason that concern all cameras. */
+export function limitReasons() {
   const [camera] = Object.values(store.state?.cameras ?? {}).filter(({ on }) => on);
   return camera?.reason.split("; ").filter((part) => part.startsWith("total ")) ?? [];
 }
 
 export function startTotal() {
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
-  const inForce = make("div", {}, make("span", {}, "Total "), figure, limited, make("span", { class: "muted" }, " kbit/s"));
-  by("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
+  const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
+  byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
   listen("hello state sample control requests socket", refresh);
   refresh();
 }

@@ -1,13 +1,13 @@
 /**
- * Whose picture is drawn next where there is not the time to draw all: the front camera's first, then that of the camera
- * which has waited longest. Pure; ms.
+ * Which picture is drawn next when there is no time to draw all: the front camera's first, then that of the camera that has
+ * waited longest. Pure; ms.
  */
 
 const BUDGET_MS = 12; // of an animation frame, which has 16 at 60 Hz
 
 /**
- * Draw pictures that wait: the first camera's, one other, and more of them while there is time.
- * @template {{name: string, waits: boolean, last_drawn: number, draw: () => void}} Drawn
+ * Draw waiting pictures: the first camera's, one other, and more while there is time.
+ * @template {{name: string, isWaiting: boolean, last_drawn: number, draw: () => void}} Drawn
  * @param {Drawn[]} streams
  * @param {string|null} first camera whose picture never waits for others
  * @param {() => number} clock
@@ -15,11 +15,11 @@ const BUDGET_MS = 12; // of an animation frame, which has 16 at 60 Hz
  */
 export function drawInTurn(streams, first, clock) {
   const began = clock();
-  const waiting = streams.filter((stream) => stream.waits);
+  const waiting = streams.filter((stream) => stream.isWaiting);
   const others = waiting.filter(({ name }) => name !== first).sort((a, b) => a.last_drawn - b.last_drawn);
   waiting.find(({ name }) => name === first)?.draw();
-  for (const [drawn, stream] of others.entries()) {
-    if (drawn > 0 && clock() - began >= BUDGET_MS) return true;
+  for (const [count, stream] of others.entries()) {
+    if (count > 0 && clock() - began >= BUDGET_MS) return true;
     stream.draw();
   }
   return false;

@@ -1,45 +1,45 @@
 /**
- * The two views of the page, Drive and Configure. Only the operator changes the view: it outlasts a reload, and Drive is
- * offered once, when this tab first gets control. A monitor, a window with some pictures, has a view of its own.
+ * The two views of the page, Drive and Configure. Only the operator changes the view. It survives a reload, and Drive is
+ * offered once, when this tab first gets control. A monitor, a window with some of the pictures, has its own view.
  */
 
 import { inControl, listen, publish, store } from "./store.js";
 import { openTab } from "./tabs.js";
-import { by } from "./format.js";
+import { byId } from "./format.js";
 
 const VIEW = "tod-view";
 const OFFERED = "tod-drive-offered";
-let offered = false; // whether the offer waits for an answer
+let isOffered = false; // whether the offer is unanswered
 
 /** @param {"configure"|"drive"} view */
-function choose(view) {
+function setView(view) {
   store.view = view;
   sessionStorage.setItem(VIEW, view);
-  answer();
-  show();
+  dismissOffer();
+  applyView();
   publish("view", view);
 }
 
-function show() {
+function applyView() {
   const drive = store.view === "drive";
   document.body.dataset.view = store.view;
-  by("drive").hidden = !drive;
+  byId("drive").hidden = !drive;
   if (!drive) setDrawer(false);
 }
 
 export function toggleView() {
-  if (store.view !== "monitor") choose(store.view === "drive" ? "configure" : "drive");
+  if (store.view !== "monitor") setView(store.view === "drive" ? "configure" : "drive");
 }
 
-// --- the drawer: all that is not a picture ----------------------------------------------------------------------------
+// --- the drawer: everything but the pictures --------------------------------------------------------------------------
 
 export function toggleDrawer() {
   if (store.view === "drive") setDrawer(document.body.dataset.drawer === undefined);
 }
 
-/** Open a tab, and the drawer for it; close the drawer where that tab is open. */
+/** Open a tab, and the drawer with it; close the drawer if the tab is already open. */
 export function toggleTab(name) {
-  const isOpen = document.body.dataset.drawer !== undefined && by("side").dataset.tab === name;
+  const isOpen = document.body.dataset.drawer !== undefined && byId("side").dataset.tab === name;
   openTab(name);
   if (store.view === "drive") setDrawer(!isOpen);
 }
@@ -47,7 +47,7 @@ export function toggleTab(name) {
 function setDrawer(open) {
   if (open) document.body.dataset.drawer = "open";
   else delete document.body.dataset.drawer;
-  by("drawer").setAttribute("aria-expanded", String(open));
+  byId("drawer").setAttribute("aria-expanded", String(open));
 }
 
 // --- full screen ------------------------------------------------------------------------------------------------------
@@ -57,37 +57,37 @@ export async function toggleFullScreen() {
     if (document.fullscreenElement) await document.exitFullscreen();
     else await document.documentElement.requestFullscreen({ navigationUI: "hide" });
   } catch (error) {
-    publish("toast", { text: `no full screen: ${error instanceof Error ? error.message : error}`, level: "problem" });
+    publish("toast", { text: `full screen failed: ${error instanceof Error ? error.message : error}`, level: "problem" });
   }
 }
 
-const showFullScreen = () => by("full-screen").setAttribute("aria-pressed", String(document.fullscreenElement !== null));
+const showFullScreen = () => byId("full-screen").setAttribute("aria-pressed", String(document.fullscreenElement !== null));
 
 // --- the offer --------------------------------------------------------------------------------------------------------
 
-/** The offer is for who is in control; it waits for an answer, also while the connection is lost. */
+/** Offer the Drive view to the page in control. The offer stays unanswered while the connection is lost. */
 function refreshOffer() {
   if (inControl() && store.view === "configure" && !sessionStorage.getItem(OFFERED)) {
     sessionStorage.setItem(OFFERED, "yes");
-    offered = true;
+    isOffered = true;
   }
-  by("offer").hidden = !(offered && inControl());
+  byId("offer").hidden = !(isOffered && inControl());
 }
 
-function answer() {
-  offered = false;
+function dismissOffer() {
+  isOffered = false;
   refreshOffer();
 }
 
 export function startViews() {
   store.view = globalThis.boot.shown ? "monitor" : sessionStorage.getItem(VIEW) === "drive" ? "drive" : "configure";
-  for (const id of ["to-drive", "to-configure"]) by(id).addEventListener("click", toggleView);
-  by("drawer").addEventListener("click", toggleDrawer);
-  by("full-screen").addEventListener("click", toggleFullScreen);
+  for (const id of ["to-drive", "to-configure"]) byId(id).addEventListener("click", toggleView);
+  byId("drawer").addEventListener("click", toggleDrawer);
+  byId("full-screen").addEventListener("click", toggleFullScreen);
   document.addEventListener("fullscreenchange", showFullScreen);
-  by("offer-drive").addEventListener("click", () => choose("drive"));
-  by("offer-no").addEventListener("click", answer);
+  byId("offer-drive").addEventListener("click", () => setView("drive"));
+  byId("offer-no").addEventListener("click", dismissOffer);
   listen("control socket", refreshOffer);
-  show();
+  applyView();
   showFullScreen();
 }

@@ -1,6 +1,6 @@
 /**
- * Draws pictures through meshes by WebGL: each vertex states which point of a camera's full image is shown there, and with
- * which share. Shares of several pictures are added.
+ * Draws pictures through meshes with WebGL: each vertex holds the point of a camera's full image that is shown there, and the
+ * picture's share. Shares of several pictures are added.
  */
 
 const VERTEX = `#version 300 es
@@ -34,7 +34,7 @@ void main() {
   colour = vec4(seen * part, part);
 }`;
 
-/** What is drawn through a mesh: the picture, red stripes in place of one that stands still, or grey where there is none. */
+/** What is drawn through a mesh: the picture, red stripes in place of a stalled one, or grey if there is none. */
 export const FILLS = { picture: 0, alarm: 1, none: 2 };
 const FLOATS = 5; // of a vertex
 const BYTES = 4;
@@ -48,7 +48,7 @@ const STRIPE_PX = 14;
 
 /** One picture and its mesh. */
 export class Layer {
-  /** @type {Picture|null} whose pixels the texture holds */
+  /** @type {Picture|null} the picture in the texture */
   loaded = null;
 
   /**
@@ -77,8 +77,8 @@ export class Layer {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    const more = gl.getExtension("EXT_texture_filter_anisotropic"); // without it ground far away is blurred along the view
-    if (more) gl.texParameterf(gl.TEXTURE_2D, more.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(ANISOTROPY, gl.getParameter(more.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
+    const anisotropy = gl.getExtension("EXT_texture_filter_anisotropic"); // without it distant ground is blurred along the line of sight
+    if (anisotropy) gl.texParameterf(gl.TEXTURE_2D, anisotropy.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(ANISOTROPY, gl.getParameter(anisotropy.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
   }
 
   /** @param {Float32Array} shares of the picture at each vertex  @param {Uint32Array} triangles that are drawn, as vertices */
@@ -93,7 +93,7 @@ export class Layer {
     this.count = triangles.length;
   }
 
-  /** Bring a picture into the texture, unless it is there. @param {Picture} picture */
+  /** Upload a picture to the texture, unless it is there already. @param {Picture} picture */
   load(picture) {
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
@@ -107,7 +107,7 @@ export class Layer {
 export class Warp {
   /**
    * @param {OffscreenCanvas} canvas
-   * @throws {Error} for people to read: there is no WebGL 2
+   * @throws {Error} with a message for the operator: there is no WebGL 2
    */
   constructor(canvas) {
     this.canvas = canvas;
@@ -116,9 +116,9 @@ export class Warp {
     this.gl = gl;
     /** @type {WebGLSync|null} */
     this.fence = null;
-    this.lost = false; // browsers take a context away when a graphics driver starts anew
+    this.lost = false; // browsers drop the context when the graphics driver restarts
     canvas.addEventListener("webglcontextlost", () => (this.lost = true));
-    const program = (this.program = linked(gl));
+    const program = (this.program = linkedProgram(gl));
     gl.useProgram(program);
     this.uniforms = Object.fromEntries(["frame", "region", "fill", "stripe"].map((name) => [name, gl.getUniformLocation(program, name)]));
     gl.enable(gl.BLEND);
@@ -134,7 +134,7 @@ export class Warp {
   /**
    * @param {{width: number, height: number}} size of the canvas, px
    * @param {Frame} frame
-   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn picture: where it is filled with one
+   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn picture: null unless filled with one
    */
   draw({ width, height }, frame, drawn) {
     const { gl, canvas, uniforms } = this;
@@ -156,7 +156,7 @@ export class Warp {
     gl.flush();
   }
 
-  /** Whether the last drawing is still under way: another one would wait for it, and all video with it. */
+  /** Whether the GPU is still drawing: another draw would wait for it, and block all video. */
   isBusy() {
     const { gl, fence } = this;
     if (!fence || this.lost) return false;
@@ -168,7 +168,7 @@ export class Warp {
 }
 
 /** @param {WebGL2RenderingContext} gl */
-function linked(gl) {
+function linkedProgram(gl) {
   const program = gl.createProgram();
   for (const [kind, source] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]])) {
     const shader = gl.createShader(kind);

@@ -1,9 +1,9 @@
 /** Converts pixels of a frame (I420 or NV12, as decoders output them) to RGBA, without any browser function. */
 
 const SHIFT = 14;
-const BELOW = 512; // how far a sum may exceed 0..255 on either side
+const MARGIN = 512; // how far a sum may exceed 0..255 on either side
 const OPAQUE = 0xff << 24;
-const CLAMP = Uint8Array.from({ length: 256 + 2 * BELOW }, (_, i) => Math.min(255, Math.max(0, i - BELOW)));
+const CLAMP = Uint8Array.from({ length: 256 + 2 * MARGIN }, (_, i) => Math.min(255, Math.max(0, i - MARGIN)));
 const LUMA = { bt709: [0.2126, 0.0722], smpte170m: [0.299, 0.114], bt470bg: [0.299, 0.114] }; // weights of red and blue
 const tables = new Map();
 
@@ -20,7 +20,7 @@ function makeTables([red, blue], full) {
   const table = (of) => Int32Array.from({ length: 256 }, (_, i) => Math.round(of(i) * (1 << SHIFT)));
   const colour = (weight) => table((i) => (((i - 128) * 255) / chroma) * weight);
   return {
-    y: table((i) => ((i - black) * 255) / span + BELOW + 0.5),
+    y: table((i) => ((i - black) * 255) / span + MARGIN + 0.5),
     rv: colour(2 * (1 - red)),
     gv: colour((-2 * (1 - red) * red) / green),
     gu: colour((-2 * (1 - blue) * blue) / green),
@@ -35,7 +35,7 @@ function makeTables([red, blue], full) {
  * @param {number} width of the frame
  */
 export function toRgba(bytes, planes, format, space, image, width) {
-  const apart = format === "NV12" ? 2 : 1; // NV12 has U and V side by side
+  const chroma_step = format === "NV12" ? 2 : 1; // NV12 interleaves U and V
   const [y, u] = planes;
   const v = format === "NV12" ? { offset: u.offset + 1, stride: u.stride } : planes[2];
   const out = new Int32Array(image.data.buffer);
@@ -45,12 +45,12 @@ export function toRgba(bytes, planes, format, space, image, width) {
   for (let row = 0; row < image.height; row++) {
     const chroma = across === 2 ? row : row >> 1;
     const from = { y: y.offset + row * across * y.stride, below: y.stride, u: u.offset + chroma * u.stride, v: v.offset + chroma * v.stride };
-    convert(bytes, from, apart, lookUp, out, row * image.width, image.width);
+    convert(bytes, from, chroma_step, lookUp, out, row * image.width, image.width);
   }
 }
 
 /** One row of pixels; two neighbours share their chroma. */
-function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
+function wholeRow(bytes, from, chroma_step, { y, rv, gv, gu, bu }, out, to, width) {
   let { y: ys, u: us, v: vs } = from;
   const end = to + width;
   while (to < end) {
@@ -59,8 +59,8 @@ function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
     const red = rv[cr];
     const green = gv[cr] + gu[cb];
     const blue = bu[cb];
-    us += apart;
-    vs += apart;
+    us += chroma_step;
+    vs += chroma_step;
     for (const stop = to + 2 < end ? to + 2 : end; to < stop; to++) {
       const light = y[bytes[ys++]];
       out[to] = OPAQUE | (CLAMP[(light + blue) >> SHIFT] << 16) | (CLAMP[(light + green) >> SHIFT] << 8) | CLAMP[(light + red) >> SHIFT];
@@ -69,7 +69,7 @@ function wholeRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
 }
 
 /** One row of pixels, each the mean of four that share their chroma anyway. */
-function halfRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
+function halfRow(bytes, from, chroma_step, { y, rv, gv, gu, bu }, out, to, width) {
   let { y: ys, u: us, v: vs } = from;
   let low = ys + from.below;
   for (const end = to + width; to < end; to++) {
@@ -78,8 +78,8 @@ function halfRow(bytes, from, apart, { y, rv, gv, gu, bu }, out, to, width) {
     const cr = bytes[vs];
     ys += 2;
     low += 2;
-    us += apart;
-    vs += apart;
+    us += chroma_step;
+    vs += chroma_step;
     out[to] = OPAQUE | (CLAMP[(light + bu[cb]) >> SHIFT] << 16) | (CLAMP[(light + gv[cr] + gu[cb]) >> SHIFT] << 8) | CLAMP[(light + rv[cr]) >> SHIFT];
   }
 }

@@ -1,14 +1,14 @@
 /** Zooming and moving the region of interest in mode S: wheel, pinch of two fingers, middle button. */
 
 import { camera, publish } from "./store.js";
-import { placed, toPicture } from "./framing.js";
+import { placement, toPicture } from "./framing.js";
 import { moved, zoomed } from "./region.js";
-import { seenRegion, sendRegion, waiting, whyNoRegion } from "./roi.js";
+import { pendingRegion, sendRegion, shownRegion, whyNoRegion } from "./roi.js";
 import { throttle } from "./scale.js";
 
-const SEND_EVERY_MS = 250; // each new region starts the encoder anew
-const REST_MS = 600; // after it the next turn of the wheel begins with the region in force
-const TURN = 0.002; // of the wheel, as a power of e for each px
+const SEND_EVERY_MS = 250; // each new region restarts the encoder
+const REST_MS = 600; // after this pause the wheel starts again from the region in force
+const TURN = 0.002; // of the wheel, exponent of e per px
 const PINCH = 0.01; // of two fingers on a touchpad, which browsers report as a wheel with Control
 const LINE_PX = 16;
 const HINT_EVERY_MS = 3000;
@@ -23,24 +23,24 @@ const MIDDLE = 1;
 export function zoomRegion(name, box, view) {
   const send = throttle((region) => sendRegion(name, region), SEND_EVERY_MS);
   /** @type {{region: Rectangle, at: number}|null} */
-  let wish = null; // of the wheel
+  let wheelRegion = null; // requested by the wheel
   /** @type {Map<number, {x: number, y: number}>} */
   const fingers = new Map();
-  /** @type {{region: Rectangle, seen: Rectangle, from: {x: number, y: number}, apart: number}|null} */
-  let held = null; // how a gesture of the hand began
+  /** @type {{region: Rectangle, seen: Rectangle, from: {x: number, y: number}, distance: number}|null} */
+  let gesture = null; // how a pinch or drag began
   let hinted = -Infinity;
 
   const size = () => ({ width: box.clientWidth, height: box.clientHeight });
-  const here = ({ clientX, clientY }) => ({ x: clientX - box.getBoundingClientRect().x, y: clientY - box.getBoundingClientRect().y });
+  const positionOf = ({ clientX, clientY }) => ({ x: clientX - box.getBoundingClientRect().x, y: clientY - box.getBoundingClientRect().y });
 
-  /** The region in force or requested, if it may be changed. */
+  /** The region requested or in force; null: it may not be changed. */
   function current() {
-    const why = seenRegion(name) ? whyNoRegion(name) : null;
+    const why = shownRegion(name) ? whyNoRegion(name) : null;
     if (why && performance.now() - hinted > HINT_EVERY_MS) {
       publish("toast", { text: `${name}: ${why}`, level: "hint" });
       hinted = performance.now();
     }
-    return why ? null : (waiting(name) ?? seenRegion(name));
+    return why ? null : (pendingRegion(name) ?? shownRegion(name));
   }
 
   /** A point of the full image. @param {Rectangle} seen what the box shows of it */
@@ -49,55 +49,55 @@ export function zoomRegion(name, box, view) {
     return { x: seen.x + x, y: seen.y + y };
   }
 
-  function turn(event) {
+  function onWheel(event) {
     event.preventDefault();
-    const [region, seen] = [wish && performance.now() - wish.at < REST_MS ? wish.region : current(), seenRegion(name)];
+    const [region, seen] = [wheelRegion && performance.now() - wheelRegion.at < REST_MS ? wheelRegion.region : current(), shownRegion(name)];
     const full = camera(name);
     if (!region || !seen || !full) return;
     const px = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? LINE_PX : 1);
     const factor = Math.exp(px * (event.ctrlKey ? PINCH : TURN));
-    wish = { region: zoomed(region, imagePoint(here(event), seen), factor, full), at: performance.now() };
-    send(wish.region);
+    wheelRegion = { region: zoomed(region, imagePoint(positionOf(event), seen), factor, full), at: performance.now() };
+    send(wheelRegion.region);
   }
 
-  const middle = () => {
+  const centre = () => {
     const points = [...fingers.values()];
     return { x: points.reduce((sum, { x }) => sum + x, 0) / points.length, y: points.reduce((sum, { y }) => sum + y, 0) / points.length };
   };
-  const apart = () => {
+  const fingerDistance = () => {
     const [a, b] = fingers.values();
     return b ? Math.hypot(a.x - b.x, a.y - b.y) : 1;
   };
 
-  function grip() {
-    const [region, seen] = [current(), seenRegion(name)];
-    held = region && seen ? { region, seen, from: middle(), apart: apart() } : null;
+  function beginGesture() {
+    const [region, seen] = [current(), shownRegion(name)];
+    gesture = region && seen ? { region, seen, from: centre(), distance: fingerDistance() } : null;
   }
 
-  function move(event) {
+  function onPointerMove(event) {
     if (!fingers.has(event.pointerId)) return;
-    fingers.set(event.pointerId, here(event));
+    fingers.set(event.pointerId, positionOf(event));
     const full = camera(name);
-    if (!held || !full) return;
-    const { region, seen, from } = held;
-    const [factor, { scale }] = [held.apart / Math.max(1, apart()), placed(size(), seen, view())];
+    if (!gesture || !full) return;
+    const { region, seen, from } = gesture;
+    const [factor, { scale }] = [gesture.distance / Math.max(1, fingerDistance()), placement(size(), seen, view())];
     const larger = zoomed(region, imagePoint(from, seen), factor, full);
-    const way = { x: ((view().mirrored ? 1 : -1) * (middle().x - from.x) * factor) / scale, y: (-(middle().y - from.y) * factor) / scale };
-    send(moved(larger, way, full));
+    const offset = { x: ((view().mirrored ? 1 : -1) * (centre().x - from.x) * factor) / scale, y: (-(centre().y - from.y) * factor) / scale };
+    send(moved(larger, offset, full));
   }
 
-  box.addEventListener("wheel", turn, { passive: false });
+  box.addEventListener("wheel", onWheel, { passive: false });
   box.addEventListener("mousedown", (event) => event.button === MIDDLE && event.preventDefault()); // the browser would scroll
   box.addEventListener("pointerdown", (event) => {
     if (event.pointerType !== "touch" && event.button !== MIDDLE) return;
-    fingers.set(event.pointerId, here(event));
+    fingers.set(event.pointerId, positionOf(event));
     box.setPointerCapture(event.pointerId);
-    if (event.button === MIDDLE || fingers.size === 2) grip();
+    if (event.button === MIDDLE || fingers.size === 2) beginGesture();
   });
-  box.addEventListener("pointermove", move);
-  const letGo = ({ pointerId }) => {
-    if (fingers.delete(pointerId)) held = null;
+  box.addEventListener("pointermove", onPointerMove);
+  const onPointerEnd = ({ pointerId }) => {
+    if (fingers.delete(pointerId)) gesture = null;
   };
-  box.addEventListener("pointerup", letGo);
-  box.addEventListener("pointercancel", letGo);
+  box.addEventListener("pointerup", onPointerEnd);
+  box.addEventListener("pointercancel", onPointerEnd);
 }
