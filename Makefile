@@ -2,9 +2,9 @@
 # make test   install what is missing, then everything that CI runs
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
-# make soak   long repeats of what a drive must survive, an hour; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
+# make soak   long repetitions of faults that a drive must survive, an hour; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot  two drives over a recorded uplink: the picture of the README
-# make setup  install what it takes to drive; the command is then .venv/bin/tod-runner
+# make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages
 VENV := .venv
@@ -14,7 +14,7 @@ ROS2 := .venv-ros2
 TEST_READY := $(VENV)/.ready-for-tests
 NODE_READY := node_modules/.ready
 
-# Tests start hundreds of processes; each would compile the project again where the environment forbids keeping bytecode.
+# Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak ros1 ros2 clean
@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(READY)
 	$(BIN)/tod-runner demo
 
-# Tests that live by the clock leave the processors idle half of the time; all else runs on what they leave over.
+# Timing-sensitive tests leave the processors idle half of the time; everything else runs in the background meanwhile.
 test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
@@ -42,7 +42,7 @@ units: $(TEST_READY)
 check: lint javascript
 	$(BIN)/pytest -m "not gst and not slow and not soak" -n auto --dist worksteal
 
-# Branches of what decides and of what reads configuration; make test runs far more of the rest.
+# Branch coverage of the decisions and of reading configuration; make test runs far more of the rest.
 coverage: $(TEST_READY)
 	$(BIN)/pytest -m "not gst and not soak" -n auto --dist loadfile --cov --cov-report=
 	$(BIN)/coverage report --include='runner/core/*,runner/configuration/*,runner/graph.py' --fail-under=95
@@ -62,7 +62,7 @@ javascript: $(NODE_READY)
 bench: $(TEST_READY)
 	$(BIN)/python bench bench.json
 
-# A drive over a recorded uplink, twice, as the operator's page showed it: make deadspot UPLINK=uplink.csv
+# One drive over a recorded uplink, twice, as shown by the operator's page: make deadspot UPLINK=uplink.csv
 UPLINK ?= ../shared/data/traces/tidy/orange-4G-traces-A-up_uplink_1s.csv
 deadspot: $(TEST_READY)
 	$(BIN)/python bench/deadspot.py $(UPLINK) docs/images/deadspot.png
@@ -72,7 +72,7 @@ soak: $(TEST_READY) $(NODE_READY)
 
 setup: $(READY)
 
-# Tests with a version of ROS run where that has been made.
+# Tests with a version of ROS run only if its target has been made.
 ros1:
 	scripts/setup-ros1
 
@@ -90,7 +90,7 @@ $(TEST_READY): pyproject.toml scripts/setup scripts/packages.apt scripts/package
 	scripts/setup $(VENV) test
 	touch $(READY) $@
 
-# Checks only: the pages are plain modules, and nothing that drives needs Node.js.
+# For checks only: the pages are plain modules, and driving does not need Node.js.
 $(NODE_READY): package.json package-lock.json | $(TEST_READY)
 	npm ci --no-audit --no-fund
 	touch $@

@@ -1,9 +1,9 @@
-"""All figures in one table and one JSON, with machine and date.
+"""All benchmarks in one table and one JSON file, with machine and date.
 
   python bench                       twenty minutes on an otherwise idle machine; rows go to bench.json
-  python bench OUT.json cost link    some of them
+  python bench OUT.json cost link    a selection
 
-What bare GStreamer does as well is measured in pairs beside it, with a ratio: bench/cost.py.
+Where bare GStreamer can do the same, both are measured in pairs, with a ratio: bench/cost.py.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from table import as_json, show, write
 BENCHES = ("cost", "memory", "live", "link", "page", "replay", "validate", "pqos_map")
 
 
-def main(words: list[str]) -> int:
-    path = Path(words[0] if words else "bench.json")
-    chosen = words[1:] or BENCHES
+def main(arguments: list[str]) -> int:
+    path = Path(arguments[0] if arguments else "bench.json")
+    chosen = arguments[1:] or BENCHES
     if unknown := [name for name in chosen if name not in BENCHES]:
         print(f"unknown bench {', '.join(unknown)}; expected one of {', '.join(BENCHES)}", file=sys.stderr)
         return 2
@@ -31,7 +31,7 @@ def main(words: list[str]) -> int:
         print(f"{name} ...", end=" ", flush=True, file=sys.stderr)
         rows += importlib.import_module(name).rows()
         print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
-        write(rows, path)  # what was measured is kept, whatever the next one does
+        write(rows, path)  # keeps these results if the next one fails
     print(json.dumps({key: value for key, value in as_json(rows).items() if key != "rows"}))
     show(rows)
     return 0 if all(row.is_acceptable for row in rows) else 1

@@ -1,9 +1,9 @@
-"""A bare GStreamer RTSP server and a bare client: processes that load nothing of the project, run by bench/cost.py.
+"""A bare GStreamer RTSP server and client: processes that load no code of the project, run by bench/cost.py.
 
 python bench/bare.py serve PORT    launch lines by camera from the first line of standard input, as JSON. Each further
                                    line sets properties: [camera, element, property, value as gst-launch writes it]
 python bench/bare.py watch URL...  receives every stream and decodes none; a line of JSON for each frame on standard
-                                   output: [stream, t of arrival, ms since its capture or null, width of the picture]
+                                   output: [stream, time of arrival, ms since its capture or null, width of the picture]
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ def serve(port: str) -> None:
         server.get_mount_points().add_factory(f"/{camera}", factory)
     server.attach()
 
-    def follow() -> None:
+    def set_properties() -> None:
         for line in sys.stdin:
             camera, element, key, value = json.loads(line)
             Gst.util_set_object_arg(elements[camera].get_by_name(element), key, value)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=set_properties, daemon=True).start()
     GLib.MainLoop().run()
 
 
 def watch(*urls: str) -> None:
-    pipelines = [_watched(number, url) for number, url in enumerate(urls)]
+    pipelines = [_receiver(number, url) for number, url in enumerate(urls)]
     for pipeline in pipelines:
         pipeline.set_state(Gst.State.PLAYING)
     GLib.MainLoop().run()
 
 
-def _watched(number: int, url: str) -> Gst.Pipeline:
+def _receiver(number: int, url: str) -> Gst.Pipeline:
     pipeline = Gst.parse_launch(
         f'rtspsrc location="{url}" latency={JITTER_BUFFER_MS} add-reference-timestamp-meta=true '
         "! rtph264depay ! h264parse name=parser ! video/x-h264,alignment=au ! fakesink sync=false"

@@ -1,11 +1,11 @@
-"""What the vehicle's side costs beside a bare GStreamer RTSP server with the same launch lines, in pairs.
+"""What the vehicle's side costs compared with a bare GStreamer RTSP server with the same launch lines, in pairs.
 
   python bench/cost.py                                    three cameras, five pairs of 15 s: six minutes
-  python bench/cost.py --pairs 3 vehicle=tum_q7           Table I, eight cameras at 3000 kbit/s in all
+  python bench/cost.py --pairs 3 vehicle=tum_q7           Table I, eight cameras at 3000 kbit/s in total
 
 Rows: processor time and memory of the vehicle's process, latency from capture to the client's parser, time from the
-start until every camera has a picture, and from the request for a new size until the first picture of that size has
-arrived. Words are overrides of the vehicle.
+start until every camera has a picture, and from the request for a new size until the first picture of that size
+arrives. Words are overrides of the vehicle.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ HERE = Path(__file__).parent
 class Cost(NamedTuple):
     """Of one run of one server.
 
-    cores     processor time per time
+    cores     processor time per wall time
     memory    resident, MB
     latency   from capture to the client, ms, median
     start     until each camera has a picture, s
-    reaction  until a new size has arrived, ms, median
-    frames    received of those that were due
+    reaction  until a new size arrives, ms, median
+    frames    share of the frames due that were received
     """
 
     cores: float
@@ -79,8 +79,8 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=15)
     parser.add_argument("words", nargs="*")
-    given = parser.parse_args()
-    show(rows(given.pairs, given.seconds, given.words))
+    options = parser.parse_args()
+    show(rows(options.pairs, options.seconds, options.words))
 
 
 def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list[Row]:
@@ -94,7 +94,7 @@ def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list
     return [
         row("vehicle: processor", "cores", "cores"),
         row("vehicle: memory", "MB", "memory"),
-        # A bare server's packets state no capture time: its sender reports count from what leaves the encoder.
+        # A bare server's packets carry no capture time: its sender reports count from the encoder's output.
         row("capture to client", "ms", "latency", compared=False),
         row("start to all pictures", "s", "start"),
         row("new size to its first picture", "ms", "reaction"),
@@ -114,7 +114,7 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
         knobs = wanted(decision.settings[plan.camera.name])
         lines[plan.camera.name] = f"( {launch(turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs))} )"
     began = time.time()
-    with _running([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
+    with _child([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
         assert server.stdin
         _write(server.stdin, lines)
 
@@ -133,13 +133,13 @@ def _own(words: Sequence[str], seconds: float) -> Cost:
     vehicle = _vehicle(words)
     with private_broker(broker):
         began = time.time()
-        with _running(["-m", "runner", "vehicle", *words]) as side:
+        with _child(["-m", "runner", "vehicle", *words]) as side:
             operator = Operator(broker, vehicle.name)
             operator.state(lambda state: state["online"])
-            asked = count()
+            numbers = count()
 
             def resize(name: str, scaling: float) -> None:
-                reply = operator.ask(f"{next(asked)}", event="camera_configured", camera=name, scaling=scaling)
+                reply = operator.ask(f"{next(numbers)}", event="camera_configured", camera=name, scaling=scaling)
                 assert reply["result"] == "applied", reply
 
             return _measured(vehicle, side.pid, began, seconds, resize)
@@ -153,36 +153,36 @@ def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: 
     urls = [f"rtsp://127.0.0.1:{vehicle.media.port}/{name}" for name in names]
     frames: list[Frame] = []
     until(lambda: answers(vehicle.media.port), WAIT_S, every_s=0.005)
-    with _running([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
+    with _child([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
         threading.Thread(target=_read, args=(client.stdout, frames), daemon=True).start()
         until(lambda: {frame.stream for frame in list(frames)} == set(range(len(names))), WAIT_S, every_s=0.005)
         first = {frame.stream: frame.t for frame in reversed(list(frames))}
         time.sleep(SETTLE_S)
-        used, at = processor_s(pid), time.time()
+        used_s, start = processor_s(pid), time.time()
         time.sleep(seconds)
-        took, cores = time.time() - at, (processor_s(pid) - used) / (time.time() - at)
-        seen = [frame for frame in list(frames) if at <= frame.t < at + took]
+        took_s, cores = time.time() - start, (processor_s(pid) - used_s) / (time.time() - start)
+        received = [frame for frame in list(frames) if start <= frame.t < start + took_s]
         memory = memory_mb(pid)
         reaction = _reaction(names, frames, resize)
-    due = sum(float(camera.fps) for camera in vehicle.cameras.values()) * took
-    ages = [frame.age_ms for frame in seen if frame.age_ms is not None]
-    return Cost(cores, memory, median(ages), max(first.values()) - began, reaction, len(seen) / due)
+    due = sum(float(camera.fps) for camera in vehicle.cameras.values()) * took_s
+    ages = [frame.age_ms for frame in received if frame.age_ms is not None]
+    return Cost(cores, memory, median(ages), max(first.values()) - began, reaction, len(received) / due)
 
 
 def _reaction(names: Sequence[str], frames: list[Frame], resize: Any) -> float:
-    """ms from the request for another size of the first camera until a picture of a width not seen before it came."""
+    """Median ms from the request for a new size of the first camera until a picture of another width arrives."""
     waits = []
     for number in range(20):
         before = next(frame.width for frame in reversed(list(frames)) if frame.stream == 0)
         began = time.time()
         resize(names[0], SIZES[number % 2])
 
-        def arrived(since: float = began, old: int = before) -> Frame | None:
+        def first_new(since: float = began, old: int = before) -> Frame | None:
             new = (frame for frame in list(frames) if frame.t > since and frame.stream == 0 and frame.width != old)
             return next(new, None)
 
-        until(arrived, WAIT_S, every_s=0.002)
-        found = arrived()
+        until(first_new, WAIT_S, every_s=0.002)
+        found = first_new()
         assert found
         waits.append(1000 * (found.t - began))
         time.sleep(RESIZE_S)
@@ -199,7 +199,7 @@ def _vehicle(words: Sequence[str]) -> Vehicle:
 
 
 @contextmanager
-def _running(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[str]]:
+def _child(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[str]]:
     pipes = {"stdout": subprocess.DEVNULL, **pipes}
     child = subprocess.Popen([sys.executable, *command], text=True, stderr=subprocess.DEVNULL, **pipes)
     try:

@@ -3,8 +3,8 @@
   python bench/deadspot.py UPLINK.csv deadspot.png
   python bench/deadspot.py UPLINK.csv deadspot.png --share 1.3 --seconds 60
 
-Draws what the operator's page showed of both drives at the same moment, with the time of the drive, and below it the
-status of each picture over time. Needs chromium; run it on an otherwise idle machine.
+Draws the operator's page of both drives at the same moment, with the time of the drive, and below it the status of
+each picture over time. Needs chromium; run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from runner.drive.read import read_drive
 from runner.drive.series import Series, series
 
 SETTLED_S = 8.0  # both drives have started by then
-EVERY_S = 1.0  # between two pictures of the page
+EVERY_S = 1.0  # between two screenshots
 POLICIES = {"open_loop": "the prediction is trusted", "safe": "the link is measured"}
 COLOURS = {"live": "#2e8b57", "late": "#ffb000", "damaged": "#c77dff", "frozen": "#e01b24", "lost": "#7a0000"}
 STILL = ("frozen", "lost")
@@ -69,31 +69,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("uplink", type=Path)
     parser.add_argument("picture", type=Path)
-    parser.add_argument("--share", type=float, default=1.5, help="of what the link carries is predicted")
+    parser.add_argument("--share", type=float, default=1.5, help="predictions as a multiple of what the link carries")
     parser.add_argument("--seconds", type=float, default=40)
-    words = parser.parse_args()
+    options = parser.parse_args()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
-        drives = {modes: watched(browser, modes, words) for modes in POLICIES}
+        drives = {modes: watched(browser, modes, options) for modes in POLICIES}
         browser.close()
-    draw(drives, words)
+    draw(drives, options)
 
 
-def watched(browser: Browser, modes: str, words: argparse.Namespace) -> Watched:
+def watched(browser: Browser, modes: str, options: argparse.Namespace) -> Watched:
     """Drive once and watch the page."""
-    print(f"{modes}: {words.seconds:g} s", flush=True)
+    print(f"{modes}: {options.seconds:g} s", flush=True)
     with tempfile.TemporaryDirectory() as directory:
         port, log = free_port(), Path(directory) / "drive"
-        trace = ("pqos=trace", f"pqos.file={words.uplink.resolve()}", f"pqos.wrong={{share: {words.share}}}")
+        trace = ("pqos=trace", f"pqos.file={options.uplink.resolve()}", f"pqos.wrong={{share: {options.share}}}")
         ports = (f"page.port={port}", f"media.port={free_port()}", f"control.port={free_port()}")
         drive = ("vehicle=tum_q7", "mode=automatic", f"modes={modes}", "link=relay", "fps_max=10", f"log={log}")
         shots, changes = [], {}
-        with process("demo", *drive, *trace, *ports, f"duration_s={words.seconds + 5:g}") as child:
+        with process("demo", *drive, *trace, *ports, f"duration_s={options.seconds + 5:g}") as child:
             until(lambda: answers(port) or child.poll() is not None, seconds=300)
             with opened(browser, f"http://127.0.0.1:{port}/", width=1280, height=760, refused=True) as page:
                 until(lambda p=page: all(camera["drawn"] for camera in measure(p).values()))
                 began = time.time()
-                while time.time() - began < words.seconds:
+                while time.time() - began < options.seconds:
                     shots.append((time.time(), page.locator("#tiles").screenshot()))
                     changes.update(
                         {(at, name): status for at, name, status in page.evaluate("tod.measure()")["status_log"]}
@@ -108,8 +108,8 @@ def watched(browser: Browser, modes: str, words: argparse.Namespace) -> Watched:
     return Watched(found, [Shot(at - found.began, png) for at, png in shots], statuses)
 
 
-def draw(drives: dict[str, Watched], words: argparse.Namespace) -> None:
-    """The moment at which most pictures stood still in the first drive, and both drives over time."""
+def draw(drives: dict[str, Watched], options: argparse.Namespace) -> None:
+    """Both pages when most pictures stood still in the first drive, and both drives over time."""
     first, second = drives.values()
     pairs = [(a, min(second.shots, key=lambda b: abs(a.t - b.t))) for a in first.shots if a.t > SETTLED_S]
     at = max(pairs, key=lambda pair: (first.frozen(pair[0].t), -abs(pair[0].t - pair[1].t)))
@@ -126,16 +126,16 @@ def draw(drives: dict[str, Watched], words: argparse.Namespace) -> None:
         clock = {"facecolor": "black", "pad": 5}
         picture.text(0.03, 0.52, f"t = {shot.t:.1f} s", transform=picture.transAxes, color="white", size=15, bbox=clock)
         draw_statuses(state, drive, shot.t)
-        draw_rates(rate, drive.drive, shot.t, words.share)
+        draw_rates(rate, drive.drive, shot.t, options.share)
     axes[2, 0].set_ylabel("Mbit/s")
     axes[2, 0].legend(loc="upper right", fontsize=8, ncols=3)
     handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in COLOURS.values()]
     axes[1, 0].legend(handles, COLOURS, loc="upper left", bbox_to_anchor=(0, 1.22), fontsize=8, ncols=5, frameon=False)
-    figure.savefig(words.picture, dpi=80)
+    figure.savefig(options.picture, dpi=80)
     for modes, drive in drives.items():
         frozen = sum(b - a for c in drive.statuses for a, b, status in drive.spans(c) if status in STILL)
         print(f"{modes}: pictures stood still for {frozen:.1f} s in {len(drive.statuses)} x {drive.drive.end:.0f} s")
-    print(words.picture)
+    print(options.picture)
 
 
 def draw_statuses(axes: Any, drive: Watched, t: float) -> None:

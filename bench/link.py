@@ -24,16 +24,16 @@ def rows() -> list[Row]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         broker = Endpoint("127.0.0.1", probe.getsockname()[1])
-    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     with private_broker(broker):
         state, request, reply = (topic("bench", *parts) for parts in (("state",), ("request", "op"), ("reply", "op")))
 
-        def answer(message: MqttMessage) -> None:
+        def on_request(message: MqttMessage) -> None:
             vehicle.publish(reply, {"id": json.loads(message.payload)["id"], "result": "applied", "reason": ""})
 
-        vehicle = ControlLink(broker, (state, OFFLINE), {request: answer}, lambda here: None, print)
+        vehicle = ControlLink(broker, (state, OFFLINE), {request: on_request}, lambda connected: None, print)
         operator = ControlLink(
-            broker, (request, OPERATOR_GONE), {reply: lambda m: answers.put(m.payload)}, lambda here: None, print
+            broker, (request, OPERATOR_GONE), {reply: lambda m: replies.put(m.payload)}, lambda connected: None, print
         )
         for link in (vehicle, operator):
             link.connect()
@@ -42,7 +42,7 @@ def rows() -> list[Row]:
         for number in range(ROUNDS):
             began = time.perf_counter()
             operator.publish(request, {"id": str(number), "event": "total_set", "kbps": 4000})
-            answers.get(timeout=5)
+            replies.get(timeout=5)
             waits.append(1000 * (time.perf_counter() - began) / 2)
             time.sleep(0.002)
         operator.close((request, OPERATOR_GONE))

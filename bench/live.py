@@ -185,13 +185,13 @@ def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
 
 @contextmanager
 def _recorded() -> Iterator[list[float]]:
-    """Times at which knobs were set, from now on."""
+    """Times at which knobs are set in the meantime."""
     times: list[float] = []
-    plain = knobs.KnobPanel._set_waiting
+    original = knobs.KnobPanel._set_waiting
 
     def timed(self: knobs.KnobPanel) -> None:
         waiting = bool(self._waiting)
-        plain(self)
+        original(self)
         if waiting:
             times.append(time.perf_counter())
 
@@ -199,13 +199,13 @@ def _recorded() -> Iterator[list[float]]:
     try:
         yield times
     finally:
-        knobs.KnobPanel._set_waiting = plain
+        knobs.KnobPanel._set_waiting = original
 
 
 def _until(done: Any, seconds: float = 10) -> None:
-    until = time.monotonic() + seconds
+    end = time.monotonic() + seconds
     while not done():
-        if time.monotonic() > until:
+        if time.monotonic() > end:
             raise SystemExit("timed out; is the machine idle?")
         time.sleep(0.0005)
 

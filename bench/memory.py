@@ -1,11 +1,11 @@
-"""Where the memory of the vehicle's process lies: by step of its start, by camera, and by element of a pipeline.
+"""Memory of the vehicle's process: by step of its start, by camera, and by element of a pipeline.
 
   python bench/memory.py                                  three cameras, three runs: three minutes
   python bench/memory.py vehicle=tum_q7 fps_max=0         Table I
 
-Each row is what a step added to the resident memory, median of the runs. Steps of the vehicle follow each other in one
-process, as in its start. Elements are those of the first camera, in bare pipelines that are cut off behind each of
-them; what one frees for a later one, such as a pool of pictures, is not seen. Words are overrides of the vehicle.
+Each row is what a step adds to the resident memory, median of the runs. The vehicle's steps run in sequence in one
+process, as at its start. Elements are those of the first camera, in bare pipelines that are cut off after each of
+them; memory that one frees for a later one, such as a buffer pool, does not show. Words are overrides of the vehicle.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=RUNS)
     parser.add_argument("words", nargs="*")
-    given = parser.parse_args()
-    show(rows(given.runs, given.words))
+    options = parser.parse_args()
+    show(rows(options.runs, options.words))
 
 
 def rows(runs: int = RUNS, words: Sequence[str] = ()) -> list[Row]:
     words = [*WORDS, *words]
     steps = _vehicle(words, runs)
-    whole = Row("memory: vehicle's process, all of it", sum(row.value for row in steps), "MB")
+    whole = Row("memory: vehicle's process, total", sum(row.value for row in steps), "MB")
     return [*steps, whole, *_elements(words, runs)]
 
 
 def _vehicle(words: Sequence[str], runs: int) -> list[Row]:
-    grown = []
+    growth = []
     for _ in range(runs):
         broker = Endpoint("127.0.0.1", free_port())
         with private_broker(broker):
-            grown.append(_output("vehicle", *words, f"media.port={free_port()}", f"control.port={broker.port}"))
-    return [Row(f"memory: {step}", median(each[step] for each in grown), "MB") for step in grown[0]]
+            growth.append(_output("vehicle", *words, f"media.port={free_port()}", f"control.port={broker.port}"))
+    return [Row(f"memory: {step}", median(each[step] for each in growth), "MB") for step in growth[0]]
 
 
 def _elements(words: Sequence[str], runs: int) -> list[Row]:

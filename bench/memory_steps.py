@@ -1,8 +1,8 @@
 """Processes whose memory bench/memory.py compares. They import nothing but what they measure.
 
-python bench/memory_steps.py vehicle WORDS...   the vehicle's side, step by step, with a viewer for one camera after the
-                                                other; a line of JSON: by how many MB each step grew
-python bench/memory_steps.py pipeline LINE      a pipeline of gst-launch's syntax that plays; its MB
+python bench/memory_steps.py vehicle WORDS...   the vehicle's side, step by step, with viewers for one camera after the
+                                                other; prints the growth of each step, MB, as JSON
+python bench/memory_steps.py pipeline LINE      a playing pipeline in gst-launch's syntax; prints its memory, MB
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ class Steps:
     """What each step added to the resident memory of this process, MB."""
 
     def __init__(self) -> None:
-        self.grown: dict[str, float] = {}
+        self.growth: dict[str, float] = {}
 
-    def took(self, what: str) -> None:
-        self.grown[what] = memory_mb(os.getpid()) - sum(self.grown.values())
+    def measure(self, what: str) -> None:
+        self.growth[what] = memory_mb(os.getpid()) - sum(self.growth.values())
 
 
 def vehicle(*words: str) -> None:
     steps = Steps()
-    steps.took("Python")
+    steps.measure("Python")
     from runner.live import live_vehicle
 
-    steps.took("modules of the project and its libraries")
+    steps.measure("modules of the project and its libraries")
     from runner.apply import check_vehicle
 
-    steps.took("GStreamer and its bindings")
+    steps.measure("GStreamer and its bindings")
     from runner.configuration.config import configuration
 
     described = configuration(words, check=check_vehicle).vehicle()
-    steps.took("configuration composed, plugins loaded")
+    steps.measure("configuration composed, plugins loaded")
     with ExitStack() as stack:
         live = stack.enter_context(live_vehicle(words, say=lambda _: None))
         live.start()
         time.sleep(SETTLE_S)
-        steps.took("server, control loop and link")
+        steps.measure("server, control loop and link")
         for name in described.cameras:
-            stack.enter_context(_watched(f"rtsp://127.0.0.1:{described.media.port}/{name}"))
+            stack.enter_context(_viewer(f"rtsp://127.0.0.1:{described.media.port}/{name}"))
             time.sleep(SETTLE_S)
-            steps.took(f"camera {name}, watched")
-    print(json.dumps(steps.grown))
+            steps.measure(f"camera {name}, watched")
+    print(json.dumps(steps.growth))
 
 
 def pipeline(line: str) -> None:
@@ -73,7 +73,7 @@ def pipeline(line: str) -> None:
 
 
 @contextmanager
-def _watched(url: str) -> Iterator[None]:
+def _viewer(url: str) -> Iterator[None]:
     """A viewer in a process of its own, from its first frame on."""
     command = [sys.executable, Path(__file__).parent / "bare.py", "watch", url]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as client:

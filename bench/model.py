@@ -5,7 +5,7 @@
 Whole processes are timed, with an empty cache, the adaptive plan of `tod-runner model` first. It is compared with the
 full plan; the full grid with two ffmpeg processes for each point, one that scales and encodes, one that decodes, scales
 up and compares with its ssim filter; and the full grid with scikit-image's MSSIM on every frame, extrapolated from one
-point and some frames. Also printed: the choice of either plan.
+point and some frames. It also prints the factors that each plan chooses.
 """
 
 from __future__ import annotations
@@ -44,10 +44,12 @@ def main() -> None:
         print(f"adaptive plan: {adaptive_s:.1f} s, {len(adaptive['points'])} encodings")
         print(f"full plan: {full_s:.1f} s, {len(full['points'])} encodings: {full_s / adaptive_s:.1f} times as long")
         print(f"memory: {memory_mb():.0f} MB at most in either")
-        for one, name in ((adaptive, "adaptive"), (full, "full")):
-            print(f"  {name}: factors {one['scaling']} from {one['b_min_kbps']} kbit/s, b_full {one['b_full_kbps']}")
+        for found, name in ((adaptive, "adaptive"), (full, "full")):
+            print(
+                f"  {name}: factors {found['scaling']} from {found['b_min_kbps']} kbit/s, b_full {found['b_full_kbps']}"
+            )
         spent = two_processes(clip, Path(directory))
-        print(f"two ffmpeg processes a point: {spent:.1f} s: {spent / adaptive_s:.1f} times as long")
+        print(f"two ffmpeg processes per point: {spent:.1f} s: {spent / adaptive_s:.1f} times as long")
         spent = scikit_image(clip, Path(directory))
         print(f"scikit-image on every frame, extrapolated: {spent:.0f} s: {spent / adaptive_s:.0f} times as long")
 
@@ -68,7 +70,7 @@ def memory_mb() -> float:
 
 
 def two_processes(clip: Path, directory: Path) -> float:
-    """The full grid as a script would do it, one point at a time; ffmpeg takes all cores that it can use."""
+    """Seconds for the full grid as a script would do it, one point at a time; ffmpeg uses all cores that it can."""
     began = time.perf_counter()
     for factor in STUDY["scalings"]:
         for kbps in STUDY["bitrates_kbps"]:

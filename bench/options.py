@@ -54,8 +54,8 @@ OPTIONS: Mapping[str, Sequence[str]] = {
 HALF, FULL = Fraction(1, 2), Fraction(1)
 KBPS = 800
 STUDY = ("scalings=[0.5]", "bitrates_kbps=[250,800]", "plan=full", "metric_every=4")
-RUNS = 3  # of each time, of which the median counts
-FEW = 10  # frames of the run that is subtracted: start and end of the process
+RUNS = 3  # of each measurement; the median counts
+FEW = 10  # frames of the run that is subtracted, for start and end of the process
 MEMORY = "/dev/shm"
 
 
@@ -88,15 +88,13 @@ class Raw(NamedTuple):
 
 @contextmanager
 def decoded(clip: Path) -> Iterator[Raw]:
-    form = discover(clip, "CLIP")
+    info = discover(clip, "CLIP")
     with tempfile.TemporaryDirectory(dir=MEMORY) as name:
         path = Path(name) / "frames"
-        _launched(
-            f"filesrc location={clip} ! decodebin ! videoconvert ! video/x-raw,format=I420 ! filesink location={path}"
-        )
-        luma = -(-form.width // 4) * 4 * -(-form.height // 2) * 2
-        chroma = -(-form.width // 8) * 4 * -(-form.height // 2) * 2
-        yield Raw(path, form.width, form.height, path.stat().st_size // (luma + chroma))
+        _run(f"filesrc location={clip} ! decodebin ! videoconvert ! video/x-raw,format=I420 ! filesink location={path}")
+        luma = -(-info.width // 4) * 4 * -(-info.height // 2) * 2
+        chroma = -(-info.width // 8) * 4 * -(-info.height // 2) * 2
+        yield Raw(path, info.width, info.height, path.stat().st_size // (luma + chroma))
 
 
 def elements(raw: Raw, words: Sequence[str], scaling: Fraction, roi: Roi | None = None) -> tuple[Element, ...]:
@@ -114,18 +112,18 @@ def elements(raw: Raw, words: Sequence[str], scaling: Fraction, roi: Roi | None 
 
 
 def spent(raw: Raw, line: str) -> Spent:
-    """Time of a line per frame, less the time that reading takes."""
+    """Time per frame of a line, minus the time for reading."""
     runs = [_slope(raw, f"{line} ! fakesink") for _ in range(RUNS)]
     reading = [_slope(raw, "fakesink") for _ in range(RUNS)]
     return Spent(*(median(run[of] for run in runs) - median(run[of] for run in reading) for of in (0, 1)))
 
 
 def _slope(raw: Raw, line: str) -> Spent:
-    few, all_of_them = (_launched(f"{raw.source(frames)} ! {line}") for frames in (FEW, raw.frames))
+    few, all_of_them = (_run(f"{raw.source(frames)} ! {line}") for frames in (FEW, raw.frames))
     return Spent(*(1000 * (b - a) / (raw.frames - FEW) for a, b in zip(few, all_of_them, strict=True)))
 
 
-def _launched(line: str) -> Spent:
+def _run(line: str) -> Spent:
     """Processor and wall time of a process, s."""
     began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(f"exec gst-launch-1.0 -q {line}", shell=True, check=True, stdout=subprocess.DEVNULL)
@@ -170,13 +168,13 @@ def by_option(raw: Raw, clip: Path) -> list[Row]:
 
 
 def by_element(raw: Raw) -> list[Row]:
-    """What each element adds to those before it, halved; and a crop to the middle half, without scaling."""
+    """What each element adds to those before it, at half size; and a crop to the middle half, without scaling."""
     whole, rows, before = elements(raw, (), HALF), [], 0.0
     ends = [number for number, element in enumerate(whole, 1) if element.factory != "capsfilter"]
     for end in ends:
-        # The scaler does nothing before caps ask for a size.
-        upto = whole[: end + 1] if whole[end - 1].name == "scaler" else whole[:end]
-        now = spent(raw, launch(upto)).processor
+        # The scaler does nothing until caps request a size.
+        part = whole[: end + 1] if whole[end - 1].name == "scaler" else whole[:end]
+        now = spent(raw, launch(part)).processor
         rows.append(Row(f"element {whole[end - 1].name}", now - before, "ms/frame"))
         before = now
     half = Roi(raw.width // 4, 0, raw.width // 2, raw.height)

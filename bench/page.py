@@ -1,7 +1,7 @@
 """From source to screen: delay of a frame on its way into the browser, by stage, and whether the page keeps up.
 
   python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each;
-                                            what one, two, four and eight cameras skip; what overlays add
+                                            pictures skipped with 1, 2, 4 and 8 cameras; what overlays add
   python bench/page.py --seconds 60 --show  with a window instead of headless
 
 The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
@@ -43,11 +43,11 @@ ONE, EIGHT = (
     ("one camera 960x540 at 30 Hz", 1, (960, 540, 30), 2500),
     ("eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000),
 )
-COUNTS = (1, 2, 4, 8)  # of cameras, for what is skipped
+COUNTS = (1, 2, 4, 8)  # of cameras, for skipped pictures
 PAIRS = 10  # of blocks with and without overlays
 BLOCK_SETTLE_S = 0.3
-STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and how far it goes: the path is drawn anew in each picture
-# The frame of a region is the page's own, which shows it only until a new region is on the picture.
+STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and amplitude: the path changes in each picture
+# The page's own frame of a region, which it normally shows only until the picture has the new region.
 OVERLAYS = ".bare #drive { visibility: hidden } body:not(.bare) .roi-drag { display: block !important; inset: 20% }"
 
 
@@ -55,8 +55,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--show", action="store_true", help="a window instead of headless")
-    words = parser.parse_args()
-    show(rows(words.seconds, headless=not words.show))
+    options = parser.parse_args()
+    show(rows(options.seconds, headless=not options.show))
 
 
 def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
@@ -67,17 +67,17 @@ def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
             *measure(browser, *ONE, seconds),
             *measure(browser, *EIGHT, seconds),
             *(skipped(browser, count, seconds / 2) for count in COUNTS),
-            *(row for form in (ONE, EIGHT) for row in overlays(browser, *form, seconds)),
+            *(row for video in (ONE, EIGHT) for row in overlays(browser, *video, seconds)),
         ]
         browser.close()
     return found
 
 
 def measure(
-    browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float
+    browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
-    """Drive a vehicle of some equal cameras and measure its page."""
-    with _vehicle(count, form, kbps) as words:
+    """Drive a vehicle of equal cameras and measure its page."""
+    with _vehicle(count, video, kbps) as words:
         rounds = [_round(browser, words, seconds / ROUNDS) for _ in range(ROUNDS)]
     cameras = [frames for one in rounds for frames in one.frames]
     for number, stage in enumerate(STAGES):
@@ -88,7 +88,7 @@ def measure(
     yield spread(f"{what}: between two pictures", between, "ms")
     yield spread(f"{what}: page opened, all drawn", [one.opened_ms for one in rounds], "ms")
     rates = [rate for one in rounds for rate in one.rates]
-    yield Row(f"{what}: drawn, slowest camera", min(rates), "Hz", note=f"of {form[2]}; fastest {max(rates):.1f}")
+    yield Row(f"{what}: drawn, slowest camera", min(rates), "Hz", note=f"of {video[2]}; fastest {max(rates):.1f}")
     yield Row(f"{what}: decoder errors", sum(one.errors for one in rounds), "", most=0)
     yield Row(f"{what}: operator's process", sum(one.cores for one in rounds) / ROUNDS, "cores")
 
@@ -102,11 +102,11 @@ def skipped(browser: Browser, count: int, seconds: float) -> Row:
 
 
 def overlays(
-    browser: Browser, what: str, count: int, form: tuple[int, int, int], kbps: int, seconds: float
+    browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
-    """What lines on the ground, figures and frames of regions add from source to screen, by turns in one drive."""
+    """What lines on the ground, figures and frames of regions add to source to screen, alternating in one drive."""
     with (
-        _vehicle(count, form, kbps) as words,
+        _vehicle(count, video, kbps) as words,
         _station(words) as (url, _, broker),
         browser.new_context(viewport={"width": 1280, "height": 800}) as context,
     ):
@@ -117,7 +117,7 @@ def overlays(
         page.add_style_tag(content=OVERLAYS)
         with _steering(broker):
             time.sleep(SETTLE_S)
-            turns = (True, False, False, True) * (PAIRS // 2)  # a trend of the machine adds to both
+            turns = (True, False, False, True) * (PAIRS // 2)  # a trend of the machine affects both
             blocks = [(with_them, _block(page, with_them, seconds / len(turns))) for with_them in turns]
     medians = {with_them: [median(ages) for each, ages in blocks if each == with_them] for with_them in (True, False)}
     added = [a - b for a, b in zip(medians[True], medians[False], strict=True)]
@@ -145,7 +145,7 @@ def _block(page: Page, with_them: bool, seconds: float) -> list[float]:
 
 @contextmanager
 def _steering(broker: Endpoint) -> Iterator[None]:
-    """The steering wheel turns from side to side, as the vehicle is told."""
+    """The steering wheel turns from side to side, reported to the vehicle."""
     ended, driver = threading.Event(), Operator(broker, "bench")
 
     def turn() -> None:
@@ -183,10 +183,10 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
         time.sleep(SETTLE_S)
         page.goto(url)
         time.sleep(SETTLE_S)
-        before, began, used = page.evaluate("tod.measure()")["cameras"], time.time(), processor_s(operator)
+        before, began, used_s = page.evaluate("tod.measure()")["cameras"], time.time(), processor_s(operator)
         time.sleep(seconds)
         after, took = page.evaluate("tod.measure()")["cameras"], time.time() - began
-        cores = (processor_s(operator) - used) / took
+        cores = (processor_s(operator) - used_s) / took
         stages = page.evaluate("tod.stages()").values()
     frames = [_since(camera, began * 1000) for camera in stages]
     due, drawn = ([after[name][key] - before[name][key] for name in after] for key in ("due", "drawn"))
@@ -196,15 +196,15 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
 
 
 def _since(frames: list[list[float]], began_ms: float) -> list[list[float]]:
-    """Those drawn since; the first ones of a stream carry no capture time."""
+    """Frames drawn since; the first ones of a stream carry no capture time."""
     return [frame for frame in frames if frame[-1] > began_ms and math.isfinite(frame[0])]
 
 
 @contextmanager
-def _vehicle(count: int, form: tuple[int, int, int], kbps: int) -> Iterator[list[str]]:
+def _vehicle(count: int, video: tuple[int, int, int], kbps: int) -> Iterator[list[str]]:
     """A vehicle of equal cameras, whose pictures are rendered. Yields the words that choose it."""
     with tempfile.TemporaryDirectory() as directory:
-        words = _configuration(Path(directory), count, *form, kbps)
+        words = _configuration(Path(directory), count, *video, kbps)
         render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
         yield [*words, f"conf={directory}"]
 

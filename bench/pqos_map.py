@@ -1,4 +1,4 @@
-"""Time of a look-up in a bandwidth map of a million points, and of building it.
+"""Time to look up a place in a bandwidth map of a million points, and to build it.
 
 python bench/pqos_map.py [points]
 """

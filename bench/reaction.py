@@ -4,8 +4,8 @@
 
 Three cameras, predictions of 4 Mbit/s that never change, 20 ms each way. The link carries 4.4 Mbit/s, and every 12 s
 half of that for 4 s. A row for each transport: time from each fall until the total is at most the new rate, the longest
-queue that the fall left, and packets lost. OUT keeps the drives; what is there is not driven again. Run it on an
-otherwise idle machine.
+queue after the fall, and packets lost. OUT keeps the drives; existing ones are not repeated. Run it on an otherwise
+idle machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from uplinks import driven, row
+from uplinks import ensure_drive, row
 
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import series
@@ -38,7 +38,7 @@ NAMES = ("front", "rear", "mast")
 SIZE_PX = (640, 360)  # so that two cores encode and decode 40 pictures a second of each
 DRIVE = (
     *("vehicle=delivery_robot", "pqos=constant", "pqos.kbps=4000"),
-    *("source=test", "source.elements.0.properties.pattern=snow"),  # of which an encoder needs all of its bitrate
+    *("source=test", "source.elements.0.properties.pattern=snow"),  # for which an encoder uses its whole bitrate
     *(
         f"cameras.{name}.{key}={px}"
         for name in NAMES
@@ -57,28 +57,28 @@ class Reaction(NamedTuple):
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("output", type=Path)
-    options.add_argument("--falls", type=int, default=10)
-    options.add_argument("--fps", type=int, default=40)
-    options.add_argument("--only", nargs="*", choices=TRANSPORTS, default=[*TRANSPORTS])
-    asked = options.parse_args()
-    asked.output.mkdir(parents=True, exist_ok=True)
-    trace = asked.output.resolve() / "halves.csv"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--falls", type=int, default=10)
+    parser.add_argument("--fps", type=int, default=40)
+    parser.add_argument("--only", nargs="*", choices=TRANSPORTS, default=[*TRANSPORTS])
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    trace = options.output.resolve() / "halves.csv"
     rows = (
         (0, WIDE_KBPS),
         (WIDE_S - NARROW_S, WIDE_KBPS),
         (WIDE_S, NARROW_KBPS),
-    )  # the last as long as its neighbour
+    )  # the last lasts as long as its neighbour
     write_whole(trace, "\n".join(["t_s,kbps", *(f"{t},{kbps}" for t, kbps in rows)]).encode())
-    fps = [f"cameras.{name}.fps={asked.fps}" for name in NAMES]
-    seconds = asked.falls * (WIDE_S + NARROW_S)
-    limit = LIMIT_MS + (0 if asked.fps >= 40 else 1000 / asked.fps)
+    fps = [f"cameras.{name}.fps={options.fps}" for name in NAMES]
+    seconds = options.falls * (WIDE_S + NARROW_S)
+    limit = LIMIT_MS + (0 if options.fps >= 40 else 1000 / options.fps)
     print(row("transport", f"median ms (at most {limit:.0f})", "p95", "longest", "longest queue ms, median", "lost"))
     print(row(*["---"] * 6), flush=True)
-    for name in asked.only:
-        path = asked.output / name.replace("/", "_").lower()
-        driven(path, [*DRIVE, *TRANSPORTS[name], *fps, f"link.file={trace}", f"duration_s={seconds}"])
+    for name in options.only:
+        path = options.output / name.replace("/", "_").lower()
+        ensure_drive(path, [*DRIVE, *TRANSPORTS[name], *fps, f"link.file={trace}", f"duration_s={seconds}"])
         drive = read_drive(path)
         found = reactions(drive)
         ms = [1000 * reaction.seconds for reaction in found]

@@ -3,8 +3,8 @@
 python bench/recording.py CLIP ...
 
 The first frames of each clip are decoded into memory beforehand; only the encoder with its muxer, and the demuxer with
-its decoder, are timed. Printed are the best of three runs, and the processor time per frame, which other processes
-disturb less. GStreamer's Matroska muxer does not take FFVHuff: it is timed without a container, its decoder as the
+its decoder, are timed. It prints the best of three runs, and the processor time per frame, which other processes
+disturb less. GStreamer's Matroska muxer does not accept FFVHuff: it is timed without a container, its decoder as the
 difference between encoding with and without decoding.
 """
 

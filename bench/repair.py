@@ -1,12 +1,12 @@
-"""What the repair of lost packets leaves to be gained: by shorter refresh waves, or by forward error correction.
+"""What shorter refresh waves or forward error correction could gain over the present repair of lost packets.
 
   python bench/repair.py OUT                     20 minutes
   python bench/repair.py OUT --runs 1 --seconds 15
 
-Forward error correction sends more packets in place of better pictures. `fec` is a drive that loses nothing, at the
-bitrate that a fifth of redundancy would leave to the pictures: error correction that repaired everything could be no
-better. A row for each case: medians over paired runs, and their range. OUT keeps the drives; what is there is not
-driven again. Run it on an otherwise idle machine.
+Forward error correction spends bitrate on redundancy instead of pictures. `fec` is a drive without losses, at the
+bitrate that a fifth of redundancy would leave for the pictures: an upper bound for perfect error correction. A row
+for each case: medians over paired runs, and their range. OUT keeps the drives; existing ones are not repeated. Run it
+on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ COLUMNS = ("mssim", "worst", "damaged", "frozen", "lost", "p50_ms", "p99_ms")
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("output", type=Path)
-    options.add_argument("--runs", type=int, default=3)
-    options.add_argument("--seconds", type=int, default=20)
-    asked = options.parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--seconds", type=int, default=20)
+    options = parser.parse_args()
     cases = dict(_cases())
     drives: dict[str, list[Figures]] = {name: [] for name in cases}
-    for number in range(asked.runs):
+    for number in range(options.runs):
         for name, done in drives.items():
-            path = asked.output / f"{name}.{number}"
-            drive(path, [*BASE, *cases[name]], asked.seconds)
+            path = options.output / f"{name}.{number}"
+            drive(path, [*BASE, *cases[name]], options.seconds)
             done.append(figures(path))
             print(path.name, {key: round(done[-1][key], 4) for key in COLUMNS}, flush=True)
     print(row("case", *(FIGURES[key] for key in COLUMNS)))

@@ -3,7 +3,7 @@
 python bench/replay.py [events]
 
 The whole process is timed: start, composition of the configuration, reading, deciding, writing. Two scenarios: one in
-which every event is a prediction that changes all bitrates, and a drive as it is logged, with time, positions and link
+which every event is a prediction that changes all bitrates, and a drive as logged, with time, positions and link
 measurements between the predictions.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 
 from table import Row, show
 
-WANTED = 7000  # events per second
+LEAST_RATE = 7000  # events per second
 RUNS = 3
 
 
@@ -60,12 +60,12 @@ def seconds(modes: str, events: Path) -> float:
 def rows(count: int = 50_000) -> list[Row]:
     found = []
     with tempfile.TemporaryDirectory() as directory:
-        for story in (predictions, drive):
-            events = Path(directory) / f"{story.__name__}.jsonl"
-            events.write_text("".join(json.dumps(event) + "\n" for event in story(count)))
+        for scenario in (predictions, drive):
+            events = Path(directory) / f"{scenario.__name__}.jsonl"
+            events.write_text("".join(json.dumps(event) + "\n" for event in scenario(count)))
             for modes in ("paper", "safe", "steady"):
                 rate = count / seconds(modes, events)
-                found.append(Row(f"replay of {story.__name__}, modes={modes}", rate, "events/s", least=WANTED))
+                found.append(Row(f"replay of {scenario.__name__}, modes={modes}", rate, "events/s", least=LEAST_RATE))
     return found
 
 

@@ -1,9 +1,9 @@
-"""The test cases of RFC 8867 that `experiment=rfc8867` drives: what the link carried, and how long packets waited.
+"""The test cases of RFC 8867 in `experiment=rfc8867`: use of the link, and queuing delay.
 
   sudo python bench/rfc8867.py OUT                            all cases, 25 minutes
   sudo python bench/rfc8867.py OTHER --only 5_6_long_tcp --runs 5 --words modes=paper
 
-A row for each case: medians over the runs, and their range. OUT keeps the drives; what is there is not driven again.
+A row for each case: medians over the runs, and their range. OUT keeps the drives; existing ones are not repeated.
 Run it on an otherwise idle machine, as root for the cases with TCP.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, cameras, driven, queue_ms, row, shown, switches
+from uplinks import SETTLED_S, Figures, cameras, ensure_drive, queue_ms, row, shown, switches
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
@@ -39,27 +39,27 @@ FIGURES = {
     "down": "settled down s",
     "up": "up s",
 }
-TAKEN = 0.8  # share of the new rate
+SETTLED = 0.8  # share of the new rate
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("output", type=Path)
-    options.add_argument("--runs", type=int, default=1)
-    options.add_argument("--only", nargs="*", help="cases; all if not given")
-    options.add_argument("--words", nargs="*", default=[], help="further overrides")
-    asked = options.parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--only", nargs="*", help="cases; all if not given")
+    parser.add_argument("--words", nargs="*", default=[], help="further overrides")
+    options = parser.parse_args()
     cases = configuration([EXPERIMENT]).experiment().runs
     print(row("case", *FIGURES.values()))
     print(row(*["---"] * (len(FIGURES) + 1)), flush=True)
-    for name in asked.only or cases:
-        paths = [asked.output / f"{name}.{number}" for number in range(asked.runs)]
-        drives = [figures(_driven(path, (*cases[name], *asked.words))) for path in paths]
+    for name in options.only or cases:
+        paths = [options.output / f"{name}.{number}" for number in range(options.runs)]
+        drives = [figures(_drive(path, (*cases[name], *options.words))) for path in paths]
         print(row(name, *(shown(key, [drive[key] for drive in drives]) for key in FIGURES)), flush=True)
 
 
-def _driven(path: Path, words: Sequence[str]) -> Drive:
-    driven(path, [EXPERIMENT, "~experiment.runs", *words])
+def _drive(path: Path, words: Sequence[str]) -> Drive:
+    ensure_drive(path, [EXPERIMENT, "~experiment.runs", *words])
     return read_drive(path)
 
 
@@ -69,11 +69,11 @@ def figures(drive: Drive) -> Figures:
     whole = statistics(over_time)
     samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
     t, kbps = np.array([(sample.t, sample.kbps) for sample in samples]).T
-    could = float(np.sum(np.diff(t) * kbps[:-1])) * 1000 / 8  # bytes
+    capacity_bytes = float(np.sum(np.diff(t) * kbps[:-1])) * 1000 / 8
     first, last = samples[0], samples[-1]
     return {
-        "used": 100 * (last.bytes - first.bytes) / could,
-        "tcp": 100 * (last.tcp_bytes - first.tcp_bytes) / could,
+        "used": 100 * (last.bytes - first.bytes) / capacity_bytes,
+        "tcp": 100 * (last.tcp_bytes - first.tcp_bytes) / capacity_bytes,
         **queue_ms(drive),
         "dropped": last.dropped - first.dropped,
         "lost": float(whole.lost or 0),
@@ -97,9 +97,9 @@ def _below_floor(drive: Drive) -> float:
 
 
 def settling(drive: Drive) -> Figures:
-    """Time from a step of the link's rate until the total is at most the new rate and at least TAKEN of it, s.
+    """Time from a step of the link's rate until the total is at most the new rate and at least SETTLED of it, s.
 
-    returns  medians by direction; inf: it never was before the next step. nan: no such step
+    returns  medians by direction; inf: not before the next step; nan: no such step
     """
     ahead = drive.sides["link"].began.time - drive.sides["vehicle"].began.time
     samples = [(sample.t + ahead, sample.kbps) for sample in drive.sides["link"].of(LinkSample)]
@@ -110,7 +110,7 @@ def settling(drive: Drive) -> Figures:
     for (t, kbps, down), end in zip(steps, ends, strict=False):  # no step, no end
         in_force = [total for since, total in totals if since <= t][-1:]
         after = [(t, total) for total in in_force] + [(since, total) for since, total in totals if t < since < end]
-        settled = (since for since, total in after if TAKEN * kbps <= total <= kbps)
+        settled = (since for since, total in after if SETTLED * kbps <= total <= kbps)
         waits[down].append(next(settled, np.inf) - t)
     return {name: median(waits[down]) if waits[down] else np.nan for name, down in (("down", True), ("up", False))}
 

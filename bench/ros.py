@@ -1,12 +1,12 @@
-"""A clip as image topics of ROS, through vehicle and operator, to a subscriber: what arrives, how large, how late.
+"""A clip as ROS image topics, through both sides, to a subscriber: pictures delivered, sizes, latency.
 
   python bench/ros.py CLIP.mp4
   python bench/ros.py CLIP.mp4 --cameras 2 --fps 2 --seconds 20
   python bench/ros.py CLIP.mp4 --version 1
 
-Starts a node that publishes the clip as topics of 480x270 (all at once, in ROS 2 reliable), the demo with source=ros
-and ros.pictures=true, and a node that subscribes to the decoded pictures. In mode A for the first half; then mode C
-with a fifth of the bitrate, and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
+Starts a node that publishes the clip as topics of 480x270 (simultaneously, in ROS 2 reliable), the demo with source=ros
+and ros.pictures=true, and a node that subscribes to the decoded pictures. Mode A for the first half, then mode C
+with a fifth of the bitrate and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ NODE = "/tod_runner_operator"
 class Row(NamedTuple):
     """A camera: pictures published and delivered with a stamp, between the first and the last of these.
 
-    sizes    before and after the change of the mode, px
-    late_ms  latencies from stamp to subscriber, ms
+    sizes       before and after the change of mode, px
+    latency_ms  from stamp to subscriber
     """
 
     camera: str
     published: int
     delivered: int
     sizes: tuple[str, str]
-    late_ms: list[float]
+    latency_ms: list[float]
 
 
 def main() -> int:
@@ -58,27 +58,29 @@ def main() -> int:
     for name, default in (("cameras", 8), ("fps", 10), ("seconds", 30)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--version", type=int, choices=(2, 1), default=2, help="of ROS")
-    asked = parser.parse_args()
-    if MISSING[asked.version]:
-        print(MISSING[asked.version], file=sys.stderr)
+    options = parser.parse_args()
+    if MISSING[options.version]:
+        print(MISSING[options.version], file=sys.stderr)
         return 1
-    cameras = list(configuration([]).vehicle().cameras)[: asked.cameras]
-    with tempfile.TemporaryDirectory() as directory, running(asked.version, Path(directory)) as ros:
+    cameras = list(configuration([]).vehicle().cameras)[: options.cameras]
+    with tempfile.TemporaryDirectory() as directory, running(options.version, Path(directory)) as ros:
         file = Path(directory, "clip.bgr")
         try:
-            file.write_bytes(pictures_of(asked.clip))
+            file.write_bytes(pictures_of(options.clip))
         except ValueError as error:
             print(error, file=sys.stderr)
             return 1
         topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
         decoded = {name: f"{NODE}/camera/{ros_name(name)}/image" for name in cameras}
-        form = map(str, (file, WIDTH, HEIGHT, asked.fps))
+        form = map(str, (file, WIDTH, HEIGHT, options.fps))
         with (
             node(ros, "publish", *form, *topics.values()) as publisher,
             node(ros, "subscribe", *decoded.values()) as subscriber,
         ):
-            status = subprocess.run(demo(ros, topics, asked.fps, asked.seconds), check=False, cwd=CHECKOUT).returncode
-            delivered, published = ended(subscriber), ended(publisher)
+            status = subprocess.run(
+                demo(ros, topics, options.fps, options.seconds), check=False, cwd=CHECKOUT
+            ).returncode
+            delivered, published = results(subscriber), results(publisher)
     if status == 0:
         show([row(name, published[topics[name]], delivered[decoded[name]]) for name in cameras])
     return status
@@ -104,7 +106,7 @@ def demo(ros: Ros, topics: Mapping[str, str], fps: int, seconds: int) -> list[st
     total = KBPS * len(topics)
     change = f"{{at_s: {seconds // 2}, request: {{event: mode_selected, mode: collective}}}}"
     less = f"{{at_s: {seconds // 2}, request: {{event: total_set, kbps: {total // 5}}}}}"
-    # A little more than the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
+    # Slightly above the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
     own = [
         "source=ros",
         "modes=paper",
@@ -128,7 +130,7 @@ def node(ros: Ros, *words: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def ended(process: subprocess.Popen[str]) -> dict[str, list[Any]]:
+def results(process: subprocess.Popen[str]) -> dict[str, list[Any]]:
     """What a node has seen, by topic."""
     seen: dict[str, list[Any]] = json.loads(process.communicate(timeout=END_S)[0])
     return seen
@@ -145,14 +147,14 @@ def row(camera: str, published: Sequence[float], delivered: Sequence[Sequence[fl
 
 
 def show(rows: Sequence[Row]) -> None:
-    every = [late for one in rows for late in one.late_ms]
+    every = [ms for one in rows for ms in one.latency_ms]
     total = Row("all", sum(one.published for one in rows), sum(one.delivered for one in rows), ("", ""), every)
     heads = ("published", "delivered", "", "mode A", "mode C", "p50 ms", "p95 ms")
     print(f"{'camera':14}" + "".join(f"{head:>10}" for head in heads))
     for one in (*rows, total):
-        late = [f"{np.percentile(one.late_ms, percent):.1f}" if one.late_ms else "-" for percent in (50, 95)]
-        share = f"{100 * one.delivered / one.published:.1f} %" if one.published else "-"
-        cells = (one.published, one.delivered, share, *one.sizes, *late)
+        latency = [f"{np.percentile(one.latency_ms, share):.1f}" if one.latency_ms else "-" for share in (50, 95)]
+        delivered = f"{100 * one.delivered / one.published:.1f} %" if one.published else "-"
+        cells = (one.published, one.delivered, delivered, *one.sizes, *latency)
         print(f"{one.camera:14}" + "".join(f"{cell:>10}" for cell in cells))
 
 

@@ -1,10 +1,10 @@
 """usage: python ros_node.py publish FILE WIDTH HEIGHT FPS TOPIC ...
        python ros_node.py subscribe TOPIC ...
 
-Run by a Python that has rclpy or rospy; see ros.py. `publish` plays a file of BGR pictures, again and again, on all
-topics at once, from when each has a subscriber; in ROS 2 reliable. `subscribe` takes pictures. Both end with their
-input, and then print JSON: by topic a list with the stamp of each picture, s; `subscribe` also its width, height and
-latency, s.
+Run by a Python that has rclpy or rospy; see ros.py. `publish` loops a file of BGR pictures on all topics
+simultaneously, once each has a subscriber; in ROS 2 reliable. `subscribe` receives pictures. Both end when standard
+input ends, and then print JSON: by topic a list with the stamp of each picture, s; `subscribe` also its width, height
+and latency, s.
 """
 
 from __future__ import annotations
@@ -49,27 +49,27 @@ class Subscriber:
     def __init__(self, node: Any, *topics: str) -> None:
         self.seen: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic in topics:
-            node.subscribe(Image, topic, partial(self._take, topic))
+            node.subscribe(Image, topic, partial(self._on_picture, topic))
 
-    def _take(self, topic: str, message: Image) -> None:
+    def _on_picture(self, topic: str, message: Image) -> None:
         stamp = stamp_s(message)
         self.seen[topic].append([stamp, message.width, message.height, time.time() - stamp])
 
 
 def main(what: str, *words: str) -> None:
     node, ended = Node(f"bench_{what}"), threading.Event()
-    one = Publisher(node, *words) if what == "publish" else Subscriber(node, *words)
+    role = Publisher(node, *words) if what == "publish" else Subscriber(node, *words)
 
     def wait() -> None:
         sys.stdin.read()
         ended.set()
 
-    def tell() -> None:
-        sys.stdout.write(json.dumps(one.seen) + "\n")
+    def report() -> None:
+        sys.stdout.write(json.dumps(role.seen) + "\n")
         sys.stdout.flush()
 
     threading.Thread(target=wait, daemon=True).start()
-    node.run(ended, tell)
+    node.run(ended, report)
 
 
 main(*sys.argv[1:])

@@ -38,12 +38,12 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("words", nargs="*")
-    given = parser.parse_args()
-    words = [*WORDS, *given.words, f"duration_s={given.seconds:g}"]
+    options = parser.parse_args()
+    words = [*WORDS, *options.words, f"duration_s={options.seconds:g}"]
     with tempfile.TemporaryDirectory() as directory:
         keys = _keys(Path(directory) / "keys")
         costs: dict[str, list[Cost]] = {"without": [], "with": []}
-        for pair in range(given.pairs):
+        for pair in range(options.pairs):
             for kind, more in (("without", []), ("with", [f"keys={keys}"])):
                 cost = _drive([*words, *more], Path(directory) / f"{kind}{pair}")
                 print(f"{kind:8} {cost.cpu_s:6.2f} s CPU   {cost.first_picture_s:5.2f} s   {cost.latency_ms:5.1f} ms")
@@ -70,8 +70,10 @@ def _drive(words: list[str], log: Path) -> Cost:
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
     samples = list(operator.of(Sample))
     arrived = min(t for sample in samples for camera in sample.cameras.values() for t, _ in camera.arrivals)
-    late = [camera.latency_ms for sample in samples for camera in sample.cameras.values() if camera.latency_ms]
-    return Cost(_children_s() - before, operator.began.time + arrived - vehicle.began.time, statistics.median(late))
+    latencies = [camera.latency_ms for sample in samples for camera in sample.cameras.values() if camera.latency_ms]
+    return Cost(
+        _children_s() - before, operator.began.time + arrived - vehicle.began.time, statistics.median(latencies)
+    )
 
 
 def _children_s() -> float:

@@ -1,4 +1,4 @@
-"""One table and one JSON of all figures, with machine and date."""
+"""One table and one JSON document of all figures, with machine and date."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ WIDTH = 58  # of the names
 class Row(NamedTuple):
     """A figure.
 
-    bare   the same of bare GStreamer; None: it has nothing like it
-    least  and most: what is acceptable
-    note   what else is known about it, such as its spread
+    bare         the same for bare GStreamer; None: it has no counterpart
+    least, most  limits of what is acceptable
+    note         further information, such as the spread
     """
 
     what: str
@@ -53,7 +53,7 @@ def show(rows: Sequence[Row]) -> None:
 
 
 def spread(what: str, values: Sequence[float], unit: str) -> Row:
-    """The median of some values, with the others in its note."""
+    """The median, with higher percentiles in the note."""
     shares = ", ".join(f"{name} {percentile(values, share):.1f}" for name, share in (("p95", 0.95), ("p99", 0.99)))
     return Row(what, middle(values), unit, note=f"{shares}, max {max(values):.1f} of {len(values)}")
 
@@ -68,7 +68,7 @@ def write(rows: Sequence[Row], path: Path) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures depend on."""
+    """The hardware and software that the figures depend on."""
     cpu = next((line.partition(":")[2].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
                 if line.startswith("model name")), platform.machine())  # fmt: skip
     gst = subprocess.run(["gst-launch-1.0", "--version"], capture_output=True, text=True, check=False).stdout

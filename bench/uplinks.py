@@ -1,12 +1,12 @@
-"""Predictions that are right and wrong over recorded uplinks, in paired runs: what the operator saw.
+"""Right and wrong predictions over recorded uplinks, in paired runs: what the operator saw.
 
   python bench/uplinks.py OUT UPLINK.csv...                   5 runs of each, hours
   python bench/uplinks.py OUT UPLINK.csv --runs 1 --seconds 30 --only right high_50
 
 Drives `experiment=wrong_prediction` over each uplink, measures each drive, and prints a table: medians over the runs,
-and their range. A drive without a limited link shows first how much of their bitrate the cameras use: where that is
+and their range. A drive over an unlimited link first shows how much of their bitrate the cameras use: if that is
 little, or a busy machine drops frames, a row says nothing about the link and is marked void. OUT keeps the drives,
-OUT/uplinks.json all figures and OUT/uplinks.png a picture of them; what is there is not driven again. Run it on an
+OUT/uplinks.json all figures and OUT/uplinks.png a chart of them; existing drives are not repeated. Run it on an
 otherwise idle machine.
 """
 
@@ -37,10 +37,10 @@ from runner.records import LinkSample
 from runner.system.files import write_whole
 
 EXPERIMENT = "experiment=wrong_prediction"
-FPS = 15  # of eight cameras that two cores encode and decode beside the rest; for a wide uplink or a slow machine less
-SETTLED_S = 3.0  # from then on a drive counts
-USABLE_KBPS = 500  # latency counts while the link carries at least so much
-OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # a link that carries less for longer is out, until it is usable again
+FPS = 15  # of eight cameras on two cores, which also do everything else; less for a wide uplink or a slow machine
+SETTLED_S = 3.0  # a drive counts from here on
+USABLE_KBPS = 500  # latency counts while the link carries at least this much
+OUTAGE_KBPS, OUTAGE_S = 50, 1.0  # an outage: less than this for longer, until the link is usable again
 FIGURES = {
     "frozen": "frozen %",
     "back_s": "back after outage, p95 s",
@@ -57,7 +57,7 @@ FIGURES = {
     "switches": "sizes/min",
     "dropped": "frames dropped by the cameras %",
 }
-FILLED, DROPPED = 95, 1  # %, at least and at most, else a row is void
+FILLED, DROPPED = 95, 1  # %, at least and at most; otherwise a row is void
 # Panels of the picture: their scale, and which way is better.
 PANELS = {
     "frozen": ("frozen, % of the time (less is better)", "linear"),
@@ -71,38 +71,40 @@ Floats = NDArray[np.float64]
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("output", type=Path)
-    options.add_argument("uplinks", type=Path, nargs="+")
-    options.add_argument("--runs", type=int, default=5)
-    options.add_argument("--seconds", type=int, default=60)
-    options.add_argument("--fps", type=int, default=FPS, help="frames a second of each camera, at most")
-    options.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
-    asked = options.parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("uplinks", type=Path, nargs="+")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--fps", type=int, default=FPS, help="frames a second of each camera, at most")
+    parser.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
+    options = parser.parse_args()
     found: dict[str, dict[str, list[Figures]]] = {}
     filled: dict[str, float] = {}
-    for uplink in asked.uplinks:
-        filled[uplink.stem] = _filled(asked.output / uplink.stem / "unlimited", uplink, asked.seconds, asked.fps)
+    for uplink in options.uplinks:
+        filled[uplink.stem] = _bitrate_use(
+            options.output / uplink.stem / "unlimited", uplink, options.seconds, options.fps
+        )
         print(f"{uplink.stem}: the cameras use {filled[uplink.stem]:.0f} % of their bitrate", flush=True)
         conditions = _conditions(uplink)
-        drives: dict[str, list[Figures]] = {name: [] for name in asked.only or conditions}
+        drives: dict[str, list[Figures]] = {name: [] for name in options.only or conditions}
         found[uplink.stem] = drives
-        for number in range(asked.runs):  # paired: what the machine does meanwhile meets all conditions
+        for number in range(options.runs):  # paired: other load on the machine affects all conditions
             for name, done in drives.items():
-                path = asked.output / uplink.stem / f"{name}.{number}"
+                path = options.output / uplink.stem / f"{name}.{number}"
                 words = [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)]
-                drive(path, words, asked.seconds, asked.fps)
+                drive(path, words, options.seconds, options.fps)
                 done.append(figures(path))
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
-            write_whole(asked.output / "uplinks.json", json.dumps(found, indent=1).encode())
-    picture(found).savefig(asked.output / "uplinks.png", dpi=100)
+            write_whole(options.output / "uplinks.json", json.dumps(found, indent=1).encode())
+    picture(found).savefig(options.output / "uplinks.png", dpi=100)
     print("\n".join(table(found, filled)))
 
 
-def _filled(path: Path, uplink: Path, seconds: int, fps: int) -> float:
-    """Of the bitrate that is allocated to the cameras, the share in % that they send over a link without limits."""
+def _bitrate_use(path: Path, uplink: Path, seconds: int, fps: int) -> float:
+    """Share of the allocated bitrate that the cameras send over an unlimited link, %."""
     words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(uplink)]
-    driven(path, [*words, f"fps_max={fps}", f"duration_s={seconds}"])
+    ensure_drive(path, [*words, f"fps_max={fps}", f"duration_s={seconds}"])
     return 100 * statistics(series(read_drive(path), path.name)).share
 
 
@@ -117,23 +119,23 @@ def _trace(uplink: Path) -> str:
 
 
 def drive(path: Path, words: Sequence[str], seconds: int, fps: int = FPS) -> None:
-    """Drive and measure the pictures, unless that was done."""
-    driven(path, [*words, f"fps_max={fps}", "log.video=true", f"duration_s={seconds}"])
+    """Drive and measure the pictures, unless that has been done."""
+    ensure_drive(path, [*words, f"fps_max={fps}", "log.video=true", f"duration_s={seconds}"])
     if not (path / DOCUMENT).exists():
         run = [sys.executable, "-m", "runner", "quality", str(path)]
         subprocess.run(run, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         shutil.rmtree(path / "video")
 
 
-def driven(path: Path, words: Sequence[str]) -> None:
-    """Drive, unless the drive is there; one that was cut short, or had other overrides, begins anew."""
-    done, asked = path / "done", "\n".join(words)
-    if done.exists() and done.read_text() == asked:
+def ensure_drive(path: Path, words: Sequence[str]) -> None:
+    """Drive, unless the drive exists; one that was cut short, or had other overrides, is repeated."""
+    done, overrides = path / "done", "\n".join(words)
+    if done.exists() and done.read_text() == overrides:
         return
     shutil.rmtree(path, ignore_errors=True)
     run = [sys.executable, "-m", "runner", "demo", *words, "page.serve=false", f"log={path}"]
     subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
-    done.write_text(asked)
+    done.write_text(overrides)
 
 
 def row(*cells: str) -> str:
@@ -158,10 +160,10 @@ def figures(path: Path) -> Figures:
     ]
     return {
         "frozen": 100 * whole.frozen,
-        "back_s": _back(over_time, link_t, link_kbps),
+        "back_s": _recovery_s(over_time, link_t, link_kbps),
         "p50_ms": float(np.percentile(ms[counts], 50)),
         "p99_ms": float(np.percentile(ms[counts], 99)),
-        "used": 100 * _used(logged, over_time),
+        "used": 100 * _link_use(logged, over_time),
         "damaged": 100 * whole.damaged,
         "lost": float(whole.lost or 0),
         "mssim": fmean(means),
@@ -175,7 +177,7 @@ def figures(path: Path) -> Figures:
 def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
     """Frames that the cameras should have sent and did not, %: the machine was too busy.
 
-    Counted where they send: between two samples in which nothing was sent, nobody watched, or sending was off.
+    Counted while they send: between two samples in which nothing was sent, nobody watched, or sending was off.
     """
     sent = due = 0.0
     for name, camera in over_time.cameras.items():
@@ -183,7 +185,7 @@ def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
         frames, seconds = np.diff(camera.sent.frames), np.diff(camera.sent.t)
         if len(frames) < 3:
             continue
-        sends = np.convolve(frames == 0, np.ones(3), "same") == 0  # nor where it stops or begins between two samples
+        sends = np.convolve(frames == 0, np.ones(3), "same") == 0  # excludes samples in which it starts or stops
         sends &= camera.sent.t[:-1] >= SETTLED_S
         sent, due = sent + float(frames[sends].sum()), due + fps[name] * float(seconds[sends].sum())
     return max(0.0, 100 * (1 - sent / due)) if due else float("nan")
@@ -217,20 +219,20 @@ def _at(t: Floats, values: Floats, times: Floats) -> Floats:
 
 
 def cameras(drive: Drive) -> Mapping[str, Camera]:
-    """The cameras that were driven with."""
+    """The cameras of a drive."""
     config = dict(drive.sides["vehicle"].began.config)
     return configuration([], base=(config, "config"), runnable=False).vehicle().cameras
 
 
-def _used(drive: Drive, over_time: Series) -> float:
-    """Bytes that passed over those that could have: no more than the link carried, or the cameras may send."""
+def _link_use(drive: Drive, over_time: Series) -> float:
+    """Bytes that passed over those that could have: at most what the link carried and the cameras may send."""
     most = float(plain(sum(camera.rate_quality.b_full for camera in cameras(drive).values())))
     samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
     could = sum(min(before.kbps, most) * (after.t - before.t) for before, after in pairwise(samples))
     return (samples[-1].bytes - samples[0].bytes) * 8 / 1000 / could
 
 
-def _back(over_time: Series, t: Floats, kbps: Floats) -> float:
+def _recovery_s(over_time: Series, t: Floats, kbps: Floats) -> float:
     """Time from the end of an outage to the next picture, over all cameras and outages: p95, s; nan without one."""
     waits = [
         float(came[0] - end)
@@ -256,7 +258,7 @@ def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
 def table(found: dict[str, dict[str, list[Figures]]], filled: dict[str, float]) -> Iterator[str]:
     """Markdown: a row for each uplink and condition, median and range over its runs.
 
-    filled  % by uplink, see `_filled`
+    filled  % by uplink, see `_bitrate_use`
     """
     yield row("uplink", "prediction", *FIGURES.values())
     yield row(*["---"] * (len(FIGURES) + 2))

@@ -1,4 +1,4 @@
-"""What a process uses, by proc(5)."""
+"""Processor time and memory of a process, from proc(5)."""
 
 from __future__ import annotations
 

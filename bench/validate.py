@@ -1,4 +1,4 @@
-"""Seconds that `tod-runner validate` takes for a user's directory, alone and with all that is packaged.
+"""Seconds that `tod-runner validate` takes for a user's directory, alone and with all packaged files.
 
 python bench/validate.py [runs]
 

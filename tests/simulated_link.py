@@ -1,4 +1,4 @@
-"""Cameras, a link and reports of what arrives, simulated: the estimator and the cap in a closed loop."""
+"""Simulated cameras, link and reception reports: the estimator and the cap in a closed loop."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PACKET = 1200  # bytes
 
 @dataclass(repr=False)
 class Link:
-    """A link with a queue that drops what would wait too long.
+    """A link with a queue that drops packets which would wait too long.
 
     kbps     capacity
-    delay_s  further delay of what is sent then, both ways; packets stay in order
+    delay_s  further delay of packets sent at that time, both ways; packets stay in order
     queue_s  longest wait
     """
 
@@ -36,13 +36,16 @@ class Link:
 
 
 class Queue:
-    """The queue in front of a link: when the last bit of what it has taken leaves."""
+    """The queue in front of a link.
+
+    free  when the last bit in the queue leaves
+    """
 
     def __init__(self, link: Link, free: float) -> None:
         self._link, self.free = link, free
 
     def put(self, t: float, size: int) -> float | None:
-        """When that many bytes have left; None: dropped."""
+        """When a packet of that many bytes has left; None: dropped."""
         if self.free - t > self._link.queue_s:
             return None
         self.free = _sent(self._link, max(t, self.free), size)
@@ -56,30 +59,30 @@ class Tcp:
 
     def __init__(self, until: float, rtt_s: float) -> None:
         self._until, self._rtt_s = until, rtt_s
-        self._window, self._flying, self._reduced = 10.0, 0, 0.0
+        self._window, self._in_flight, self._reduced_at = 10.0, 0, 0.0
         self.delivered: list[tuple[float, int]] = []
 
-    def react(self, t: float, what: str) -> None:
-        if what == "ack":
-            self._flying -= 1
+    def on_feedback(self, t: float, outcome: str) -> None:
+        if outcome == "ack":
+            self._in_flight -= 1
             self._window += 1 / self._window
             self.delivered.append((t, self.PACKET))
-        elif what == "loss":
-            self._flying -= 1
-            if t - self._reduced > self._rtt_s:
-                self._window, self._reduced = max(2.0, 0.7 * self._window), t
+        elif outcome == "loss":
+            self._in_flight -= 1
+            if t - self._reduced_at > self._rtt_s:
+                self._window, self._reduced_at = max(2.0, 0.7 * self._window), t
 
     def send(self, t: float, queue: Queue) -> Iterator[tuple[float, str]]:
-        """As much as the window allows: when the sender learns what became of each packet."""
-        while t < self._until and self._flying < self._window:
-            self._flying += 1
+        """Send as much as the window allows; yields when the sender learns the fate of each packet."""
+        while t < self._until and self._in_flight < self._window:
+            self._in_flight += 1
             left = queue.put(t, self.PACKET)
             yield (left or queue.free) + self._rtt_s, "ack" if left else "loss"
 
 
 @dataclass(repr=False)
 class Drive:
-    """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived, t of losses."""
+    """Record of a simulated drive: (t, cap in kbit/s, state), waits in the queue, bytes that arrived, t of losses."""
 
     caps: list[tuple[float, float, str]] = field(default_factory=list)
     waits: list[tuple[float, float]] = field(default_factory=list)
@@ -87,7 +90,7 @@ class Drive:
     lost: list[float] = field(default_factory=list)
     tcp: Sequence[tuple[float, int]] = ()
 
-    def passed(self, t: float, wait: float, arrived: float, size: int) -> None:
+    def record_frame(self, t: float, wait: float, arrived: float, size: int) -> None:
         self.waits.append((t, wait))
         self.arrived.append((arrived, size))
 
@@ -131,60 +134,60 @@ def drive(
     queued_s  length of the queue before the cameras begin
     start  share of the limit until the link is measured
     key_frame  size of each camera's first frame, in multiples of the others
-    late  how late the frame that a camera captures at t is sent, s
+    late  delay until the frame that a camera captures at t is sent, s
     """
-    chance, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
+    rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
-    waiting, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
+    link_queue, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
     done, cap = Drive(tcp=tcp.delivered), started(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
-    queue: list[tuple[float, int, str, Any]] = [
+    events: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
-    queue += [(report_s, next(order), "report", None), (begin, next(order), "tcp", "begins")]
-    heapq.heapify(queue)
+    events += [(report_s, next(order), "report", None), (begin, next(order), "tcp", "begins")]
+    heapq.heapify(events)
 
-    def at(t: float, kind: str, what: Any) -> None:
-        heapq.heappush(queue, (t, next(order), kind, what))
+    def schedule(t: float, kind: str, what: Any) -> None:
+        heapq.heappush(events, (t, next(order), kind, what))
 
     last_unit = last_report = 0.0
-    on_the_way: list[tuple[ReceivedUnit, int, int]] = []  # with packets that came, and those that did not until then
+    in_flight: list[tuple[ReceivedUnit, int, int]] = []  # with packets received, and those missing until then
     missing = [0] * cameras
     in_force = limit(0.0) if cap.kbps is None else float(cap.kbps)
-    while queue and queue[0][0] < seconds:
-        t, _, kind, what = heapq.heappop(queue)
+    while events and events[0][0] < seconds:
+        t, _, kind, what = heapq.heappop(events)
         if kind == "frame":
-            at(t + 1 / fps, "frame", what)
-            at(t + late(what, t), "sent", (what, t))
+            schedule(t + 1 / fps, "frame", what)
+            schedule(t + late(what, t), "sent", (what, t))
         elif kind == "sent":
             camera, captured = what
-            varied = chance.uniform(1 - noise, 1 + noise) * (key_frame if captured < 1 / fps else 1)
+            varied = rng.uniform(1 - noise, 1 + noise) * (key_frame if captured < 1 / fps else 1)
             size = int(in_force * 1000 / 8 / fps / cameras * varied)
-            came, gone = _passed(waiting, t, size, lambda: chance.random() < link.loss)
-            missing[camera] += gone
-            done.lost += [t] * bool(gone)
-            if came:
-                last_unit = max(last_unit, came[-1] + link.one_way_s + link.delay_s(t))
-                size = min(size, len(came) * PACKET)
-                done.passed(t, came[-1] - t, last_unit, size)
-                on_the_way.append(
+            left, lost_packets = _send_frame(link_queue, t, size, lambda: rng.random() < link.loss)
+            missing[camera] += lost_packets
+            done.lost += [t] * bool(lost_packets)
+            if left:
+                last_unit = max(last_unit, left[-1] + link.one_way_s + link.delay_s(t))
+                size = min(size, len(left) * PACKET)
+                done.record_frame(t, left[-1] - t, last_unit, size)
+                in_flight.append(
                     (
-                        ReceivedUnit(f"camera {camera}", captured, last_unit, size, not gone),
-                        len(came),
+                        ReceivedUnit(f"camera {camera}", captured, last_unit, size, not lost_packets),
+                        len(left),
                         missing[camera],
                     )
                 )
                 missing[camera] = 0
         elif kind == "tcp":
-            tcp.react(t, what)
-            for when, outcome in tcp.send(t, waiting):
-                at(when, "tcp", outcome)
+            tcp.on_feedback(t, what)
+            for when, outcome in tcp.send(t, link_queue):
+                schedule(when, "tcp", outcome)
         elif kind == "report":
-            at(t + report_s, "report", None)
-            arrived = [entry for entry in on_the_way if entry[0].arrived <= t]
-            on_the_way = on_the_way[len(arrived) :]
+            schedule(t + report_s, "report", None)
+            arrived = [entry for entry in in_flight if entry[0].arrived <= t]
+            in_flight = in_flight[len(arrived) :]
             last_report = max(last_report, t + link.one_way_s + link.delay_s(t))
             units, packets, lost = zip(*arrived, strict=True) if arrived else ((), (), ())
-            at(last_report, "arrived", LinkReport(t, units, sum(packets), sum(lost)))
+            schedule(last_report, "arrived", LinkReport(t, units, sum(packets), sum(lost)))
         else:
             uplink, estimated = estimate(uplink, what)
             if estimated:
@@ -196,11 +199,11 @@ def drive(
     return done
 
 
-def _passed(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:
-    """When packets of a frame have left that are neither dropped nor lost, and how many are."""
-    left = [queue.put(t, min(PACKET, size - begin)) for begin in range(0, size, PACKET)]
-    came = [at for at in left if at is not None and not is_lost()]
-    return came, len(left) - len(came)
+def _send_frame(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:
+    """When the packets of a frame that get through have left, and how many are dropped or lost."""
+    times = [queue.put(t, min(PACKET, size - begin)) for begin in range(0, size, PACKET)]
+    left = [at for at in times if at is not None and not is_lost()]
+    return left, len(times) - len(left)
 
 
 def _measured(t: float, estimated: LinkEstimate, rtt_s: float) -> LinkMeasured:
@@ -215,7 +218,7 @@ def _measured(t: float, estimated: LinkEstimate, rtt_s: float) -> LinkMeasured:
 
 
 def _sent(link: Link, t: float, size: int) -> float:
-    """When the last bit has left."""
+    """When the last bit of a packet has left."""
     bits = size * 8 / 1000
     while True:
         end = (int(t / SLOT_S + 1e-9) + 1) * SLOT_S
@@ -227,7 +230,7 @@ def _sent(link: Link, t: float, size: int) -> float:
 
 
 def steps(*values: tuple[float, float]) -> Profile:
-    """A profile that has each value from its time on."""
+    """A profile that takes each value from its time on."""
 
     def value(t: float) -> float:
         return [v for begin, v in values if begin <= t or begin == values[0][0]][-1]
@@ -236,7 +239,7 @@ def steps(*values: tuple[float, float]) -> Profile:
 
 
 def stalls(*spans: tuple[float, float]) -> Profile:
-    """Delay of a link that stands still for spans of time and then delivers all at once."""
+    """Delay of a link that stalls for spans of time and then delivers everything in a burst."""
 
     def delay(t: float) -> float:
         return next((end - t for begin, end in spans if begin <= t < end), 0.0)
@@ -245,32 +248,32 @@ def stalls(*spans: tuple[float, float]) -> Profile:
 
 
 def jitter(every_s: float, long_s: float, ms: float, seed: int = 3, until: float = 60.0) -> Profile:
-    """Delays that come and go, with these means: time between two, length, and size."""
-    chance, spans, t = random.Random(seed), [], 1.0
+    """Random delays with these means: time between two, length, and size."""
+    rng, spans, t = random.Random(seed), [], 1.0
     while t < until:
-        t += chance.expovariate(1 / every_s)
-        end = t + long_s * chance.uniform(0.5, 1.5)
-        spans.append((t, end, ms / 1000 * chance.uniform(0.5, 1.5)))
+        t += rng.expovariate(1 / every_s)
+        end = t + long_s * rng.uniform(0.5, 1.5)
+        spans.append((t, end, ms / 1000 * rng.uniform(0.5, 1.5)))
         t = end
     return lambda t: next((delay for begin, end, delay in spans if begin <= t < end), 0.0)
 
 
 def busy(share: float, mean_s: float, ms: float, seed: int = 1) -> Callable[[int, float], float]:
-    """Lateness of frames by a machine that is busy for a share of the time, in spans with this mean.
+    """Delay of frames on a machine that is busy for a share of the time, in spans with this mean length.
 
-    Then each frame of each camera is late by up to so many ms, on its own; frames of a camera keep their order.
+    In these spans each frame is independently late by up to `ms`; frames of a camera keep their order.
     """
-    chance, begun = random.Random(seed), 1.0
+    rng, at = random.Random(seed), 1.0
     spans: list[tuple[float, float]] = []
-    while begun < 60:
-        begun += chance.expovariate(share / (mean_s * (1 - share))) if share < 1 else 0
-        spans.append((begun, begun + chance.expovariate(1 / mean_s)))
-        begun = spans[-1][1]
+    while at < 60:
+        at += rng.expovariate(share / (mean_s * (1 - share))) if share < 1 else 0
+        spans.append((at, at + rng.expovariate(1 / mean_s)))
+        at = spans[-1][1]
     sent: dict[int, float] = {}
 
     def late(camera: int, t: float) -> float:
         is_busy = any(begin <= t < end for begin, end in spans)
-        after = chance.uniform(0, ms / 1000) if is_busy else 0.0
+        after = rng.uniform(0, ms / 1000) if is_busy else 0.0
         sent[camera] = max(t + after, sent.get(camera, 0.0) + 1e-4)
         return sent[camera] - t
 
@@ -278,7 +281,7 @@ def busy(share: float, mean_s: float, ms: float, seed: int = 1) -> Callable[[int
 
 
 def utilisation(done: Drive, link: Link, limit: Profile, begin: float, end: float) -> float:
-    """Received over what the link and the limit allowed."""
+    """Received rate over the rate that the link and the limit allowed."""
     allowed = [min(link.kbps(t), limit(t)) for t in _times(begin, end)]
     return done.kbps(begin, end) / (sum(allowed) / len(allowed))
 

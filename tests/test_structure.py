@@ -42,7 +42,7 @@ def test_no_import_breaks_a_contract(copy: Path) -> None:
         ("gst/lanes", "from runner.rate_quality.study import Study", "Packages lie in layers"),
         ("page/server", "from runner.gst.server import CameraServer", "only door"),
         ("verbs/doctor", "import gi", "gi is behind that door"),
-        ("vehicle/loop", "from runner.drive.series import Series", "loads no evidence tool"),
+        ("vehicle/loop", "from runner.drive.series import Series", "loads no evaluation tool"),
         ("core/model", "from runner.core.rules import RuleCall", "imports itself"),
     ],
 )

@@ -1,15 +1,15 @@
-"""Long repetitions of what a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
+"""Long repetitions of faults that a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
 new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, and
-thousands of changes that must leave nothing behind.
+thousands of changes that must leak nothing.
 
     make soak                           everything, about an hour on two cores
     SOAK=0.1 make soak                  a tenth of it
-    SOAK_SEED=7 make soak               the same random choices again; the seed is printed
+    SOAK_SEED=7 make soak               repeats the random choices; each run prints its seed
     make soak PARTS="stalls hostile"    some parts only
     KEYS=1 make soak                    encrypted: TLS, passwords and SRTP for video, TLS 1.3 for control
 
-Parts run one after the other in two lanes. One lane has the parts with limits in time, the other those that only repeat
-or wait. Every part prints its steps and figures; the exit status is 1 if anything failed.
+Parts run one after the other in two lanes: one for the parts with time limits, the other for those that only repeat or
+wait. Every part prints its steps and figures; the exit status is 1 if anything failed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from rig import CHECKOUT
 
 
 def _tests(_seed: int, _scale: float) -> list[str]:
-    """Those of pytest that `make test` leaves out."""
+    """Tests that `make test` excludes."""
     status = subprocess.run([sys.executable, "-m", "pytest", "-m", "soak"], check=False, cwd=CHECKOUT).returncode
     return [f"pytest ended with {status}"] if status else []
 
@@ -66,9 +66,9 @@ PARTS: dict[str, Part] = {
 }
 
 
-ASIDE = ("clocks", "churn")  # the second lane
+SECOND_LANE = ("clocks", "churn")
 BACKGROUND = str(CHECKOUT / "scripts" / "background")
-BEFORE = {"churn": [BACKGROUND]}  # it uses all the time that it is given
+BEFORE = {"churn": [BACKGROUND]}  # it uses all the processor time that it gets
 
 
 def main(chosen: Sequence[str]) -> int:
@@ -80,8 +80,9 @@ def main(chosen: Sequence[str]) -> int:
     if len(chosen) == 1:
         return _run(chosen[0], seed, scale)
     print(f"seed {seed}, scale {scale:g}", flush=True)
-    os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1"}  # of the parts, whose lines are to come at once
-    lanes = [[name for name in chosen or PARTS if (name in ASIDE) == aside] for aside in (False, True)]
+    # For the parts, whose lines must appear immediately.
+    os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1"}
+    lanes = [[name for name in chosen or PARTS if (name in SECOND_LANE) == second] for second in (False, True)]
     with ThreadPoolExecutor(len(lanes)) as pool:
         failed = [name for names in pool.map(_run_each, lanes) for name in names]
     print(f"failed: {', '.join(failed)}" if failed else "no problems")
@@ -90,11 +91,11 @@ def main(chosen: Sequence[str]) -> int:
 
 def _run_each(names: Sequence[str]) -> list[str]:
     """Run parts, each in a process of its own. Returns those that failed."""
-    return [name for name in names if _run_apart(name)]
+    return [name for name in names if _run_in_process(name)]
 
 
-def _run_apart(name: str) -> int:
-    """The exit status of a part, whose lines are printed with its name as they come."""
+def _run_in_process(name: str) -> int:
+    """Run a part and print its lines with its name as they arrive. Returns its exit status."""
     command = [*BEFORE.get(name, ()), sys.executable, str(Path(__file__).parent), name]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
         assert child.stdout
@@ -108,7 +109,7 @@ def _run(name: str, seed: int, scale: float) -> int:
     began = time.monotonic()
     try:
         problems = PARTS[name](seed, scale)
-    except Exception:  # with what led to it: nobody watches
+    except Exception:  # report the traceback: nobody watches
         problems = [traceback.format_exc()]
     print(f"{len(problems)} problems, {time.monotonic() - began:.0f} s", flush=True)
     print("\n".join(problems), end="\n" if problems else "", flush=True)

@@ -1,6 +1,6 @@
-"""Sizes that change, viewers that come and go, pipelines that fail and are built anew, thousands of times.
+"""Thousands of size changes, viewers that come and go, and pipelines that fail and are rebuilt.
 
-Memory, descriptors and threads of each process are sampled meanwhile. The slope of each over the number of operations,
+Meanwhile memory, descriptors and threads of each process are sampled. The slope of each over the number of operations,
 after a warm-up, is printed with its confidence interval: it must be flat.
 
     resizes     new sizes of all cameras while they play
@@ -27,36 +27,36 @@ from system import CAMERAS, System, running
 from rig import Operator, free_port, until
 
 RESIZES, RECONNECTS, REBUILDS = 10_000, 1000, 1000
-# Operations before these: caches, arenas and pools fill up, and viewers that left without a word are dropped.
+# Warm-up operations: caches, arenas and pools fill up, and viewers that left without TEARDOWN are dropped.
 WARM = {"resizes": 2000, "reconnects": 150, "rebuilds": 100}
 EVERY_S = 0.5
-BLOCKS = 20  # of samples: those that follow each other are not independent
-CONFIDENT = 2.1  # standard errors: 95 % for the line through so many means
+BLOCKS = 20  # of samples, since successive samples are not independent
+CONFIDENT = 2.1  # standard errors: 95 % for a line through this many means
 PER = 1000  # operations
 WAIT_S = 60.0
-FAILS = 12  # frames after which a source or a sender of this part fails
+FAIL_AFTER = 12  # frames after which a source or a sender of this part fails
 RESIZE_S = 0.08  # between two sizes: longer than a frame, so that each is sent
-RECONNECT_S = 0.15  # between two viewers: those that leave without a word are dropped after some seconds
+RECONNECT_S = 0.15  # between two viewers: those that leave without TEARDOWN are dropped after some seconds
 BREAK_S = 0.4  # mean time between two connections that break
-# front's source fails, and rear's pipeline behind its encoder, as soon as each works again.
+# front's source, and rear's pipeline after its encoder, fail again as soon as they work.
 SOURCE = f"""\
 frozen_s: 0.5
 elements:
   - {{name: source, element: videotestsrc, properties: {{is-live: true, pattern: smpte}}}}
-  - {{name: fails, element: identity, properties: {{error-after: {FAILS}}}}}
+  - {{name: fails, element: identity, properties: {{error-after: {FAIL_AFTER}}}}}
   - {{name: raw, element: capsfilter, properties: {{caps: "{{raw_caps}}"}}}}
 """
 GRAPH = f"""\
 defaults: [h264_rtsp, _self_]
 sender:
-  - {{name: sent, element: identity, properties: {{error-after: {FAILS}}}}}
+  - {{name: sent, element: identity, properties: {{error-after: {FAIL_AFTER}}}}}
   - {{name: pay0, element: rtph264pay, properties: {{pt: 96, mtu: "{{mtu_bytes}}", config-interval: -1}}}}
 """
 FAILING = ("+source@cameras.front.source=failing", "+graph@cameras.rear.graph=failing")
 
 
-class Kind(NamedTuple):
-    """What a process holds: how it is named, and how much more per thousand operations counts as flat."""
+class Resource(NamedTuple):
+    """A resource of a process, and the growth per thousand operations that still counts as flat."""
 
     name: str
     flat: float
@@ -64,7 +64,7 @@ class Kind(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Growth per thousand operations, and by how much that may be wrong."""
+    """Growth per thousand operations, and its error."""
 
     value: float
     error: float
@@ -74,59 +74,59 @@ class Slope(NamedTuple):
 
 
 def _memory_mb(pid: int) -> float:
-    """Resident memory without what is mapped from files."""
+    """Resident memory without mapped files."""
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return float(status["RssAnon"].split()[0]) / 1024
 
 
-KINDS = (
-    Kind("MB", 2.0, _memory_mb),
-    Kind("descriptors", 1.0, lambda pid: len(list(Path(f"/proc/{pid}/fd").iterdir()))),
-    Kind("threads", 1.0, lambda pid: len(list(Path(f"/proc/{pid}/task").iterdir()))),
+RESOURCES = (
+    Resource("MB", 2.0, _memory_mb),
+    Resource("descriptors", 1.0, lambda pid: len(list(Path(f"/proc/{pid}/fd").iterdir()))),
+    Resource("threads", 1.0, lambda pid: len(list(Path(f"/proc/{pid}/task").iterdir()))),
 )
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    dice, problems = random.Random(seed), []
+    rng, problems = random.Random(seed), []
     with running("mode=single", "page.serve=false") as (system, operator):
-        problems += _measured(system, "resizes", round(RESIZES * scale), _resized(operator, dice))
+        problems += _measured(system, "resizes", round(RESIZES * scale), _resize(operator, rng))
         problems += system.tracebacks()
     with running("mode=single", "page.serve=false") as (system, _):
-        problems += _measured(system, "reconnects", round(RECONNECTS * scale), _reconnected(system, dice, problems))
+        problems += _measured(system, "reconnects", round(RECONNECTS * scale), _reconnect(system, rng, problems))
         problems += system.tracebacks()
-    with TemporaryDirectory(prefix="tod-soak-conf-") as conf, Door() as door:
+    with TemporaryDirectory(prefix="tod-soak-conf-") as conf, Proxy() as proxy:
         for kind, text in (("source", SOURCE), ("graph", GRAPH)):
             (Path(conf) / kind).mkdir()
             (Path(conf) / kind / "failing.yaml").write_text(text)
-        words = (f"conf={conf}", *FAILING, "page.serve=false", f"media.port={door.inner}")
-        with running(*words, own={"operator": [f"media.port={door.port}"]}, complete=False) as (system, _):
-            problems += _measured(system, "rebuilds", round(REBUILDS * scale), _rebuilt(system, door, dice))
+        words = (f"conf={conf}", *FAILING, "page.serve=false", f"media.port={proxy.inner}")
+        with running(*words, own={"operator": [f"media.port={proxy.port}"]}, complete=False) as (system, _):
+            problems += _measured(system, "rebuilds", round(REBUILDS * scale), _rebuild(system, proxy, rng))
             problems += system.tracebacks()
     return problems
 
 
 def _measured(system: System, what: str, most: int, operations: Iterator[int]) -> list[str]:
-    """Problems while so many operations are done, after the warm-up.
+    """Problems during a number of operations, after the warm-up.
 
-    operations  yields how many are done so far
+    operations  yields the number done so far
     """
     warm = WARM[what]
-    held: dict[tuple[str, Kind], list[tuple[int, float]]] = {}
+    samples_by_kind: dict[tuple[str, Resource], list[tuple[int, float]]] = {}
     began, due = time.monotonic(), 0.0
     for done in operations:
         if time.monotonic() >= due:
             due = time.monotonic() + EVERY_S
             for name, child in system.processes.items():
                 assert child.poll() is None, f"{name} ended"
-                for kind in KINDS:
-                    held.setdefault((name, kind), []).append((done, kind.read(child.pid)))
+                for kind in RESOURCES:
+                    samples_by_kind.setdefault((name, kind), []).append((done, kind.read(child.pid)))
         if done >= warm + most:
             break
     print(f"  {warm + most} {what} in {time.monotonic() - began:.0f} s; growth per {PER}:", flush=True)
     problems = []
     for name in system.processes:
-        slopes = {kind: slope([s for s in held[name, kind] if s[0] >= warm]) for kind in KINDS}
-        last = {kind: held[name, kind][-1][1] for kind in KINDS}
+        slopes = {kind: slope([s for s in samples_by_kind[name, kind] if s[0] >= warm]) for kind in RESOURCES}
+        last = {kind: samples_by_kind[name, kind][-1][1] for kind in RESOURCES}
         words = (f"{last[kind]:8.1f} {kind.name} {s.value:+.2f} ± {s.error:.2f}" for kind, s in slopes.items())
         print(f"    {name:9}{''.join(words)}", flush=True)
         for kind, found in slopes.items():
@@ -137,9 +137,9 @@ def _measured(system: System, what: str, most: int, operations: Iterator[int]) -
 
 
 def slope(samples: Sequence[tuple[int, float]]) -> Slope:
-    """The line through the least of each of successive blocks of samples (operations, value), with its 95 % interval.
+    """The line through the minima of successive blocks of samples (operations, value), with its 95 % interval.
 
-    What comes and goes, such as viewers that left without a word, lies above it.
+    Temporary growth, such as viewers that left without TEARDOWN, is above it.
     """
     assert len(samples) >= 4, f"{len(samples)} samples are too few: more operations"
     blocks = np.array_split(np.array(samples, float), min(BLOCKS, len(samples)))
@@ -151,57 +151,57 @@ def slope(samples: Sequence[tuple[int, float]]) -> Slope:
 # --- operations -------------------------------------------------------------------------------------------------------
 
 
-def _resized(operator: Operator, dice: random.Random) -> Iterator[int]:
-    """All cameras at once; the next sizes follow once these are read back from the pipelines.
+def _resize(operator: Operator, rng: random.Random) -> Iterator[int]:
+    """Resize all cameras together; the next sizes follow once these are read back from the pipelines.
 
-    On a machine that stands still for a second some are refused as too old, and not counted.
+    If the machine stalls for a second, some requests are refused as too old, and not counted.
     """
     began, done = time.monotonic(), 0
     for number in count():
         time.sleep(max(0.0, began + RESIZE_S * number - time.monotonic()))
-        asked = [f"size{number}{name}" for name in CAMERAS]
-        for identity, name in zip(asked, CAMERAS, strict=True):
-            scaling = round(dice.uniform(0.2, 1), 3)
+        identities = [f"size{number}{name}" for name in CAMERAS]
+        for identity, name in zip(identities, CAMERAS, strict=True):
+            scaling = round(rng.uniform(0.2, 1), 3)
             operator.send(identity, event="camera_configured", camera=name, scaling=scaling)
-        until(lambda a=asked: operator.replies.keys() >= set(a), WAIT_S, every_s=0.002)
-        replies = [operator.replies.pop(identity) for identity in asked]
+        until(lambda a=identities: operator.replies.keys() >= set(a), WAIT_S, every_s=0.002)
+        replies = [operator.replies.pop(identity) for identity in identities]
         applied = sum(reply["result"] == "applied" for reply in replies)
         assert applied, replies
         done += applied
         yield done
 
 
-def _reconnected(system: System, dice: random.Random, problems: list[str]) -> Iterator[int]:
-    """One viewer after the other, beside those of the operator."""
+def _reconnect(system: System, rng: random.Random, problems: list[str]) -> Iterator[int]:
+    """One viewer after the other, in addition to those of the operator."""
     began = time.monotonic()
     for number in count(1):
         time.sleep(max(0.0, began + RECONNECT_S * number - time.monotonic()))
-        camera, udp = dice.choice(CAMERAS), dice.random() < 0.5
+        camera, udp = rng.choice(CAMERAS), rng.random() < 0.5
         with system.viewer(camera) as viewer:
             if (codes := viewer.open(udp=udp)) != [200, 200, 200]:
                 problems.append(f"{camera}: a viewer was answered {codes}")
             else:
                 viewer.read()
                 until(lambda v=viewer: v.packets, WAIT_S)
-            if dice.random() < 0.5:
+            if rng.random() < 0.5:
                 viewer.leave()
         yield number
 
 
-def _rebuilt(system: System, door: Door, dice: random.Random) -> Iterator[int]:
-    """Counts pipelines that the operator's side has built anew, and sources that the vehicle has."""
+def _rebuild(system: System, proxy: Proxy, rng: random.Random) -> Iterator[int]:
+    """Counts pipelines that the operator's side has rebuilt, and sources that the vehicle has replaced."""
     at = time.monotonic()
     while True:
         if time.monotonic() >= at:
-            at = time.monotonic() + dice.expovariate(1 / BREAK_S)
-            door.slam(dice)
+            at = time.monotonic() + rng.expovariate(1 / BREAK_S)
+            proxy.break_one(rng)
         received = sum(camera["rebuilt"] for camera in system.samples().values())
         yield received + system.output("vehicle").read_text().count("front: source: ")
         time.sleep(0.1)
 
 
-class Door:
-    """Passes TCP connections on to the RTSP server, until one of them is broken.
+class Proxy:
+    """A TCP proxy to the RTSP server, which can break its connections.
 
     port, inner  where the operator's side connects, and where the server listens
     """
@@ -212,24 +212,24 @@ class Door:
         self._open: dict[socket.socket, socket.socket] = {}
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def __enter__(self) -> Door:
+    def __enter__(self) -> Proxy:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._listening.close()
 
-    def slam(self, dice: random.Random) -> None:
+    def break_one(self, rng: random.Random) -> None:
         """Break one of the connections, if there is any."""
         if self._open:
-            _break(*dice.choice(list(self._open.items())))
+            _break(*rng.choice(list(self._open.items())))
 
     def _accept(self) -> None:
-        with suppress(OSError):  # the end
+        with suppress(OSError):  # the socket was closed
             while True:
                 client, _ = self._listening.accept()
                 try:
                     server = socket.create_connection(("127.0.0.1", self.inner), 1)
-                except OSError:  # it does not listen yet
+                except OSError:  # the server does not listen yet
                     client.close()
                     continue
                 server.settimeout(None)

@@ -1,4 +1,4 @@
-"""kill -9 of each process: after a restart everything is back within 5 s, and a demo leaves no process behind."""
+"""kill -9 of each process: after a restart everything recovers within 5 s, and a demo leaves no process behind."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from signals import MARK, ROBOT, marked
+from signals import MARK, ROBOT, marked_processes
 from system import CAMERAS, System, flowing, running
 
 import keyed
 from rig import CHECKOUT, free_port, until
 
 BACK_S = 5.0
-END_S = 6.0  # for a demo that has lost a part to end the others, by force after a while
-START_S = 3.0  # for a process to start, before its connections count
+END_S = 6.0  # in which a demo that has lost a part must end the others, eventually by force
+START_S = 3.0  # for a process to start, in addition to BACK_S
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    dice = random.Random(seed)
-    return [*_restarted(dice, max(3, round(12 * scale))), *_demos(dice, max(4, round(16 * scale)))]
+    rng = random.Random(seed)
+    return [*_restarted(rng, max(3, round(12 * scale))), *_demos(rng, max(4, round(16 * scale)))]
 
 
-def _restarted(dice: random.Random, count: int) -> list[str]:
+def _restarted(rng: random.Random, count: int) -> list[str]:
     problems = []
     with running("page.serve=false") as (system, operator):
         for number in range(count):
-            name, away_s = ("vehicle", "operator", "broker")[number % 3], dice.uniform(0.2, 4)
+            name, away_s = ("vehicle", "operator", "broker")[number % 3], rng.uniform(0.2, 4)
             system.processes[name].kill()
             system.processes[name].wait()
             time.sleep(away_s)
@@ -43,7 +43,7 @@ def _restarted(dice: random.Random, count: int) -> list[str]:
             began = time.monotonic()
             limit = BACK_S + (START_S if name != "broker" else 0)
 
-            def back(
+            def is_back(
                 before: dict[str, int] = frames, telemetry: int = telemetry, new: bool = name == "operator"
             ) -> bool:
                 now = _received(system)
@@ -51,7 +51,7 @@ def _restarted(dice: random.Random, count: int) -> list[str]:
                 return rising and len(operator.telemetry) > telemetry and flowing(operator)
 
             try:
-                until(back, seconds=30, every_s=0.05)
+                until(is_back, seconds=30, every_s=0.05)
             except AssertionError:
                 problems.append(f"{name} killed: not back within 30 s")
                 continue
@@ -70,11 +70,11 @@ def _received(system: System) -> dict[str, int]:
         return {}
 
 
-def _demos(dice: random.Random, count: int) -> list[str]:
+def _demos(rng: random.Random, count: int) -> list[str]:
     problems = []
     for number in range(count):
-        relay = dice.random() < 0.5
-        # A relay cannot pass what keys encrypt.
+        relay = rng.random() < 0.5
+        # A relay cannot forward encrypted streams.
         link, process = ("netns", "tunnel") if keyed.keys() else ("relay", "relay")
         victim = ("demo", "vehicle", "operator", "mosquitto", process if relay else "vehicle")[number % 5]
         mark = uuid.uuid4().hex
@@ -90,7 +90,7 @@ def _demos(dice: random.Random, count: int) -> list[str]:
                 cwd=CHECKOUT,
                 env={**os.environ, "PYTHONPATH": str(CHECKOUT), MARK: mark},
             )
-            at_s = dice.uniform(2, 5)
+            at_s = rng.uniform(2, 5)
             time.sleep(at_s)
             pid = demo.pid if victim == "demo" else until(partial(_part, mark, demo.pid, victim), 10 * START_S)
             with suppress(ProcessLookupError):
@@ -99,7 +99,7 @@ def _demos(dice: random.Random, count: int) -> list[str]:
             while (left := _left(mark, demo)) and time.monotonic() - began < END_S:
                 time.sleep(0.05)
             ended_s = time.monotonic() - began
-            with suppress(subprocess.TimeoutExpired):  # its parts may end a moment before it
+            with suppress(subprocess.TimeoutExpired):  # its parts may end shortly before it
                 demo.wait(1)
             status = demo.poll()
             name = f"demo over {link}" if relay else "demo"
@@ -122,9 +122,11 @@ def _demos(dice: random.Random, count: int) -> list[str]:
 def _part(mark: str, demo: int, wanted: str) -> int | None:
     """Process id of a part of a demo."""
     signs = (f"-m runner {wanted} ", f"/{wanted} ", f"runner.link.{wanted} ")
-    return next((p for p, words in marked(mark).items() if p != demo and any(s in f"{words} " for s in signs)), None)
+    return next(
+        (p for p, words in marked_processes(mark).items() if p != demo and any(s in f"{words} " for s in signs)), None
+    )
 
 
 def _left(mark: str, demo: subprocess.Popen[bytes]) -> dict[int, str]:
     demo.poll()  # otherwise it would remain a zombie
-    return marked(mark)
+    return marked_processes(mark)

@@ -15,13 +15,13 @@ EVERY = 8  # openings between two checks of the watched camera
 
 def soak(seed: int, scale: float) -> list[str]:
     """rear is in one of the states, mast is an IP camera that delivers nothing; front is watched."""
-    dice, problems = random.Random(seed), []
+    rng, problems = random.Random(seed), []
     dead = f'cameras.mast.source.address="rtsp://127.0.0.1:{free_port()}/none"'
     with running("+source@cameras.mast.source=rtsp", dead) as (system, operator):
         watched = Watched(system, operator)
         for number in range(max(EVERY, round(64 * scale))):
-            state, transport = dice.choice(STATES), dice.choice(("tcp", "udp"))
-            camera, seconds = dice.choice(("rear", "rear", "rear", "mast")), dice.uniform(0.3, 3)
+            state, transport = rng.choice(STATES), rng.choice(("tcp", "udp"))
+            camera, seconds = rng.choice(("rear", "rear", "rear", "mast")), rng.uniform(0.3, 3)
             operator.ask(f"on{number}", event="camera_switched", camera="rear", on=state != "switched off")
             operator.ask(f"weight{number}", event="weights_set", weights={"rear": 0 if state == "paused" else 1})
             with player(system, camera, transport):
@@ -33,7 +33,7 @@ def soak(seed: int, scale: float) -> list[str]:
         operator.ask("last weight", event="weights_set", weights={"rear": 1})
         opened = Watched(system, operator, "rear")
         time.sleep(1)
-        problems += opened.problems()  # its picture is back, too
+        problems += opened.problems()  # its picture has returned, too
         assert newest(operator)["online"]
         problems += system.tracebacks()
     return problems

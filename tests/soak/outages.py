@@ -1,8 +1,8 @@
-"""Whatever interrupts a drive with keys, or must not: a table of how long each path is away, and what was missed.
+"""Faults during a drive with keys: a table of how long each path is interrupted, and of frames missed.
 
-The link is cut, clocks are set, certificates expire, keys are replaced and the broker starts anew, while predictions
-change each second. Video and control are back soon after the end of the cause; what is applied then is what the newest
-prediction says; latencies are right to within their bound, or unknown; no process is left.
+The link is cut, clocks are set, certificates expire, keys are replaced and the broker restarts, while predictions
+change every second. Video and control recover soon after the end of the fault; the applied bitrates follow the newest
+prediction; latencies are right to within their bound, or unknown; no process is left.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-from signals import MARK, marked
+from signals import MARK, marked_processes
 from system import CAMERAS, System, ended, newest, running
 
 import keyed
@@ -30,23 +30,23 @@ from runner.link import limited_link
 from runner.link.limit import Limit, Reverse
 from runner.security.authority import VALID, Authority
 
-BACK_S, LONG_BACK_S, LONG_S = 3.0, 5.0, 20.0  # after the end of the cause, and after one that lasted so long
-MISSED = 3  # frames of a camera that the cause does not concern
+BACK_S, LONG_BACK_S, LONG_S = 3.0, 5.0, 20.0  # limits after the end of a fault, and of one at least LONG_S long
+MISSED = 3  # most frames missed by a camera that a fault should not affect
 STALE_S = 1.5  # control.expires_s and the round trip
 FPS = 15
 QUIET_S = 4.0  # before and after a fault, to count frames
 WAIT_S = 20.0
 SETTINGS = 10
 STEP_S = 5.0  # by which clocks are set, forwards and backwards
-QUICKEST_MS, SLOWEST_MS = 1.0, 1000.0  # that a picture can take here, on a busy machine
-PREDICTED = tuple(range(3000, 1500, -100))  # kbit/s, each for a second, again and again
-EXPIRE_S = 8.0  # term of the certificates that expire
+QUICKEST_MS, SLOWEST_MS = 1.0, 1000.0  # possible latencies here, on a busy machine
+PREDICTED = tuple(range(3000, 1500, -100))  # kbit/s, each for a second, repeated
+EXPIRE_S = 8.0  # lifetime of the certificates that expire
 
 
 class Fault(NamedTuple):
-    """What happens while driving; `cause` returns at its end.
+    """A fault while driving; `cause` returns when it ends.
 
-    cuts  whether video cannot pass meanwhile
+    cuts  whether it interrupts video
     """
 
     name: str
@@ -56,7 +56,7 @@ class Fault(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What a fault did: s until each path was back, None if it was not; frames missed, by camera."""
+    """Effects of a fault: s until each path recovered, None if it did not; frames missed, by camera."""
 
     fault: Fault
     back: dict[str, float | None]
@@ -70,18 +70,18 @@ class Row(NamedTuple):
 
 
 class Paths(threading.Thread):
-    """Watches the cameras' frames and asks for control, several times a second.
+    """Counts the cameras' frames and sends requests, several times a second.
 
-    frames    by camera: (when seen, number so far)
-    answered  of requests that were applied, when they were sent
+    frames    by camera: (time, number so far)
+    answered  of requests that were applied: (sent, answered)
     """
 
     def __init__(self, system: System, operator: Operator) -> None:
         super().__init__(daemon=True)
         self._system, self._operator = system, operator
         self.frames: dict[str, list[tuple[float, int]]] = {name: [] for name in CAMERAS}
-        self._asked: dict[str, float] = {}
-        self.answered: list[tuple[float, float]] = []  # sent, answered
+        self._sent: dict[str, float] = {}
+        self.answered: list[tuple[float, float]] = []
         self._stopped = threading.Event()
 
     def run(self) -> None:
@@ -92,10 +92,10 @@ class Paths(threading.Thread):
                 if not seen or camera["frames"] != seen[-1][1]:
                     seen.append((now, camera["frames"]))
             identity = f"paths{now}"
-            self._asked[identity] = now
+            self._sent[identity] = now
             self._operator.send(identity, event="weights_set", weights={"rear": 1})
-            for name in self._asked.keys() & self._operator.replies.keys():
-                sent = self._asked.pop(name)
+            for name in self._sent.keys() & self._operator.replies.keys():
+                sent = self._sent.pop(name)
                 if self._operator.replies.pop(name)["result"] == "applied":
                     self.answered.append((sent, now))
 
@@ -104,17 +104,17 @@ class Paths(threading.Thread):
         self.join(5)
 
     def back(self, since: float) -> dict[str, float | None]:
-        """s from a time until each path worked: frames came, and a request sent since then was applied."""
+        """s from a time until each path worked: frames arrived, and a request sent since then was applied."""
         control = next((answered - since for sent, answered in self.answered if sent >= since), None)
         return {"control": control, **{name: self._video(name, since) for name in CAMERAS}}
 
     def _video(self, name: str, since: float) -> float | None:
-        # The first sample after the end may count what came before it.
+        # The first sample after the end may count earlier frames.
         after = [at for at, _ in self.frames[name] if at > since]
         return after[1] - since if len(after) > 1 else None
 
     def missed(self, name: str, begin: float, end: float) -> float:
-        """Frames missing between two times, by what came in the time before and the time after them."""
+        """Frames missing between two times, extrapolated from those before and after."""
         frames = list(self.frames[name])
         before = [number - FPS * at for at, number in frames if begin - QUIET_S < at < begin]
         after = [number - FPS * at for at, number in frames if end < at < end + QUIET_S]
@@ -131,7 +131,7 @@ def soak(seed: int, scale: float) -> list[str]:
         print(f"{'fault':40}" + "".join(f"{name:>10}" for name in ("control", *CAMERAS, *CAMERAS)))
         for _ in range(rounds):
             for fault in drive.faults():
-                row = drive.suffers(fault)
+                row = drive.inject(fault)
                 print(row, flush=True)
                 problems += row.problems
         problems += drive.system.tracebacks()
@@ -140,12 +140,12 @@ def soak(seed: int, scale: float) -> list[str]:
 
 
 def _ends(system: System, mark: str) -> list[str]:
-    """Both sides end at once when they are told to, and leave no process."""
+    """Both sides end promptly on SIGTERM, and leave no process."""
     for name in ("operator", "vehicle", "broker"):
         system.processes[name].terminate()
         if not ended(system.processes[name], 5):
             return [f"{name} did not end"]
-    left = marked(mark)
+    left = marked_processes(mark)
     return [f"left: {'; '.join(left.values())}"] if left else []
 
 
@@ -154,15 +154,15 @@ class _Drive:
 
     def __init__(
         self,
-        dice: random.Random,
+        rng: random.Random,
         system: System,
         operator: Operator,
         paths: Paths,
         passing: list[bool],
         clocks: dict[str, Path],
     ) -> None:
-        self._dice, self.system, self._operator, self._paths = dice, system, operator, paths
-        self._passing, self._clocks, self._asked_at = passing, clocks, 0.0
+        self._rng, self.system, self._operator, self._paths = rng, system, operator, paths
+        self._passing, self._clocks, self._requested_at = passing, clocks, 0.0
 
     def faults(self) -> Iterator[Fault]:
         for cut_s in (0.2, 2.0, LONG_S):
@@ -181,17 +181,17 @@ class _Drive:
         yield Fault("all certificates expire", lambda: time.sleep(max(0.0, ends - time.monotonic())))
         yield Fault("expired keys replaced", self._replace_keys, cuts=True)
 
-    def suffers(self, fault: Fault) -> Row:
+    def inject(self, fault: Fault) -> Row:
         time.sleep(QUIET_S)
         begin, at = time.monotonic(), self.system.operator_log.stat().st_size
         stale = f"stale{begin}"
         if fault.cuts:
-            threading.Timer(fault.lasts_s / 10, self._ask_late, (stale,)).start()
+            threading.Timer(fault.lasts_s / 10, self._request_late, (stale,)).start()
         fault.cause()
         end = time.monotonic()
         limit_s = LONG_BACK_S if fault.lasts_s >= LONG_S else BACK_S
-        until_end = end + WAIT_S
-        while None in self._paths.back(end).values() and time.monotonic() < until_end:
+        deadline = end + WAIT_S
+        while None in self._paths.back(end).values() and time.monotonic() < deadline:
             time.sleep(0.05)
         back = self._paths.back(end)
         problems = [f"{path} is not back within {WAIT_S:g} s" for path, s in back.items() if s is None]
@@ -204,21 +204,21 @@ class _Drive:
         missed = {name: self._paths.missed(name, begin, all_back) for name in CAMERAS}
         if not fault.cuts:
             problems += [f"{name} missed {n:.1f} frames, limit {MISSED}" for name, n in missed.items() if n > MISSED]
-        problems += self._late(stale)
+        problems += self._applied_late(stale)
         problems += self._wrong_latencies(at, SLOWEST_MS + 1000 * fault.lasts_s)
         return Row(fault, back, missed, [f"{fault.name}: {problem}" for problem in problems])
 
-    def _ask_late(self, identity: str) -> None:
-        """A request that waits for the end of the cause on its way."""
-        self._asked_at = self._operator.as_of()
+    def _request_late(self, identity: str) -> None:
+        """Send a request that is delayed until the end of the fault."""
+        self._requested_at = self._operator.as_of()
         self._operator.send(identity, event="weights_set", weights={"rear": 1})
 
-    def _late(self, identity: str) -> list[str]:
-        """Whether such a request was applied though it had waited for too long."""
+    def _applied_late(self, identity: str) -> list[str]:
+        """Whether such a request was applied although it was too old."""
         reply = self._operator.replies.get(identity)
-        if reply is None or reply["result"] != "applied" or reply["t"] - self._asked_at < STALE_S:
+        if reply is None or reply["result"] != "applied" or reply["t"] - self._requested_at < STALE_S:
             return []
-        return [f"a request was applied {reply['t'] - self._asked_at:.1f} s after it was made"]
+        return [f"a request was applied {reply['t'] - self._requested_at:.1f} s after it was made"]
 
     # --- causes -------------------------------------------------------------------------------------------------------
 
@@ -228,10 +228,10 @@ class _Drive:
         self._passing.append(True)
 
     def _set_often(self, side: str) -> None:
-        """At random moments: latencies must be right whatever comes between two comparisons of the clocks."""
+        """At random moments: latencies must be right whatever happens between two comparisons of the clocks."""
         for _ in range(SETTINGS):
-            time.sleep(self._dice.uniform(0.3, 1.2))
-            set_clock(self._clocks[side], self._dice.choice((-STEP_S, 0.0, STEP_S)))
+            time.sleep(self._rng.uniform(0.3, 1.2))
+            set_clock(self._clocks[side], self._rng.choice((-STEP_S, 0.0, STEP_S)))
         set_clock(self._clocks[side], 0.0)
 
     def _restart_broker(self) -> None:
@@ -240,7 +240,7 @@ class _Drive:
         self.system.start("broker")
 
     def _replace_keys(self, term: timedelta = VALID) -> None:
-        """Of everybody. They come to the machines one after the other, and the broker starts anew with its own."""
+        """Replace everybody's keys, one after the other, and restart the broker with its own."""
         assert self.system.keys
         authority = Authority(self.system.keys, lambda: datetime.now(UTC) - VALID + term)
         with authority.opened():
@@ -251,7 +251,7 @@ class _Drive:
     # --- what must be right afterwards --------------------------------------------------------------------------------
 
     def _stale(self) -> list[str]:
-        """Whether what is applied is not what the newest decision says, or that not what the newest prediction says."""
+        """Whether the applied bitrates differ from the newest decision, or that from the newest prediction."""
         try:
             until(lambda: self._is_current(newest(self._operator), self._operator.telemetry[-1]), 2.0)
         except AssertionError:
@@ -273,7 +273,7 @@ class _Drive:
         )
 
     def _wrong_latencies(self, since: int, slowest_ms: float) -> list[str]:
-        """Latencies that the operator was shown since an offset of its log, and that no picture had."""
+        """Impossible latencies in the operator's log since an offset."""
         with self.system.operator_log.open("rb") as file:
             file.seek(since)
             lines = [json.loads(line) for line in file.read().split(b"\n")[1:-1]]
@@ -285,16 +285,16 @@ class _Drive:
             if camera["latency_ms"] is not None
             and not is_possible(camera["latency_ms"], sample["clock_bound_ms"], slowest_ms)
         ]
-        return [f"{len(wrong)} latencies are wrong, as {wrong[0]}"] if wrong else []
+        return [f"{len(wrong)} latencies are wrong, such as {wrong[0]}"] if wrong else []
 
 
 def is_possible(latency_ms: float, bound_ms: float | None, slowest_ms: float) -> bool:
-    """Whether a picture can have had a latency, stated with a bound."""
+    """Whether a picture can have had a latency stated with this bound."""
     return bound_ms is not None and latency_ms + bound_ms >= QUICKEST_MS and latency_ms - bound_ms <= slowest_ms
 
 
 @contextmanager
-def _drive(directory: Path, mark: str, dice: random.Random) -> Iterator[_Drive]:
+def _drive(directory: Path, mark: str, rng: random.Random) -> Iterator[_Drive]:
     passing = [True]
 
     def kbps(t: float) -> float:
@@ -316,6 +316,6 @@ def _drive(directory: Path, mark: str, dice: random.Random) -> Iterator[_Drive]:
             paths = Paths(system, operator)
             paths.start()
             try:
-                yield _Drive(dice, system, operator, paths, passing, clocks)
+                yield _Drive(rng, system, operator, paths, passing, clocks)
             finally:
                 paths.stop()

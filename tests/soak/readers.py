@@ -1,6 +1,6 @@
 """A slow reader per camera, and one that stops: both are disconnected, and regular viewers lose no frame.
 
-Meanwhile a subscriber to all that the vehicle publishes reads nothing.
+Meanwhile a subscriber to everything that the vehicle publishes reads nothing.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ ALONE_S = 300  # with readers at half the rate
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    dice, problems = random.Random(seed), []
+    rng, problems = random.Random(seed), []
     with running("page.serve=false") as (system, operator):
-        deaf = system.mqtt_client(keyed.WATCHER)
-        deaf.subscribe(f"tod/{keyed.VEHICLE}/#")
-        deaf.loop_write()
+        silent = system.mqtt_client(keyed.WATCHER)
+        silent.subscribe(f"tod/{keyed.VEHICLE}/#")
+        silent.loop_write()
         watched = [Watched(system, operator, name) for name in CAMERAS]
         end = time.monotonic() + max(30.0, ALONE_S * scale)
         rounds = 0
@@ -39,7 +39,7 @@ def soak(seed: int, scale: float) -> list[str]:
                     kbps = operator.telemetry[-1]["cameras"][client.url.rpartition("/")[2]]["applied"]["bitrate"]
                     client.delay_s = 2 * 1200 * 8 / (1000 * kbps)  # twice the interval at which packets are sent
                     client.read()
-                time.sleep(dice.uniform(10, 20))
+                time.sleep(rng.uniform(10, 20))
                 for client in stopped:
                     if not client.ended(10):
                         problems.append(f"{client.url}: a reader that stopped was not closed")
@@ -49,7 +49,7 @@ def soak(seed: int, scale: float) -> list[str]:
                     if client.is_reading():
                         problems.append(f"{client.url}: a reader at half the rate was not closed")
         print(f"{rounds} rounds of {2 * len(CAMERAS)} readers", flush=True)
-        deaf.disconnect()
+        silent.disconnect()
         for watch in watched:
             problems += watch.problems()
         problems += system.tracebacks()

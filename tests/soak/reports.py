@@ -13,7 +13,7 @@ from runner.core.model import exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 SEQUENCES, BATCH = 200_000, 500
-RECOVERED = 100  # one sequence in so many is followed until the link is clear again
+RECOVERED = 100  # one sequence in this many is followed until the link is clear again
 RECOVERY_S = 60.0
 CAMERAS = ("front", "left", "right")
 PLACES = tuple((48 + north / 2000, 11.5) for north in range(4))  # 56 m apart
@@ -34,48 +34,48 @@ def _batch(first: int) -> list[str]:
 
 
 def sequence(seed: int) -> str:
-    """One random sequence; returns what is wrong, "" if nothing is."""
-    chance = random.Random(seed)
-    uplink, cap, t, at = UplinkMemory(), LinkCap(), 0.0, chance.uniform(-1e6, 1e6)
-    for _ in range(chance.randrange(1, 40)):
-        passed = chance.choice((REPORT_S, REPORT_S, chance.expovariate(5), 0.0))
+    """One random sequence; returns the problem, "" if there is none."""
+    rng = random.Random(seed)
+    uplink, cap, t, at = UplinkMemory(), LinkCap(), 0.0, rng.uniform(-1e6, 1e6)
+    for _ in range(rng.randrange(1, 40)):
+        passed = rng.choice((REPORT_S, REPORT_S, rng.expovariate(5), 0.0))
         t, at = t + passed, at + passed
-        if chance.random() < 0.02:  # another operator, with another clock
-            uplink, at = UplinkMemory(), chance.uniform(-1e6, 1e6)
-        uplink, cap, wrong = _step(uplink, cap, t, _report(chance, at), chance.choice(PLACES))
-        if wrong:
-            return wrong
+        if rng.random() < 0.02:  # another operator, with another clock
+            uplink, at = UplinkMemory(), rng.uniform(-1e6, 1e6)
+        uplink, cap, problem = _step(uplink, cap, t, _report(rng, at), rng.choice(PLACES))
+        if problem:
+            return problem
     until = t + (0 if seed % RECOVERED else RECOVERY_S)
     while t < until and (cap.kbps is not None or cap.trust.share < 1):
         t, at = t + REPORT_S, at + REPORT_S
         size = int(float(min(LIMIT, cap.kbps or LIMIT)) * REPORT_S * 125 / len(CAMERAS))
         units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size) for name in CAMERAS)
-        uplink, cap, wrong = _step(uplink, cap, t, LinkReport(at, units, 9, 0), PLACES[0])
-        if wrong:
-            return wrong
+        uplink, cap, problem = _step(uplink, cap, t, LinkReport(at, units, 9, 0), PLACES[0])
+        if problem:
+            return problem
     return f"not recovered within {RECOVERY_S:g} s: {cap}" if seed % RECOVERED == 0 and t >= until else ""
 
 
-def _report(chance: random.Random, at: float) -> LinkReport:
+def _report(rng: random.Random, at: float) -> LinkReport:
     units = sorted(
-        (at - chance.expovariate(20), chance.choice(CAMERAS), chance.uniform(-10, 10) ** chance.choice((1, 3)))
-        for _ in range(chance.choice((0, 1, 3, 8)))
+        (at - rng.expovariate(20), rng.choice(CAMERAS), rng.uniform(-10, 10) ** rng.choice((1, 3)))
+        for _ in range(rng.choice((0, 1, 3, 8)))
     )
     return LinkReport(
         at,
         tuple(
-            ReceivedUnit(name, came - delay, came, chance.randrange(10**5), chance.random() < 0.8)
-            for came, name, delay in units
+            ReceivedUnit(name, arrived - delay, arrived, rng.randrange(10**5), rng.random() < 0.8)
+            for arrived, name, delay in units
         ),
-        chance.randrange(100),
-        chance.choice((0, 0, 1, 100)),
+        rng.randrange(100),
+        rng.choice((0, 0, 1, 100)),
     )
 
 
 def _step(
     uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport, place: tuple[float, float]
 ) -> tuple[UplinkMemory, LinkCap, str]:
-    """The next estimate and cap, and what is wrong with them."""
+    """The next estimate and cap, and a problem with them."""
     uplink, link = estimate(uplink, report)
     if link is None:
         return uplink, cap, ""

@@ -1,4 +1,4 @@
-"""A vehicle whose address changes while it drives, and a NAT that forgets it: everything is back within 3 s each time.
+"""A vehicle whose address changes while driving, and a NAT that forgets it: everything recovers within 3 s each time.
 
 By the recipes of docs/deployment.md, over SRT and through WireGuard.
 """
@@ -14,7 +14,7 @@ from machines import Mobile, Watch, mobile
 from recipes import SRT, WIREGUARD, Site, watched
 
 BACK_S = 3.0
-SETTLE_S = 5.0  # until the next change, and what comes back later than that is lost
+SETTLE_S = 5.0  # until the next change; anything not back by then counts as lost
 
 
 def soak(_seed: int, scale: float) -> list[str]:
@@ -32,7 +32,7 @@ def roam(heading: str, what: str, translated: bool, count: int, change: Callable
         site = Site(network.vehicle, network.operator, Path(directory))
         with watched(site, heading) as watch:
             for number in range(count):
-                back = times_back(watch, lambda: change(network))
+                back = recovery_times(watch, lambda: change(network))
                 shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in sorted(back.items()))
                 print(f"{heading:9} {what} {number:2}: back after {shown} s", flush=True)
                 problems += [
@@ -45,8 +45,8 @@ def roam(heading: str, what: str, translated: bool, count: int, change: Callable
     return problems
 
 
-def times_back(watch: Watch, change: Callable[[], None]) -> dict[str, float]:
-    """Change something, and see when each camera and the control link are back for good, s."""
+def recovery_times(watch: Watch, change: Callable[[], None]) -> dict[str, float]:
+    """Make a change, and measure when each camera and the control link are back for good, s."""
     changed = time.monotonic()
     change()
     time.sleep(SETTLE_S)

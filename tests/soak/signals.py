@@ -1,4 +1,4 @@
-"""Signals to long-running verbs, at random moments, once or twice: each run ends in time, with all it started.
+"""Signals to long-running verbs, at random moments, once or twice: each run and all its processes end in time.
 
     PYTHONPATH=tests/integration .venv/bin/python tests/soak/signals.py SEED COUNT [VERB ...]
 
@@ -31,7 +31,7 @@ LIMIT_S = 3.0  # from the first signal to the end of the last process
 MARK = "TOD_SOAK_RUN"  # environment variable that marks the processes of one run
 ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=5", "page.serve=false", "pqos=constant", "pqos.kbps=2000")
 STATUSES = {0, 130, 143}
-BY_VERB = {  # further valid statuses
+STATUSES_BY_VERB = {  # further valid statuses
     "record": {1},  # a camera had no frame yet
     # By the signal's default action, when the work is done and Python exits: no partial files remain.
     **{verb: {-signal.SIGINT, -signal.SIGTERM} for verb in ("report", "export", "replay")},
@@ -67,7 +67,7 @@ class Run:
             return f"traceback: {self.output.strip()[-2000:]}"
         # Before Python has started, the default action of a signal ends the process.
         killed = self.status is not None and self.status < 0 and self.at_s < 0.5
-        right = self.status in STATUSES | BY_VERB.get(self.verb, set())
+        right = self.status in STATUSES | STATUSES_BY_VERB.get(self.verb, set())
         return "" if right or killed else f"status {self.status}: {self.output.strip()[-200:]}"
 
     def __str__(self) -> str:
@@ -104,7 +104,7 @@ def verbs() -> Iterator[dict[str, Verb]]:
         )
         assert done.returncode == 0, done.stderr
         keys = keyed.keys()
-        link = "netns" if keys else "relay"  # a relay cannot pass what keys encrypt
+        link = "netns" if keys else "relay"  # a relay cannot forward encrypted streams
         with private_broker(broker, keys and keys / "broker"):
             yield {
                 "demo": Verb(_demo, 5.0),
@@ -127,19 +127,19 @@ def soak(seed: int, count: int, chosen: Sequence[str] = (), report: Callable[[Ru
 
     returns  the runs that failed
     """
-    dice, failed = random.Random(seed), []
+    rng, failed = random.Random(seed), []
     with verbs() as known:
         names = list(chosen or known)
         for number in range(count):
-            run = _run(number, names[number % len(names)], known[names[number % len(names)]], dice)
+            run = _run(number, names[number % len(names)], known[names[number % len(names)]], rng)
             report(run)
             failed += [run] if run.problem else []
     return failed
 
 
-def _run(number: int, name: str, verb: Verb, dice: random.Random) -> Run:
-    kinds = [dice.choice((signal.SIGINT, signal.SIGTERM)) for _ in range(dice.choice((1, 2)))]
-    at_s, gap_s = dice.uniform(0.05, verb.span_s), dice.choice((0.0, 0.001, 0.02, 0.2, 0.6))
+def _run(number: int, name: str, verb: Verb, rng: random.Random) -> Run:
+    kinds = [rng.choice((signal.SIGINT, signal.SIGTERM)) for _ in range(rng.choice((1, 2)))]
+    at_s, gap_s = rng.uniform(0.05, verb.span_s), rng.choice((0.0, 0.001, 0.02, 0.2, 0.6))
     mark = uuid.uuid4().hex
     with tempfile.TemporaryDirectory() as free, tempfile.TemporaryFile("w+") as output:
         child = subprocess.Popen(
@@ -171,20 +171,20 @@ def _run(number: int, name: str, verb: Verb, dice: random.Random) -> Run:
 
 
 def _wait(child: subprocess.Popen[bytes], mark: str, until: float) -> dict[int, str]:
-    """Wait until every process of a run has ended; returns those that have not in time, by process id."""
+    """Wait until every process of a run has ended; returns those that have not ended in time, by process id."""
     while True:
         child.poll()  # otherwise it would remain a zombie
-        left = marked(mark)
+        left = marked_processes(mark)
         if not left or time.monotonic() > until:
             return left
         time.sleep(0.02)
 
 
-def marked(mark: str) -> dict[int, str]:
+def marked_processes(mark: str) -> dict[int, str]:
     """Command lines of the processes that run with a mark in their environment, by process id."""
     wanted, found = f"{MARK}={mark}".encode(), {}
     for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended meanwhile, or is another user's
+        with suppress(OSError):  # it has ended, or is another user's
             if wanted in (process / "environ").read_bytes():
                 words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
                 found[int(process.name)] = " ".join(words)[:120]

@@ -14,14 +14,14 @@ TEST = Path(__file__).parents[1] / "integration" / "test_page_sides.py"
 
 def soak(seed: int, scale: float) -> list[str]:
     """The test of the page with 180 changes; each takes about a second, ten at most."""
-    turns = max(20, round(180 * scale))
+    changes = max(20, round(180 * scale))
     command = [sys.executable, "-m", "pytest", str(TEST), "-k", "new_size"]
-    environment = {**os.environ, "TOD_NEW_SIZES": str(turns)}
+    environment = {**os.environ, "TOD_NEW_SIZES": str(changes)}
     if keys := keyed.keys():
         environment["TOD_NEW_SIZES_KEYS"] = str(keys)
     try:
-        done = subprocess.run(command, env=environment, check=False, timeout=60 + 10 * turns)
+        done = subprocess.run(command, env=environment, check=False, timeout=60 + 10 * changes)
     except subprocess.TimeoutExpired as late:
         return [f"not done after {late.timeout:g} s"]
-    print(f"{turns} new sizes of each camera")
+    print(f"{changes} new sizes of each camera")
     return ["see above"] if done.returncode else []

@@ -1,4 +1,4 @@
-"""An operator's process that stalls for 0.5 to 8 s: its video is back within 1.5 s of waking."""
+"""An operator's process that stalls for 0.5 to 8 s: its video recovers within 1.5 s after it resumes."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ BACK_S = 1.5
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    dice, problems, slowest = random.Random(seed), [], 0.0
+    rng, problems, slowest = random.Random(seed), [], 0.0
     with running("page.serve=false") as (system, operator):
         for number in range(max(4, round(25 * scale))):
-            stall_s = dice.uniform(0.5, 8)
+            stall_s = rng.uniform(0.5, 8)
             process = system.processes["operator"]
             process.send_signal(signal.SIGSTOP)
             time.sleep(stall_s)
             paused = not newest(operator)["cameras"]["front"]["sending"]
             before = frames(system)
             process.send_signal(signal.SIGCONT)
-            woken = time.monotonic()
+            resumed = time.monotonic()
             try:
-                until(lambda b=before: flowing(operator) and rising(system, b), seconds=10, every_s=0.05)
+                until(lambda b=before: flowing(operator) and all_rising(system, b), seconds=10, every_s=0.05)
             except AssertionError:
                 problems.append(f"stalled for {stall_s:.1f} s: not back within 10 s")
                 continue
-            back_s = time.monotonic() - woken
+            back_s = time.monotonic() - resumed
             slowest = max(slowest, back_s)
             print(
                 f"{number:3} stalled {stall_s:.1f} s{', paused' if paused else '':8} back in {back_s:.2f} s", flush=True
@@ -48,5 +48,5 @@ def frames(system: System) -> dict[str, int]:
     return {name: camera["frames"] for name, camera in system.samples().items()}
 
 
-def rising(system: System, before: dict[str, int]) -> bool:
+def all_rising(system: System, before: dict[str, int]) -> bool:
     return all(now > before[name] for name, now in frames(system).items())

@@ -1,4 +1,4 @@
-"""A running broker, vehicle and operator's side, as three processes that a test may stop, kill and start again.
+"""A running broker, vehicle and operator's side, as three processes that a test may stop, kill and restart.
 
 With KEYS=1 RTSP is TLS with passwords, RTP is SRTP, and MQTT is TLS 1.3.
 """
@@ -40,7 +40,7 @@ class System:
     words        overrides of both sides
     predictions  overrides that name the source of predictions
     keys         directory with the keys of everybody; None: nothing is encrypted
-    link         that the vehicle drives behind; None: it is on this machine
+    link         limited link in front of the vehicle; None: it is on this machine
     environment  of each side, by name, in addition to this process's
     own          overrides of one side, by name
     url          address of a camera: `url("front")`
@@ -77,12 +77,12 @@ class System:
         return f"rtsp{'s' if self.keys else ''}://127.0.0.1:{self.media}/{camera}"
 
     def viewer(self, camera: str, *, small: bool = False) -> RtspClient:
-        """A client of a camera's stream: with keys, one that may watch and not drive."""
+        """A client of a camera's stream: with keys, a watcher."""
         keys = self.keys / keyed.WATCHER if self.keys else None
         return RtspClient(self.url(camera), small=small, keys=keys)
 
     def mqtt_client(self, holder: str) -> Client:
-        """A client that is connected to the broker, with somebody's keys if there are any."""
+        """A client that is connected to the broker, with the holder's keys if keys are in use."""
         client = Client(CallbackAPIVersion.VERSION2)
         if self.keys:
             login = Login(Keyring(self.keys / holder), print)
@@ -131,7 +131,7 @@ class System:
         return cameras
 
     def received(self) -> bool:
-        """Whether pictures have come to the operator."""
+        """Whether pictures have arrived at the operator."""
         return self.operator_log.exists() and any(camera.get("frames") for camera in self.samples().values())
 
     def tracebacks(self) -> list[str]:
@@ -157,16 +157,16 @@ def running(
 ) -> Iterator[tuple[System, Operator]]:
     """A streaming system, and a program at the other end of its control link.
 
-    keys      None: those that the environment asks for, if it does
+    keys      None: those that the environment requests, if any
     complete  wait until all cameras are sent
-    The others are as of `System`.
+    For the others see `System`.
     """
     with tempfile.TemporaryDirectory(prefix="tod-soak-") as directory:
         system = System(Path(directory), words, keys or keyed.keys(), link, environment, predictions, own)
         try:
             for name in ("broker", "vehicle", "operator"):
                 system.start(name)
-            # With the keys of the operator's side, hence in control whenever that is.
+            # With the keys of the operator's side, and therefore in control whenever that is.
             operator = Operator(system.broker, keys=system.keys and system.keys / keyed.CONTROLLER)
             until(lambda: (flowing(operator) or not complete) and system.received(), seconds=30, every_s=0.1)
             yield system, operator
@@ -184,7 +184,7 @@ def newest(operator: Operator) -> Any:
 
 
 def flowing(operator: Operator, cameras: Sequence[str] = CAMERAS) -> bool:
-    """Whether all cameras are to be sent and have viewers."""
+    """Whether all cameras are being sent and have viewers."""
     state = newest(operator)
     return state["online"] and all(
         state["cameras"][name]["sending"] and state["cameras"][name]["applied"] for name in cameras
@@ -233,13 +233,13 @@ class Watched:
 
 @contextmanager
 def player(system: System, camera: str, transport: str) -> Iterator[Callable[[], bool]]:
-    """Somebody else plays a camera: ffmpeg; with keys, which ffmpeg cannot present, `RtspClient`.
+    """Another player of a camera: ffmpeg, or `RtspClient` with keys, which ffmpeg does not support.
 
-    Yields whether it still plays.
+    Yields a function that tells whether it still plays.
     """
     if system.keys:
         with system.viewer(camera) as client:
-            with suppress(OSError, EOFError):  # refused, or there is nothing to see
+            with suppress(OSError, EOFError):  # refused, or nothing is sent
                 client.open(udp=transport == "udp")
             client.read()
             yield client.is_reading

@@ -1,4 +1,4 @@
-"""A package of ROS 2 without code of its own: launch files."""
+"""A ROS 2 package of launch files, without code of its own."""
 
 from glob import glob
 from xml.etree import ElementTree
