@@ -20,7 +20,7 @@ from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
 from runner.gst.credentials import log_in
-from runner.gst.outage import Gathered
+from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
@@ -331,7 +331,7 @@ class VehicleSide:
         source = None
         if plan.frozen_s is not None:
             source = WatchedSource(plan, lambda what: self._on_report(name, what))
-            source.take_place(pipeline, plan)
+            source.install(pipeline, plan)
         elif problem := log_in(pipeline, plan):
             self._on_report(name, problem)
         if self._video:
@@ -381,14 +381,14 @@ class OperatorSide:
     ) -> None:
         plans = _kept(plans, video, "operator")
         self._glib = _Glib()
-        self._gathered = gathered = Gathered(on_report)
+        self._reports = reports = ReportMerger(on_report)
         login: StreamLogin | None = None
         if keyring:
             from runner.gst.secure import StreamLogin
 
-            login = StreamLogin(keyring, vehicle, lambda what: gathered("keys", what))
+            login = StreamLogin(keyring, vehicle, lambda what: reports("keys", what))
         self._receivers = {
-            plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator, login)
+            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login)
             for plan in plans
         }
 
@@ -439,7 +439,7 @@ class OperatorSide:
                 receiver.stop()
 
         self._glib.end(stop)
-        self._gathered.flush()
+        self._reports.flush()
 
 
 class RecordingSide:

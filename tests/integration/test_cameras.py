@@ -116,7 +116,7 @@ def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
     [
         ("viewer:wrong", 0o600, "Unauthorized"),
         ("viewer:se:same7", 0o640, "credentials FILE: others may read it (mode 640); chmod 600"),
-        ("viewer", 0o600, "credentials FILE: must hold one line user:password"),
+        ("viewer", 0o600, "credentials FILE: must contain one line user:password"),
         (None, 0o600, "credentials FILE: no such file"),
     ],
 )

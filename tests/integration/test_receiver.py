@@ -100,7 +100,7 @@ def test_packets_of_strangers_are_dropped_and_counted():
     vehicle, plans = compiled()
     with sending(vehicle, plans), receiving(plans) as (side, messages, more):
         more()
-        sockets = [taken for r in side._receivers.values() for taken in r._filter._sockets.values()]
+        sockets = [sock for r in side._receivers.values() for sock in r._filter._sockets.values()]
         assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
         ports = [taken.getsockname()[1] for taken in sockets]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -114,7 +114,7 @@ def test_packets_of_strangers_are_dropped_and_counted():
         assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
         assert {(received.lost, received.rebuilt) for received in samples.values()} == {(0, 0)}
         until(lambda: messages)
-    assert messages == ["front, rear: packets from other hosts than the vehicle are dropped"]
+    assert messages == ["front, rear: packets from hosts other than the vehicle are dropped"]
 
 
 def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
