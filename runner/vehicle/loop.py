@@ -407,7 +407,7 @@ class ControlLoop:
         if isinstance(event, SteeringReported):
             self._publish_steering(event)
         if after.fault:
-            self._report_once(f"{after.fault}; the decision before stays in force")
+            self._report_once(f"{after.fault}; the previous decision stays in force")
         elif before.fault:
             self.on_report("the rules decide again")
         if after.refused:

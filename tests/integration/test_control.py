@@ -221,7 +221,7 @@ def test_both_sides_wait_for_a_broker(stack):
         output[verb] = []
         reader = threading.Thread(target=lambda c=child, v=verb: output[v].extend(c.stdout), daemon=True)
         reader.start()
-    wanted = f"no control link: MQTT broker at {broker}: connection refused; trying again"
+    wanted = f"no control link: MQTT broker at {broker}: connection refused; retrying"
     until(lambda: any(wanted in line for line in output["vehicle"]))
     time.sleep(2)
     with private_broker(broker):
@@ -398,7 +398,7 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
         vehicle.send_signal(signal.SIGTERM)
         assert vehicle.wait(15) == 0
     messages = notes(tmp_path)
-    assert "rule mine failed: ZeroDivisionError: division by zero; the decision before stays in force" in messages
+    assert "rule mine failed: ZeroDivisionError: division by zero; the previous decision stays in force" in messages
     assert messages.index("the control loop hangs in bitrate_predicted") < messages.index("the control loop runs again")
     replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
     faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}

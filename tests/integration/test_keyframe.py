@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from runner.h264.access_unit import Recent, read_unit
+from runner.h264.access_unit import RecentUnits, read_unit
 from runner.h264.damage import Damage
 from runner.h264.keyframe import grey_idr
 
@@ -53,7 +53,7 @@ def test_a_grey_picture_starts_a_decoder_and_waves_make_it_exact(width, height, 
 
 
 def test_the_burst_of_a_late_viewer_is_exact_though_shorter_than_two_periods():
-    recent, whole = Recent(refresh_s=0.5), encoded(480, 260)
+    recent, whole = RecentUnits(refresh_s=0.5), encoded(480, 260)
     pictures, _ = decoded(whole, 480, 260)
     lengths = []
     for number, data in enumerate(whole):
