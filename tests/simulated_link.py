@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import UNCAPPED, advanced, believed, started
+from runner.core.link_cap import UNCAPPED, update_cap, believed_limit, start_cap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -136,7 +136,7 @@ def drive(
     chance, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
     waiting, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
-    done, cap = Drive(tcp=tcp.delivered), started(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
+    done, cap = Drive(tcp=tcp.delivered), start_cap(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
     queue: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -189,8 +189,8 @@ def drive(
             uplink, estimated = estimate(uplink, what)
             if estimated:
                 measured = _measured(t, estimated, 2 * link.one_way_s)
-                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None)
-            trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
+                cap = update_cap(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None)
+            trusted = float(believed_limit(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done

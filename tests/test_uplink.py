@@ -15,8 +15,8 @@ from simulated_link import Link, busy, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, LinkCap, Overuse, advanced
-from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, updated
+from runner.core.link_cap import LEAST, LinkCap, Overuse, update_cap
+from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, add_doubt, is_near, update_trust
 from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
 pytestmark = pytest.mark.slow  # simulates drives
@@ -227,25 +227,25 @@ DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),)
 
 
 def test_a_place_is_forgotten_little_by_little() -> None:
-    shares = {t: updated(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
+    shares = {t: update_trust(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
     assert list(map(float, shares.values())) == [0.5, 0.75, 0.9, 1, 1]
-    assert updated(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
+    assert update_trust(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
 
 
 def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_stays() -> None:
-    trust = updated(DOUBTED, 10, HALF, laps(30))
+    trust = update_trust(DOUBTED, 10, HALF, laps(30))
     assert (trust.share, trust.places[0].near) == (1, False)
-    trust = updated(trust, 51, HALF, laps(51))
+    trust = update_trust(trust, 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
     for t in range(52, 120):
-        trust = updated(trust, t, HALF, replace(laps(50), t=t))
+        trust = update_trust(trust, t, HALF, replace(laps(50), t=t))
     assert trust.share == 1
-    assert updated(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(83, 100)
+    assert update_trust(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(83, 100)
 
 
 def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:
     """After time in which nothing was measured."""
-    trust = updated(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
+    trust = update_trust(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
 
 
@@ -260,9 +260,9 @@ def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_
 
 
 def test_an_old_position_says_nothing() -> None:
-    assert updated(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
+    assert update_trust(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
     doubts = tuple((float(t), Fraction(1, 2)) for t in (0, 2))
-    trust = updated(doubted(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
+    trust = update_trust(add_doubt(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
     assert (trust.share, trust.places) == (Fraction(1, 2), ())
 
 
@@ -272,8 +272,8 @@ def test_a_place_that_is_doubted_again_is_kept_longest() -> None:
         DoubtedPlace(PositionReported(t=0, lat=50 + i, lon=11), 0.0, Fraction(1, 2), near=False) for i in range(3)
     )
     doubts = tuple((float(t), Fraction(3, 5)) for t in (96, 98))
-    trust = doubted(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5))
-    trust = updated(trust, 100.5, HALF, laps(100))
+    trust = add_doubt(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5))
+    trust = update_trust(trust, 100.5, HALF, laps(100))
     assert trust.places == (*far, DoubtedPlace(laps(0), 100.5, Fraction(3, 5)))
 
 
@@ -303,14 +303,14 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
         link = LinkMeasured(
             t=t, kbps=None if kbps is None else Fraction(kbps), queue_ms=queue_ms, loss=loss, state=state, rtt_ms=30
         )
-        cap = advanced(cap, link, t, Fraction(limit))
+        cap = update_cap(cap, link, t, Fraction(limit))
         assert cap.kbps is None or cap.kbps >= LEAST
         for _ in range(3):  # and time in which no report arrives
             t += passed / 3
-            cap = advanced(cap, link, t, Fraction(limit))
+            cap = update_cap(cap, link, t, Fraction(limit))
     for _ in range(500):
         t += 0.1
-        cap = advanced(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
+        cap = update_cap(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
     assert cap.kbps is None or cap.kbps >= 5000
 
 
@@ -323,7 +323,7 @@ def test_a_low_rate_amid_the_burst_after_a_stall_counts_no_more_once_more_has_ar
     for number, (state, kbps, queue_ms) in enumerate(burst):
         t = 0.7 + 0.06 * number
         link = LinkMeasured(t=t, kbps=Fraction(kbps), queue_ms=queue_ms, loss=0, state=LinkState(state), rtt_ms=4)
-        cap = advanced(cap, link, t, Fraction(4200))
+        cap = update_cap(cap, link, t, Fraction(4200))
     assert cap.overuse
     assert cap.overuse.carried == known
 
