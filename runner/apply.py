@@ -337,7 +337,12 @@ class VehicleSide:
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
-            pipeline, plan, self._wanted_of(name), self._on_knobs_turned, lambda what: self._on_report(name, what), source
+            pipeline,
+            plan,
+            self._wanted_of(name),
+            self._on_knobs_turned,
+            lambda what: self._on_report(name, what),
+            source,
         )
 
     def _on_knobs_turned(self) -> None:

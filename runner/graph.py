@@ -51,9 +51,9 @@ _RECORDED = (
 )
 _WRITER = Element("writer", "filesink", {})
 # The branch after the tee writes a side's video, as sent or received, into a file. Its element names contain a hyphen,
-# which is not allowed in a graph. Its queue drops the oldest data, so that a slow disk never blocks the stream: 8 MB are
-# 10 s at 6 Mbit/s. The gate closes when writing fails, see runner/gst/video_files.py. Each frame is written immediately,
-# in case the process is killed.
+# which is not allowed in a graph. Its queue drops the oldest data, so that a slow disk never blocks the stream: 8 MB
+# are 10 s at 6 Mbit/s. The gate closes when writing fails, see runner/gst/video_files.py. Each frame is written
+# immediately, in case the process is killed.
 _TEE = Element("video-tee", "tee", {})
 _FILE_GATE = Element("video-gate", "valve", {})
 _FILE_QUEUE = Element(

@@ -305,7 +305,7 @@ class Sample:
     speed_factor    as in `SpeedAdvice`; None: not advised
     clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
     clock_bound_ms  maximum error of that and of each latency; None: unknown. Older logs lack it: there
-                    `clock_ahead_ms` was derived from negative latencies, and latencies are the difference of both clocks
+                    `clock_ahead_ms` was derived from negative latencies, and latencies are differences of both clocks
     """
 
     t: float

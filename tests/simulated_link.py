@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import UNCAPPED, update_cap, believed_limit, start_cap
+from runner.core.link_cap import UNCAPPED, believed_limit, start_cap, update_cap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -189,7 +189,9 @@ def drive(
             uplink, estimated = estimate(uplink, what)
             if estimated:
                 measured = _measured(t, estimated, 2 * link.one_way_s)
-                cap = update_cap(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None)
+                cap = update_cap(
+                    cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None
+                )
             trusted = float(believed_limit(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))

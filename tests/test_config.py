@@ -268,7 +268,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             GRAPH,
             {"name: pay0": "name: pay"},
-            "vehicle: 'pay': the last element must be named pay0, as the RTSP server asks",
+            "vehicle: 'pay': the last element must be named pay0, as the RTSP server requires",
         ),
         (
             GRAPH,
@@ -284,7 +284,7 @@ REAR, GRAPH, PAPER, ROBOT = (
             "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
-        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: this rule needs it"),
+        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: is required by this rule"),
         (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number from 0"),
         (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
         (
@@ -316,7 +316,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
             "@cameras.rear",
             "@cameras.front",
             "defaults: '/cameras@cameras.front': is chosen twice; "
-            "to choose again write override /cameras@cameras.front: FILE",
+            "to replace a choice write override /cameras@cameras.front: FILE",
         ),
         ("  rear:\n", "  front:\n", "line 18: found duplicate key front"),
         ("  rear:\n", "  raer:\n", "cameras.raer: no camera of that name is mounted, did you mean rear?"),
@@ -355,7 +355,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         (
             ": compact_480p",
             ": ${oc.env:HOME}",
-            "defaults: ${oc.env:HOME}: a defaults list may refer to a choice above it only, such as ${vehicle}",
+            "defaults: ${oc.env:HOME}: a defaults list may refer only to a choice above it, such as ${vehicle}",
         ),
     ],
 )
@@ -462,8 +462,8 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             ["cameras.front_left.place.column_span=2"],
             'cameras.front_center.place: {"row": 0, "column": 1}: overlaps the place of camera front_left',
         ),
-        (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already that of view"),
-        (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already that of enlarge"),
+        (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already assigned to view"),
+        (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already assigned to enlarge"),
         (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or null"),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],

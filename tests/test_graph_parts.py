@@ -79,9 +79,9 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
         (("graph.effort=most",), "'most': must be one of low, medium, high"),
         (
             ("graph.effort=high", "~graph.efforts.high"),
-            "high: must be low or medium, which the encoder of this graph has",
+            "high: must be low or medium, which this graph's encoder supports",
         ),
-        (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which the encoder of this graph has"),
+        (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],
 )
 def test_an_effort_that_the_encoder_has_not_is_refused(tod: Command, words: tuple[str, ...], problem: str) -> None:
@@ -121,7 +121,7 @@ def test_the_composed_graph_is_whole_lists() -> None:
         ),
         (
             "defaults: [h264_rtsp, _self_]\nsender:\n  - {name: sent, element: identity}\n",
-            "vehicle: 'sent': the last element must be named pay0, as the RTSP server asks",
+            "vehicle: 'sent': the last element must be named pay0, as the RTSP server requires",
         ),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 from helpers import CONF, Command, UserConf
 
 from runner.configuration import yaml_file
-from runner.configuration.interpolation import written_out
+from runner.configuration.interpolation import expands_within
 
 LONGEST_S = 2.0
 
@@ -34,15 +34,15 @@ def _interpolations(path: Path) -> None:
 @pytest.mark.parametrize(
     "make, expected",
     [
-        (_aliases, "line 5: must hold at most 10000 values, aliases written out"),
-        (_merges, "line 5: must hold at most 10000 values, aliases written out"),
+        (_aliases, "line 5: must contain at most 10000 values, with aliases expanded"),
+        (_merges, "line 5: must contain at most 10000 values, with aliases expanded"),
         (_interpolations, "interpolations, ${...}, are nested too deeply or expand to more than 50000 values"),
         (
             lambda path: path.write_text("a: " + "[" * 3000 + "]" * 3000),
             "line 1: must be nested at most 32 levels deep",
         ),
         (lambda path: path.write_text("- " * 3000), "line 1: must be nested at most 32 levels deep"),
-        (lambda path: path.write_text("a: [" + "1," * 10_001 + "]"), "line 1: must hold at most 10000 values, "),
+        (lambda path: path.write_text("a: [" + "1," * 10_001 + "]"), "line 1: must contain at most 10000 values, "),
         (lambda path: path.write_text("a: " + "x" * 100_000), "must be at most 100 kB long"),
         (lambda path: path.write_text("a: 0x" + "F" * 30_000), "line 1: must have at most 300 digits"),
         (lambda path: path.write_text("a: " + "1" * 6000), "Exceeds the limit (4300 digits)"),
@@ -72,7 +72,7 @@ def test_a_file_is_refused_before_it_does_harm(
 def test_files_that_build_on_each_other_in_a_circle(conf: UserConf, tod: Command) -> None:
     conf.write("modes/a.yaml", "defaults: [b, _self_]\n").write("modes/b.yaml", "defaults: [a, _self_]\n")
     (problem,) = tod("print", "source=test", "modes=a", conf.word).problems
-    assert problem == "command line: source=test modes=a: files build on each other in a circle"
+    assert problem == "command line: source=test modes=a: files include each other in a cycle"
 
 
 def test_a_misspelt_kind_beside_a_broken_file(conf: UserConf, tod: Command) -> None:
@@ -122,7 +122,7 @@ def test_words_have_limits_too(tod: Command, word: str, expected: str) -> None:
     ],
 )
 def test_the_size_of_interpolations_is_limited(document: object, most: int, fits: bool) -> None:
-    assert written_out(document, most) is fits
+    assert expands_within(document, most) is fits
 
 
 # --- blame ------------------------------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
     conf.write("modes/mine.yaml", f"{head}  - fade_when_stale: {{}}\n{RULES}")
     problems = tod("print", "source=test", "modes=mine", conf.word).problems
     assert {problem.partition(": ")[0] for problem in problems} == {str(conf.path / "modes/mine.yaml")}
-    assert "automatic[2].fade_when_stale.after_s: missing: this rule needs it" in problems[0]
+    assert "automatic[2].fade_when_stale.after_s: missing: is required by this rule" in problems[0]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
     [
         (
             "modes.automatic=[{total_from_prediction: {}}]",
-            "modes.automatic[0].total_from_prediction.start_kbps: missing: this rule needs it",
+            "modes.automatic[0].total_from_prediction.start_kbps: missing: is required by this rule",
         ),
         (
             "cameras.front_left.rate_quality.scaling=[0.5]",

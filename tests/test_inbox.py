@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.vehicle.inbox import MEASUREMENTS, ROUND_S, MAX_SENDERS, MAX_PER_ROUND, MAX_QUEUED, Inbox, Request
+from runner.vehicle.inbox import MAX_PER_ROUND, MAX_QUEUED, MAX_SENDERS, MEASUREMENTS, ROUND_S, Inbox, Request
 
 
 def make_request(sender: str, event: str, **keys: Any) -> Request:

@@ -16,7 +16,16 @@ from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import LEAST, LinkCap, Overuse, update_cap
-from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, add_doubt, is_near, update_trust
+from runner.core.trust import (
+    KNOWN_S,
+    METRES_PER_DEGREE,
+    REMEMBERED_S,
+    DoubtedPlace,
+    Trust,
+    add_doubt,
+    is_near,
+    update_trust,
+)
 from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
 pytestmark = pytest.mark.slow  # simulates drives
@@ -240,7 +249,9 @@ def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_sta
     for t in range(52, 120):
         trust = update_trust(trust, t, HALF, replace(laps(50), t=t))
     assert trust.share == 1
-    assert update_trust(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(83, 100)
+    assert update_trust(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(
+        83, 100
+    )
 
 
 def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:

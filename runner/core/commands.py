@@ -52,7 +52,7 @@ def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[
         now = commanded.get(name, {})
         for knob, value in wanted(setting).items():
             held = now.get(knob)
-            # Most values are the same object that was commanded; comparing regions one by one is slow.
+            # Most values are the same object as commanded; comparing regions field by field is slow.
             if held is not value and held != value:
                 commands.append(Command(name, knob, value))
     return commands

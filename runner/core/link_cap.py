@@ -1,9 +1,9 @@
 """The total that the measured link allows. Pure.
 
-On overuse it is cut immediately below the link's capacity, low enough to drain the queue. It recovers in steps up to the
-limit, which is the prediction or the operator's total, and never beyond: the prediction saves probing. Where the link
-proved narrower than the limit, recovery is fast up to that capacity, scaled with the limit, and careful beyond. When an
-operator connects, the cap starts at a share of the limit.
+On overuse it is cut immediately below the link's capacity, low enough to drain the queue. It recovers in steps up to
+the limit, which is the prediction or the operator's total, and never beyond: the prediction saves probing. Where the
+link proved narrower than the limit, recovery is fast up to that capacity, scaled with the limit, and careful beyond.
+When an operator connects, the cap starts at a share of the limit.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
 # To competing traffic the cameras yield down to this share of the most that arrived recently ...
 YIELDED = Fraction(1, 3)
-# ... unless a cap was held for this long, s, and less than this share of it arrives, or never more than TRIED of it: then
-# the link itself is narrower.
+# ... unless a cap was held for this long, s, and less than this share of it arrives, or never more than TRIED of it:
+# then the link itself is narrower.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
-# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent than
-# the link carries, it soon grows longer.
+# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent
+# than the link carries, it soon grows longer.
 JITTER_MS = 40
 # A longer one is real once it has lasted this long, s: delays on a busy machine are shorter.
 LASTED_S = 0.3

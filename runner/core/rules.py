@@ -333,11 +333,11 @@ def cap_by_link(
 
     The measured link also carries packet headers, and `reserve_kbps` of it are left to other traffic. The operator
     measures its own copy of each camera; other copies that leave the vehicle occupy the link in proportion. While there
-    is nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`, is
-    ignored while the link is measured: the total then follows the measurement alone. A prediction that repeatedly
-    proved too high is trusted less, down to the share `least_trust`; trust recovers with time, and drops again at places
-    where it dropped before; see `runner.core.trust`. When an operator connects, the total starts at the share `start`
-    of the limit and recovers once the link has been measured.
+    is nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`,
+    is ignored while the link is measured: the total then follows the measurement alone. A prediction that repeatedly
+    proved too high is trusted less, down to the share `least_trust`; trust recovers with time, and drops again at
+    places where it dropped before; see `runner.core.trust`. When an operator connects, the total starts at the share
+    `start` of the limit and recovers once the link has been measured.
 
     Memory: the cap, `LinkCap`.
     """
@@ -429,7 +429,7 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
 def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
-    """As `hold_upscaling`, while the measured link caps the total: its rate is being probed, and each new size costs bits.
+    """As `hold_upscaling`, while the measured link caps the total: its rate is being probed, and new sizes cost bits.
 
     Memory: as there; empty while nothing caps the total.
     """
@@ -443,7 +443,9 @@ def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memo
 _Hold = tuple[Fraction, float | None]
 
 
-def _hold_back(state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction) -> tuple[Draft, Mapping[str, _Hold]]:
+def _hold_back(
+    state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction
+) -> tuple[Draft, Mapping[str, _Hold]]:
     now: dict[str, _Hold] = {}
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, requested in draft.scaling.items():

@@ -1,12 +1,12 @@
 """Estimates the capacity of the uplink from what the operator's side receives from every camera. Pure.
 
 All cameras share one uplink and so one estimate. An access unit is delayed by the path and by the queue in front of the
-link. The smallest recent delay of its camera is the path's; the rest is the queue's, and an offset between the clocks of
-both sides cancels out. While a queue lasts, units arrive at the rate of the link.
+link. The smallest recent delay of its camera is the path's; the rest is the queue's, and an offset between the clocks
+of both sides cancels out. While a queue lasts, units arrive at the rate of the link.
 
-Delay-based like NADA (RFC 8698), with special handling of two cases in which delay misleads. A link that stalls and then
-delivers everything in a burst, as cellular links do, shows a gap and no lasting queue. A path that becomes longer shows
-a queue that does not drain although less is sent.
+Delay-based like NADA (RFC 8698), with special handling of two cases in which delay misleads. A link that stalls and
+then delivers everything in a burst, as cellular links do, shows a gap and no lasting queue. A path that becomes longer
+shows a queue that does not drain although less is sent.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class LinkEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """Delay of one camera's path: the minimum of the previous time bucket and of the current one, which began at `began`.
+    """Delay of one camera's path: the minimum of the previous time bucket and the current one, which began at `began`.
 
     own  whether this camera was measured with an empty queue. Until then the path is the shortest of all cameras: a
          camera that starts slowly or while a queue lasts would mistake that delay for its path

@@ -72,7 +72,7 @@ class ArrivingFrames:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._frames: deque[Arrival] = deque(maxlen=KEPT)
+        self._frames: deque[Arrival] = deque(maxlen=MAX_FRAMES)
         self._clock = MediaClock(1 / RTP_HZ)
         self._newest: Packet | None = None
         self._arrived = 0.0  # when the newest packet arrived

@@ -36,8 +36,8 @@ def read_bag(source: Gst.Element, bag: BagTopic, fps: Fraction, loop: bool = Fal
 class BagFeed:
     """Pushes the pictures of a topic into an appsrc once it requests data.
 
-    The first picture is pushed immediately; the running times of the others follow from their stamps. A bag that cannot be read
-    ends the pipeline, as an error of its source.
+    The first picture is pushed immediately; the running times of the others follow from their stamps. A bag
+    that cannot be read ends the pipeline, as an error of its source.
 
     fps        stated in the caps, Hz
     loop       start again at the end, one mean interval after the last picture

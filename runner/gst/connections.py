@@ -37,7 +37,7 @@ class RtspConnection:
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
         connection = client.get_connection()
-        # Our own descriptor: the library closes its own from another thread, and the next file opened reuses the number.
+        # Our own descriptor: the library closes its own from another thread, and the number is then reused.
         self._socket = socket.socket(fileno=os.dup(connection.get_write_socket().get_fd()))
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
@@ -54,7 +54,7 @@ class RtspConnection:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
 
     def idle_before_first_request(self, now: float) -> float:
-        """How long it has been connected without a request, s; over TLS it may be in the handshake. 0 after the first."""
+        """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
         return now - self.viewer.since if self.last_request == self._began else 0.0
 
     def identify(self, operator: str | None) -> None:

@@ -131,7 +131,10 @@ class Receiver:
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
-        self._progress = (0, time.monotonic())  # frames at the last change of the counter, and time of the last progress
+        self._progress = (
+            0,
+            time.monotonic(),
+        )  # frames at the last change of the counter, and time of the last progress
         self._last_unexpected = time.monotonic()  # when the camera was last not expected to send
         self._was_expected = False  # whether it was expected to send at the last sample
         self.should_send: bool | None = None  # None: unknown while the vehicle is offline

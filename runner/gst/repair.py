@@ -55,7 +55,7 @@ class RepairBuffer:
         return lost
 
     def adapt(self) -> int:
-        """Set the wait for missing packets to the time of their retransmission; returns it, ms. A few times a second."""
+        """Adapt the wait for missing packets to the round trip; returns it, ms. A few times a second."""
         round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or INITIAL_RTT_MS
         self._update_congestion()
         wait_ms = self._reorder_ms + (0 if self._congested else round(ATTEMPTS * round_trip_ms))

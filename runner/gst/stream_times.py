@@ -1,4 +1,4 @@
-"""Presentation times as stored in an MPEG-TS file. GStreamer's demuxer mistakes gaps for a new clock and shortens them."""
+"""Presentation times stored in an MPEG-TS file. GStreamer's demuxer mistakes gaps for a new clock and shortens them."""
 
 from __future__ import annotations
 

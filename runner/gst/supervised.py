@@ -67,7 +67,9 @@ class SupervisedPipeline:
             self._retry = 0
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
-            self._change = set_state_in_thread(self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change)
+            self._change = set_state_in_thread(
+                self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change
+            )
             self._pipeline = None
 
     def restart(self, why: str) -> None:

@@ -105,7 +105,7 @@ class VideoFile:
         """From any thread, before the pipeline handles it."""
         if message.type != Gst.MessageType.ERROR or not concerns_file(message):
             return Gst.BusSyncReply.PASS
-        # A bin that fails to start resets all its elements, including locked ones; a file sink without a name then fails.
+        # A bin that fails to start resets all elements, even locked ones; a file sink without a name then fails.
         if self._begun or message.src.get_name() != f"{_MARK}file":
             self._fail(message.src.get_parent(), message.parse_error()[0].message)
         return Gst.BusSyncReply.DROP

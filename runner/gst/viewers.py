@@ -53,8 +53,8 @@ def admit(
     viewers     of this camera, in order of arrival
     limit       viewers over the uplink at once, at least 1
     controller  id of the operator in control, "" for none
-    returns     for the controller, the newest viewers of others; if all are the controller's own, the oldest: a leftover
-                of an operator whose address has changed
+    returns     for the controller, the newest viewers of others; if all are the controller's own, the oldest: a
+                leftover of an operator whose address has changed
     """
     if not over_uplink(new_viewer.address):
         return []

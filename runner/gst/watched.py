@@ -43,7 +43,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
         self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
-        self._lock = threading.Lock()  # for the child: the server's threads start and stop it, GLib's thread replaces it
+        self._lock = (
+            threading.Lock()
+        )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
         self._timer = 0
         self._error: str | None = None  # the source's own error, set from its threads
@@ -112,7 +114,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if now - self._progress[1] <= self._frozen_s:
             return
         if self._is_idle():
-            self.outage.report_failure(f"source: {self._error or f'no frame for {self._frozen_s:g} s'}", self._progress[1])
+            self.outage.report_failure(
+                f"source: {self._error or f'no frame for {self._frozen_s:g} s'}", self._progress[1]
+            )
             self._replace(now)
         else:
             self._progress = (self._progress[0], now)  # its next frame follows once this one has passed

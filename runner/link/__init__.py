@@ -1,7 +1,7 @@
 """A limited link between the vehicle's and the operator's process, whose rate follows a trace.
 
-Arrivals, losses and delays are thus measured, not assumed. Two kinds: `netns` (root; packets of any protocol between two
-network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
+Arrivals, losses and delays are thus measured, not assumed. Two kinds: `netns` (root; packets of any protocol between
+two network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
 vehicle to the operator in one queue, and all traffic back in another, if that is limited.
 
 with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):

@@ -2,8 +2,8 @@
 
     vehicle's namespace link0 ---- runner.link.tunnel ---- tod-N this machine's namespace
 
-Both devices are TUN devices of one process, which limits, delays and drops packets of any protocol in both directions. Sizes are those of IP packets. The operator, its page and the broker stay in this
-machine's namespace.
+Both devices are TUN devices of one process, which limits, delays and drops packets of any protocol in both directions.
+Sizes are those of IP packets. The operator, its page and the broker stay in this machine's namespace.
 """
 
 from __future__ import annotations

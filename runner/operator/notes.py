@@ -44,7 +44,9 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
         return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s"
     reasons = [cameras[name].reason for name in changed]
     if len(changed) > 1:
-        each = [reason.split("; ")[1:] for reason in reasons]  # first the camera's own reason, then those of the whole decision
+        each = [
+            reason.split("; ")[1:] for reason in reasons
+        ]  # first the camera's own reason, then those of the whole decision
         shared = [part for part in each[0] if all(part in others for others in each)]
         total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
         reasons = ["; ".join([total, *shared])]

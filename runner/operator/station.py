@@ -227,7 +227,7 @@ class Station:
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
-        """Process a sample of all cameras' counters; to be called a few times a second, since it also checks timeouts."""
+        """Process a sample of all counters; to be called a few times a second, since it also checks timeouts."""
         now = time.monotonic()
         if self.state and now - self._last_message > SILENT_S:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
@@ -408,7 +408,9 @@ class Station:
     def _note_changes(self, before: VehicleState, state: VehicleState) -> None:
         """A note about a decision, and one when the rules fail or recover."""
         if state.fault != before.fault:
-            self.note(f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again")
+            self.note(
+                f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
+            )
         if text := decision_note(before, state):
             self.note(text)
 

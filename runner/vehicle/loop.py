@@ -335,7 +335,7 @@ class ControlLoop:
             item.state_clock()
 
     def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
-        """Any message of an operator shows its presence. The core sees only the first to arrive and the last to leave."""
+        """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
             self._operators.connected(sender, t)
@@ -370,7 +370,9 @@ class ControlLoop:
         if in_control != self._in_control:
             self._in_control = in_control
             self._guarded("control", lambda: self._pass_control(in_control, t))
-        if bool(now) != (self._run.state.operator_since is not None):  # compared with the core: an event may have failed
+        if bool(now) != (
+            self._run.state.operator_since is not None
+        ):  # compared with the core: an event may have failed
             self._take(OperatorConnected(t=t) if now else OperatorDisconnected(t=t))
 
     def _pass_control(self, operator: str, t: float) -> None:

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from fractions import Fraction
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, REPORT_S, LinkCap, update_cap, believed_limit
+from runner.core.link_cap import LEAST, REPORT_S, LinkCap, believed_limit, update_cap
 from runner.core.model import exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 
