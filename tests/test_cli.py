@@ -54,7 +54,7 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
         (["report", "drive", "output="], "command line: output: '': must not be empty"),
     ],
 )
-def test_words_that_are_no_command(tod: Command, words: list[str], expected: str) -> None:
+def test_invalid_command_lines(tod: Command, words: list[str], expected: str) -> None:
     assert tod(*words) == (2, "", f"{expected}\n")
 
 
@@ -165,7 +165,7 @@ def test_doctor_and_validate_report_which_part_of_gstreamer_does_not_load(
         ([], ["paho", "rich", "aiohttp", "plotly", "numba"]),
     ],
 )
-def test_doctor_looks_at_what_a_verb_needs(tod: Command, words: list[str], modules: list[str]) -> None:
+def test_doctor_checks_what_a_verb_needs(tod: Command, words: list[str], modules: list[str]) -> None:
     result = tod("doctor", *words)
     assert result.err == ""
     named = [line.split("Python module ")[1].partition(":")[0] for line in result.out.splitlines() if "module" in line]

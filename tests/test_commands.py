@@ -23,7 +23,7 @@ def test_while_nothing_is_sent_the_other_knobs_stay() -> None:
     assert wanted(replace(FRONT, sending=False, kbps=0)) == {"sending": False}
 
 
-def test_first_everything_then_nothing_then_what_differs() -> None:
+def test_only_differences_are_commanded() -> None:
     first = difference(DECISION, {})
     assert [(c.camera, c.knob) for c in first] == [
         (camera, knob) for camera in ("front", "rear", "mast") for knob in ("sending", "roi", "size", "bitrate")
@@ -34,7 +34,7 @@ def test_first_everything_then_nothing_then_what_differs() -> None:
     assert difference(changed, commanded) == [Command("front", "bitrate", 1)]
 
 
-def test_what_was_commanded_before_is_left_as_it_was() -> None:
+def test_earlier_commands_are_not_modified() -> None:
     commanded = after({}, difference(DECISION, {}))
     later = after(commanded, [Command("front", "bitrate", 1)])
     assert commanded["front"]["bitrate"] == FRONT.kbps

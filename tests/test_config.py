@@ -67,7 +67,7 @@ def test_the_papers_vehicle_is_table_1_digit_by_digit() -> None:
     assert {c.weight for c in cameras.values()} == {1}
 
 
-def test_the_second_vehicle_is_of_other_shape() -> None:
+def test_the_second_vehicle_has_another_structure() -> None:
     cameras = vehicle("vehicle=delivery_robot").cameras
     assert len(cameras) == 3
     assert len({(c.width, c.height, c.rate_quality.scaling) for c in cameras.values()}) == 3
@@ -90,7 +90,7 @@ def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
 # --- a user's own directory -------------------------------------------------------------------------------------------
 
 
-def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> None:
+def test_a_users_file_shadows_only_the_packaged_file_of_its_name(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"b_full_kbps: 5000": "b_full_kbps: 7000"})
     cameras = configuration(["source=test"], conf.path).vehicle().cameras
     assert cameras["front_center"].rate_quality.b_full == 7000
@@ -98,7 +98,7 @@ def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> No
     assert vehicle().cameras["front_center"].rate_quality.b_full == 5000
 
 
-def test_a_user_adds_vehicle_camera_graph_modes_and_source(conf: UserConf) -> None:
+def test_a_user_can_add_files_of_every_group(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"1920": "640", "1040": "480"})
     (conf.path / "cameras/front_center.yaml").rename(conf.path / "cameras/tiny.yaml")
     conf.change("graph/h264_rtsp.yaml", {"first_port: 5600": "first_port: 7000"})
@@ -146,7 +146,7 @@ def test_a_mounted_camera_may_have_its_own_graph_and_source(conf: UserConf) -> N
     assert [c.source.elements[0].factory for c in cameras.values()] == ["appsrc", "videotestsrc"]
 
 
-def test_overrides_mount_unmount_and_exchange_cameras() -> None:
+def test_overrides_mount_unmount_and_replace_cameras() -> None:
     cameras = vehicle(
         "+cameras@cameras.extra=top_view", "~cameras.top_rear", "cameras@cameras.top_left=rear_center"
     ).cameras
@@ -154,7 +154,7 @@ def test_overrides_mount_unmount_and_exchange_cameras() -> None:
     assert (cameras["extra"].width, cameras["top_left"].height) == (1280, 1200)
 
 
-def test_the_environment_names_the_directory_too_and_an_argument_wins(
+def test_the_environment_may_name_the_directory_and_an_argument_wins(
     conf: UserConf, tmp_path: Path, tod: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf.write("vehicle/mine.yaml", MINE)
@@ -474,7 +474,7 @@ def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list
     assert problem.endswith(expected)
 
 
-def test_every_tile_that_lies_on_another_is_reported(conf: UserConf, tod: Command) -> None:
+def test_every_overlapping_tile_is_reported(conf: UserConf, tod: Command) -> None:
     words = [f"cameras.{name}.place.row=0" for name in ("rear_center", "top_left", "top_right")]
     found = [line.removeprefix("command line: cameras.") for line in problems(tod, conf, *words)]
     assert found == [
@@ -549,7 +549,7 @@ def test_the_same_problem_is_reported_once() -> None:
     assert str(two).splitlines()[1:] == ["a.yaml: must not either", "2 problems, nothing was started"]
 
 
-def test_no_part_of_the_environment_comes_into_the_configuration(conf: UserConf) -> None:
+def test_the_environment_does_not_affect_the_configuration(conf: UserConf) -> None:
     conf.write("vehicle/mine.yaml", MINE.replace("top_view", "${oc.env:KIND}"))
     words = ("print", "vehicle=mine", "source=test", conf.word)
     result = process(*words, env={**os.environ, "KIND": "top_view"})

@@ -40,7 +40,7 @@ def test_a_loss_shows_until_the_picture_is_healed(text: str, lost: str, expected
     assert damaged(stream(text, lost)) == expected
 
 
-def test_of_a_codec_that_is_not_understood_only_incomplete_units_are_known_to_be_damaged() -> None:
+def test_for_unsupported_codecs_only_incomplete_units_count_as_damaged() -> None:
     assert damaged([(b"", False), (b"", True), (b"", False)], codec="vp8") == "-D-"
 
 
@@ -53,21 +53,21 @@ def test_a_shorter_wave_that_begins_later_heals_first() -> None:
     assert damaged([(DELTA, True), (wrong, False), (DELTA, False), (KEY, False)]) == "DDD-"
 
 
-def test_nothing_is_read_while_the_picture_is_whole() -> None:
+def test_units_are_not_parsed_while_the_picture_is_intact() -> None:
     def fail() -> bytes:
         raise AssertionError
 
     assert not Damage("h264").add(False, fail)
 
 
-def test_the_beginning_of_a_unit_is_enough() -> None:
+def test_the_first_bytes_of_a_unit_suffice() -> None:
     noise = bytes(range(1, 256)) * 100
     damage = Damage("h264")
     assert damage.add(True, lambda: b"")
     assert not damage.add(False, lambda: (KEY + noise)[:HEAD_BYTES])
 
 
-def test_what_was_missed_before_the_first_unit_shows_likewise() -> None:
+def test_units_missed_before_the_first_one_cause_damage() -> None:
     damage = Damage("h264", lasts=True)
     assert [damage.add(False, lambda: DELTA), damage.add(False, lambda: KEY), damage.add(False, lambda: DELTA)] == [
         True,

@@ -84,7 +84,7 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
         (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],
 )
-def test_an_effort_that_the_encoder_has_not_is_refused(tod: Command, words: tuple[str, ...], problem: str) -> None:
+def test_an_effort_that_the_encoder_lacks_is_rejected(tod: Command, words: tuple[str, ...], problem: str) -> None:
     assert tod("print", "source=test", *words).problems == [f"command line: graph.effort: {problem}"]
 
 
@@ -148,7 +148,7 @@ def test_a_path_is_the_one_in_the_file(conf: UserConf, tod: Command, old: str, n
     assert found == {(f"{conf.path}/graph/h264_rtsp.yaml", path)}
 
 
-def test_a_part_that_no_list_takes_in_is_refused(conf: UserConf, tod: Command) -> None:
+def test_a_part_that_no_list_includes_is_rejected(conf: UserConf, tod: Command) -> None:
     conf.change("graph/h264_rtsp.yaml", {"  - ${..encoder}\n": ENCODER})
     # The packaged graph defines an encoder that the user's list would silently ignore.
     assert tod("print", "source=test", "graph=openh264_rtsp", conf.word).problems == [

@@ -22,7 +22,7 @@ def all_of(inbox: Inbox, rounds: int = 1) -> list[Request]:
     return taken
 
 
-def test_one_request_of_each_sender_in_turn() -> None:
+def test_senders_are_served_round_robin() -> None:
     inbox = Inbox()
     for number in range(3):
         inbox.put(make_request("a", "total_set", kbps=number))
@@ -30,7 +30,7 @@ def test_one_request_of_each_sender_in_turn() -> None:
     assert [(r.sender, r.document["kbps"]) for r in all_of(inbox)] == [("a", 0), ("b", 9), ("a", 1), ("a", 2)]
 
 
-def test_the_senders_of_what_waits() -> None:
+def test_senders_with_queued_items_are_listed() -> None:
     inbox = Inbox()
     assert inbox.senders() == frozenset()
     for sender in ("a", "b", "a"):
@@ -39,7 +39,7 @@ def test_the_senders_of_what_waits() -> None:
     assert inbox.senders() == {"a", "b"}
 
 
-def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_of_the_mode() -> None:
+def test_a_measurement_supersedes_an_older_one_but_not_across_a_change_of_the_mode() -> None:
     inbox = Inbox()
     first = make_request("a", "bitrate_predicted", kbps=1)
     assert inbox.put(first) is None
@@ -83,7 +83,7 @@ def test_requests_are_never_merged_or_reordered(puts: list[tuple[str, str]]) -> 
         assert [r.document["n"] for r in taken if r.sender == sender and r.measures is None] == wanted
 
 
-def test_a_flood_is_taken_a_few_at_a_time_and_others_go_between() -> None:
+def test_a_flood_is_throttled_and_others_are_served_in_between() -> None:
     inbox = Inbox()
     for number in range(MAX_QUEUED):
         inbox.put(make_request("flood", "total_set", kbps=number))

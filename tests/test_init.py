@@ -109,7 +109,7 @@ def test_one_directory_is_named(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_validate_tells_that_the_editor_knows_another_version(tod: Command, fleet: Path) -> None:
+def test_validate_reports_editor_schemas_of_another_version(tod: Command, fleet: Path) -> None:
     (fleet / FOLDER / "VERSION").write_text("0.0.1\n")
     status, out, err = tod("validate", f"conf={fleet}")
     assert status == 0 and out.startswith("valid: 3 files")

@@ -38,7 +38,7 @@ def timed(gaps):
 
 
 @given(arrivals)
-def test_no_stretch_of_time_sees_more_than_the_rate_and_one_bucket(gaps):
+def test_no_period_passes_more_than_the_rate_and_one_bucket(gaps):
     packets = timed(gaps)
     left, _ = passed(packets)
     for first, (begin, _) in enumerate(left):
@@ -86,7 +86,7 @@ def test_a_new_rate_applies_to_queued_packets():
     assert bucket.due() == pytest.approx(0.002 + (1000 - 110) / 100_000)
 
 
-def test_without_a_rate_packets_stay_until_there_is_one():
+def test_at_a_rate_of_0_packets_stay_queued():
     bucket = Bucket(0, QUEUE_MS, 0.0)
     for index in range(5):
         bucket.put(1500, index, 0.0)
@@ -139,7 +139,7 @@ def test_ports_are_read_and_replaced_in_the_transport_header_alone():
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.002, 1), (0.01, 1), (0.03, 10), (0.2, 3)])
-def test_losses_have_their_share_and_length(loss, burst):
+def test_losses_have_the_configured_share_and_burst_length(loss, burst):
     losses = LossModel(loss, burst)
     drawn = [losses.draw() for _ in range(400_000)]
     runs = sum(lost and not before for before, lost in pairwise([False, *drawn]))
@@ -148,6 +148,6 @@ def test_losses_have_their_share_and_length(loss, burst):
 
 
 @pytest.mark.parametrize(("loss", "drawn"), [(0, {False}), (1, {True})])
-def test_all_or_nothing_is_lost(loss, drawn):
+def test_a_loss_of_0_or_1_is_exact(loss, drawn):
     losses = LossModel(loss, 1)
     assert {losses.draw() for _ in range(1000)} == drawn

@@ -32,7 +32,7 @@ def test_an_invalid_message_is_refused(payload: bytes, problem: str) -> None:
         read_message(payload)
 
 
-def test_records_are_read_by_several_threads_from_their_first_use_on() -> None:
+def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:
     """In a process of its own, which would crash."""
     program = dedent(
         """\

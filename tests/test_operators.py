@@ -8,7 +8,7 @@ from runner.mqtt.messages import MAX_ROUND_TRIP_S
 from runner.vehicle.operators import DELAYS, MAX_OPERATORS, SILENT_S, Operators
 
 
-def test_an_operator_leaves_by_its_own_silence_or_goodbye_only() -> None:
+def test_an_operator_leaves_only_by_its_own_silence_or_sign_off() -> None:
     operators = Operators(1.0)
     assert operators.connected("a", 0.0)
     assert operators.connected("b", 0.0)
@@ -32,7 +32,7 @@ def test_any_message_of_its_own_brings_an_operator_back() -> None:
     assert operators.present == {"a"}
 
 
-def test_a_sender_that_never_announced_itself_is_no_operator() -> None:
+def test_a_sender_without_announcement_is_no_operator() -> None:
     operators = Operators(1.0)
     assert not operators.message_received("predictor", 0.0)
     assert operators.present == frozenset()
@@ -65,7 +65,7 @@ def test_control_outlasts_an_outage_of_all_operators() -> None:
     assert operators.in_control == "driver"
 
 
-def test_control_passes_on_when_only_its_holder_is_silent() -> None:
+def test_control_passes_when_only_its_holder_is_silent() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     for quarter in range(1, 6):
@@ -76,7 +76,7 @@ def test_control_passes_on_when_only_its_holder_is_silent() -> None:
     assert operators.in_control == "onlooker"
 
 
-def test_control_passes_on_a_while_after_an_outage_from_which_its_holder_does_not_return() -> None:
+def test_control_passes_after_an_outage_if_its_holder_does_not_return() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     operators.connected("onlooker", 0.0)
@@ -88,7 +88,7 @@ def test_control_passes_on_a_while_after_an_outage_from_which_its_holder_does_no
     assert operators.in_control == "onlooker"
 
 
-def test_an_operator_whose_messages_wait_is_not_silent() -> None:
+def test_an_operator_with_queued_messages_is_not_silent() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     assert operators.expire_silent(5.0, {"driver"}) == []

@@ -6,7 +6,7 @@ from runner.system import recent
 from runner.system.recent import CURRENT_S, RecentValue
 
 
-def test_it_is_forgotten_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_expires(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(recent.time, "monotonic", lambda: now[0])
     value = RecentValue[float]()

@@ -34,7 +34,7 @@ def test_times_of_video_units(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"short", b"\x47" * 1000])
-def test_what_is_no_transport_stream_has_no_times(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_transport_stream_has_no_times(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "video.ts"
     path.write_bytes(content)
     assert stream_times(path) == []
@@ -45,14 +45,14 @@ def restored(stated: list[int], demuxed: list[int]) -> list[int]:
     return [times.next(ms * MS) // MS for ms in demuxed]
 
 
-def test_a_gap_has_its_length_again() -> None:
+def test_the_length_of_a_gap_is_restored() -> None:
     assert restored([0, 100, 200, 5200, 5300], [0, 100, 200, 700, 800]) == [0, 100, 200, 5200, 5300]
 
 
-def test_units_that_the_demuxer_left_out_are_passed_over() -> None:
+def test_units_omitted_by_the_demuxer_are_skipped() -> None:
     assert restored([0, 100, 200, 300, 5300, 5400], [0, 100, 300, 800, 900]) == [0, 100, 300, 5300, 5400]
 
 
-def test_more_units_than_stated_stay_at_the_last() -> None:
+def test_excess_units_get_the_last_time() -> None:
     assert restored([0, 100], [0, 100, 200]) == [0, 100, 100]
     assert restored([], [0, 100]) == [0, 100]

@@ -21,16 +21,16 @@ AUD, SPS, PPS, SEI, IDR, SLICE = (bytes([0, 0, 0, 1, kind]) for kind in (0x09, 0
         (b"\0\0\0\1\x25\x88", True),  # nal_ref_idc 1
     ],
 )
-def test_only_an_idr_starts_anew(data, anew):
+def test_only_an_idr_restarts_the_stored_units(data, anew):
     assert read_unit(data, None, 0).key is anew
 
 
 @pytest.mark.parametrize("data", [AUD + SPS, AUD, b"", b"\0\0\1"])
-def test_a_unit_without_a_picture_is_of_no_use(data):
+def test_a_unit_without_a_picture_is_useless(data):
     assert read_unit(data, None, 0) is None
 
 
-def test_half_a_picture_is_left_out_and_half_an_idr_picture_becomes_a_grey_one():
+def test_an_incomplete_picture_is_dropped_and_an_incomplete_idr_becomes_grey():
     sps = b"\0\0\0\1" + bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
     assert (
@@ -89,7 +89,7 @@ def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods
     assert recent.add(unit(3.1)).exact
 
 
-def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
+def test_a_burst_begins_with_the_last_completed_wave():
     recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))
     for tenth in range(1, 58):
@@ -101,7 +101,7 @@ def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
     assert recent.burst()[1].arrived == 5.0
 
 
-def test_a_grey_start_is_exact_when_the_first_whole_wave_has_run():
+def test_a_grey_start_is_exact_after_the_first_whole_wave():
     recent = RecentUnits(refresh_s=1.0)
     sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False))]
@@ -178,7 +178,7 @@ def test_a_unit_of_h265_is_key_by_its_picture_and_not_by_its_parameter_sets(kind
     assert (unit.key, unit.exact, unit.data) == (key, True, h265(*kinds))
 
 
-def test_damaged_units_of_h265_and_those_without_a_picture_are_of_no_use():
+def test_damaged_h265_units_and_those_without_a_picture_are_useless():
     assert read_unit(h265(19), 1.0, 2.0, damaged=True, codec="h265") is None
     assert read_unit(h265(32, 33, 34), 1.0, 2.0, codec="h265") is None
 

@@ -34,7 +34,7 @@ RIGHT, HIGH = 3600.0, 6000.0  # kbit/s predicted over a link of 4000
 HALF = Fraction(1, 2)
 
 
-def test_a_right_prediction_costs_nothing() -> None:
+def test_a_correct_prediction_is_used_fully() -> None:
     link, limit = Link(steps((0, 4000))), steps((0, RIGHT))
     done = drive(link, limit, 30)
     assert {cap for _, cap, _ in done.caps} == {RIGHT}
@@ -88,7 +88,7 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
     assert min(shown[19:25]) > 90
 
 
-def test_the_rest_of_a_frame_in_a_later_report_shows_no_clock_that_was_set() -> None:
+def test_the_rest_of_a_frame_in_a_later_report_is_no_clock_step() -> None:
     """Rounded times make it seem older than its first part."""
     uplink = UplinkMemory()
     for number in range(30):
@@ -102,7 +102,7 @@ def test_the_rest_of_a_frame_in_a_later_report_shows_no_clock_that_was_set() -> 
     assert uplink.intervals == {"front": pytest.approx(1 / 15, abs=0.001)}
 
 
-def test_a_link_that_halves_is_answered_at_once() -> None:
+def test_a_link_that_halves_causes_an_immediate_cut() -> None:
     done = drive(Link(steps((0, 4000), (5, 2000))), steps((0, RIGHT)), 10)
     assert done.first(5, lambda cap: cap <= 2000) <= 0.03 + 0.25
     assert done.wait_ms(0.99, since=6) <= 100
@@ -131,7 +131,7 @@ def test_random_loss_does_not_cut() -> None:
     assert done.lowest(1, 20) == RIGHT
 
 
-def test_a_longer_path_is_no_queue() -> None:
+def test_a_longer_path_is_not_mistaken_for_a_queue() -> None:
     """A handover adds 60 ms for good."""
     done = drive(Link(steps((0, 4000)), lambda t: 0.06 if t >= 5 else 0.0), steps((0, RIGHT)), 15)
     assert done.lowest(5, 15) >= 0.4 * RIGHT
@@ -140,7 +140,7 @@ def test_a_longer_path_is_no_queue() -> None:
 
 @pytest.mark.parametrize("limit", [RIGHT, HIGH])
 @pytest.mark.parametrize("fps", [15, 30])
-def test_jitter_is_no_reason_to_send_less(limit: float, fps: float) -> None:
+def test_jitter_does_not_reduce_the_rate(limit: float, fps: float) -> None:
     """Twice a second 0.1 s in which everything is late by some 15 ms, as on many radio links and busy machines."""
     link, total = Link(steps((0, 4000)), jitter(0.5, 0.1, 15)), steps((0, limit))
     done = drive(link, total, 40, fps=fps)
@@ -149,7 +149,7 @@ def test_jitter_is_no_reason_to_send_less(limit: float, fps: float) -> None:
 
 
 @pytest.mark.parametrize("limit", [RIGHT, HIGH])
-def test_the_jitter_of_a_recorded_5g_link_is_no_reason_to_send_less(limit: float) -> None:
+def test_the_jitter_of_a_recorded_5g_link_does_not_reduce_the_rate(limit: float) -> None:
     with shared("traces/tidy/cicv5g_urban_n8_v30_rtt.csv").open() as file:
         rows = [(float(row["t_s"]), float(row["rtt_ms"]) / 1000) for row in csv.DictReader(file)]
     times, least = [t - rows[0][0] for t, _ in rows], min(rtt for _, rtt in rows)
@@ -186,13 +186,13 @@ def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
 
 
 @pytest.mark.parametrize("kbps", [300, 600, 1000, 1200, 1250, 1300])
-def test_a_link_that_falls_far_is_not_taken_for_one_that_others_fill(kbps: float) -> None:
+def test_a_large_drop_of_the_link_is_not_mistaken_for_competing_traffic(kbps: float) -> None:
     done = drive(Link(steps((0, 5000), (20, kbps)), one_way_s=0.05), steps((0, HIGH)), 60, fps=15)
     assert done.wait_ms(0.95, since=20) <= 100
     assert done.kbps(25, 60) >= 0.9 * kbps
 
 
-def test_after_a_stall_no_more_is_restored_than_the_link_carries_since() -> None:
+def test_after_a_stall_the_rate_is_restored_only_up_to_the_new_capacity() -> None:
     """As in another cell: half of what arrived before would fill the queue again."""
     link = Link(steps((0, 8000), (20, 800)), delay_s=stalls((20, 22.4)), one_way_s=0.02, queue_s=0.5)
     done = drive(link, steps((0, 8000)), 34, fps=15)
@@ -207,7 +207,7 @@ def test_a_prediction_that_falls_and_is_still_too_high_fills_no_queue() -> None:
 
 
 @pytest.mark.parametrize("fps", [15, 40])
-def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
+def test_cameras_and_a_tcp_flow_share_the_link(fps: float) -> None:
     """Case 5.6 of RFC 8867, rates times two: a quarter of the fair share at least. TCP itself fills the queue."""
     link, limit = Link(steps((0, 4000)), one_way_s=0.05), steps((0, 4000))
     done = drive(link, limit, 80, fps=fps, tcp_s=(5, 60))
@@ -235,13 +235,13 @@ def test_a_place_where_predictions_proved_too_high_is_remembered() -> None:
 DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),))
 
 
-def test_a_place_is_forgotten_little_by_little() -> None:
+def test_a_place_is_forgotten_gradually() -> None:
     shares = {t: update_trust(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
     assert list(map(float, shares.values())) == [0.5, 0.75, 0.9, 1, 1]
     assert update_trust(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
 
 
-def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_stays() -> None:
+def test_trust_falls_when_the_vehicle_reaches_a_place_and_recovers_while_it_stays() -> None:
     trust = update_trust(DOUBTED, 10, HALF, laps(30))
     assert (trust.share, trust.places[0].near) == (1, False)
     trust = update_trust(trust, 51, HALF, laps(51))
@@ -254,7 +254,7 @@ def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_sta
     )
 
 
-def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:
+def test_trust_falls_at_a_place_even_while_recovering() -> None:
     """After time in which nothing was measured."""
     trust = update_trust(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
@@ -270,14 +270,14 @@ def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_
         assert done.first(end, lambda cap: cap >= 0.8 * RIGHT) <= 2.5
 
 
-def test_an_old_position_says_nothing() -> None:
+def test_a_stale_position_is_ignored() -> None:
     assert update_trust(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
     doubts = tuple((float(t), Fraction(1, 2)) for t in (0, 2))
     trust = update_trust(add_doubt(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
     assert (trust.share, trust.places) == (Fraction(1, 2), ())
 
 
-def test_a_place_that_is_doubted_again_is_kept_longest() -> None:
+def test_a_place_that_is_doubted_again_is_remembered_longest() -> None:
     near = DoubtedPlace(laps(0), 0.0, Fraction(1, 2))
     far = tuple(
         DoubtedPlace(PositionReported(t=0, lat=50 + i, lon=11), 0.0, Fraction(1, 2), near=False) for i in range(3)
@@ -326,7 +326,7 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
 
 
 @pytest.mark.parametrize("after, known", [(1870, 1870), (2520, 1900), (1300, 1300)])
-def test_a_low_rate_amid_the_burst_after_a_stall_counts_no_more_once_more_has_arrived(after: int, known: int) -> None:
+def test_a_low_rate_during_the_burst_after_a_stall_is_corrected_by_later_arrivals(after: int, known: int) -> None:
     """As measured on a busy machine; the cap then stayed at 1200 kbit/s for seconds."""
     overuse = Overuse(0.0, Fraction(1900), Fraction(4200))
     cap = LinkCap(kbps=Fraction(1760), overuse=overuse, before=Fraction(1400), began=-9.0, changed=0.6, measured=0.6)

@@ -214,7 +214,7 @@ def received(side, plan, camera, frame):
         (Roi(960, 520, 960, 520), (480, 260), (DARK, DARK, DARK, DARK)),
     ],
 )
-def test_an_roi_shows_what_it_names(roi, size, corners):
+def test_an_roi_shows_its_region(roi, size, corners):
     frame = quadrants(1920, 1040)
     with streaming("source=appsrc") as (side, _, (plan,), _reported):
         turn(side, roi=roi, size=size, bitrate=2000)
@@ -262,7 +262,7 @@ def test_a_port_in_use_is_reported_in_one_line():
     assert str(raised.value) == f"cannot listen on {where}: address already in use; choose another port"
 
 
-def test_other_modules_may_throw_beside_gstreamer():
+def test_other_libraries_may_throw_exceptions_after_gstreamer_is_loaded():
     # GStreamer loads libunwind; a C++ exception that unwinds through it ends the process.
     pytest.importorskip("cv2")
     pytest.importorskip("matplotlib")

@@ -153,7 +153,7 @@ def take(received, seen):
     return True
 
 
-def test_pictures_of_another_size_are_left_out_and_others_go_on(tmp_path):
+def test_pictures_of_another_size_are_left_out_and_playback_continues(tmp_path):
     pictures = [numbered(n) if n % 10 < 8 else numbered(n)[::2, ::2] for n in range(60)]
     frames = {"/front/image": pictures, "/rear/image": map(numbered, range(60))}
     bag = camera_bag(tmp_path / "drive", "mcap", frames, RATE)
@@ -165,7 +165,7 @@ def test_pictures_of_another_size_are_left_out_and_others_go_on(tmp_path):
     assert [line for line in reported if "pipeline" not in line] == [what]
 
 
-def test_a_bag_that_is_damaged_further_on_ends_its_camera_alone(tmp_path):
+def test_a_bag_that_is_damaged_further_on_ends_only_its_camera(tmp_path):
     whole = camera_bag(tmp_path / "drive", "ros1", {"/front/image": map(numbered, range(40))}, RATE)
     data = bytearray(whole.read_bytes())
     at = data.index(b"rgb8") if b"rgb8" in data else data.rindex(b"bgr8")

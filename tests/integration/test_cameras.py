@@ -120,7 +120,7 @@ def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
         (None, 0o600, "credentials FILE: no such file"),
     ],
 )
-def test_what_is_wrong_with_credentials_is_reported(credentials, text, mode, why):
+def test_problems_with_credentials_are_reported(credentials, text, mode, why):
     credentials.unlink()
     if text:
         credentials.write_text(text)

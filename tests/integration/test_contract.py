@@ -74,7 +74,7 @@ def applied(operator, name, **knobs):
     return operator.reach(fits)["cameras"][name]["applied"]
 
 
-def test_what_nobody_watches_is_kept_until_somebody_does(operator, vehicle):
+def test_settings_of_unwatched_cameras_are_kept_until_somebody_watches(operator, vehicle):
     operator.ask("1", event="mode_selected", mode="collective")
     reply = operator.ask("2", event="total_set", kbps=1200)
     assert reply["result"] == "applied"
@@ -134,7 +134,7 @@ def test_telemetry_counts_what_is_sent_of_watched_cameras_only(operator, vehicle
 
 
 @pytest.mark.parametrize("vehicle", ["recording"], indirect=True)
-def test_a_camera_that_is_damaged_for_good_starts_anew_once_a_second(operator, vehicle, broker):
+def test_a_camera_with_unrecovered_loss_sends_a_key_frame_at_most_once_a_second(operator, vehicle, broker):
     operator.ask("1", event="operator_connected")  # holds control from here on
     stranger = Operator(broker)
     stranger.ask("1", event="operator_connected")

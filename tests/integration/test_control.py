@@ -103,7 +103,7 @@ def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_
 
 @pytest.mark.soak  # reconnecting may take a second of it
 @pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
-def test_a_stalled_operator_is_back_at_once(broker, vehicle, ports, stall_s, tmp_path):
+def test_a_stalled_operator_is_back_immediately(broker, vehicle, ports, stall_s, tmp_path):
     assert waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path) < 1.5
 
 
@@ -125,7 +125,7 @@ def waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path):
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_request_that_comes_late_is_not_carried_out(broker, vehicle):
+def test_a_late_request_is_not_executed(broker, vehicle):
     operator = Operator(broker)
     operator.ask("1", event="mode_selected", mode="collective")
     operator.ask("2", event="total_set", kbps=1000)
@@ -232,7 +232,7 @@ def test_both_sides_wait_for_a_broker(stack):
 
 
 @pytest.mark.alone
-def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
+def test_the_control_link_recovers_after_the_broker_has_hung(tmp_path):
     """A broker that hangs accepts connections and answers nothing, like a link that is cut."""
     broker = Endpoint("127.0.0.1", free_port())
     file = tmp_path / "mosquitto.conf"
@@ -298,7 +298,7 @@ def station(broker):
     station.close()
 
 
-def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
+def test_invalid_messages_from_the_vehicle_end_no_operator(broker, vehicle, station):
     station, listener = station
     station.connect()
     until(lambda: station.state)
@@ -316,7 +316,7 @@ def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
     assert until(lambda: replies)[0].result == "applied"
 
 
-def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(broker, vehicle):
+def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
     Operator(broker).as_of()
     station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).vehicle(), {})
     listener = RecordingListener()
@@ -329,7 +329,7 @@ def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(br
         station.close()
 
 
-def test_sides_of_different_configuration_name_the_difference(broker, vehicle, ports):
+def test_differences_between_both_sides_configurations_are_reported(broker, vehicle, ports):
     with process("operator", *ROBOT, *ports, "fps_max=10", "duration_s=4") as operator:
         output, _ = operator.communicate(timeout=60)
     assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(output.split())
@@ -405,7 +405,7 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
     assert len(faults) == 4, replayed.stderr
 
 
-def test_no_message_is_queued_for_a_broker_that_is_away():
+def test_no_message_is_queued_while_the_broker_is_away():
     """After a reconnection only new messages are sent."""
     endpoint = Endpoint("127.0.0.1", free_port())
     messages, seen = [], []
@@ -455,7 +455,7 @@ class Stalling:
                 other.sendall(data)
 
 
-def test_what_is_repeated_does_not_wait_for_a_link_that_carries_nothing(broker, stack):
+def test_periodic_messages_are_not_queued_on_a_stalled_link(broker, stack):
     """Else it would take the first part of a second after an outage, when pictures should return."""
     seen = []
     link_there = Stalling(broker, stack)

@@ -79,7 +79,7 @@ def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
     assert sum(during.values()) > FRAMES  # the counting works
 
 
-def test_a_change_writes_what_differs_and_nothing_else(streaming, writes):
+def test_a_change_sets_only_what_differs(streaming, writes):
     side, vehicle = streaming
 
     def turned(knob, value):

@@ -139,7 +139,7 @@ def test_through_wireguard_nothing_is_fragmented(path, mtu, rtp, tmp_path):
     ids=["srt", "srt behind NAT", "wireguard"],
 )
 @pytest.mark.soak
-def test_a_vehicle_that_roams_is_back(heading, translated, change, tmp_path):
+def test_a_roaming_vehicle_reconnects(heading, translated, change, tmp_path):
     """Twice; ten times in tests/soak."""
     with mobile(translated) as network:
         site = Site(network.vehicle, network.operator, tmp_path)

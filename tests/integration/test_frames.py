@@ -59,7 +59,7 @@ def test_a_slow_program_gets_the_newest_and_ends_when_it_is_closed(robot):
     assert list(frames) == []
 
 
-def test_a_camera_that_is_off_is_not_connected_again_and_again(robot, monkeypatch):
+def test_a_camera_that_is_off_is_not_reconnected_repeatedly(robot, monkeypatch):
     monkeypatch.setattr("runner.operator.frames.RETRY_S", 1.0)
     side, overrides = robot
     side.turn([Command("mast", "sending", False)])

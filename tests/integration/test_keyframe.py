@@ -52,7 +52,7 @@ def test_a_grey_picture_starts_a_decoder_and_waves_make_it_exact(width, height, 
     assert (late[-10:] == whole[-10:]).all()
 
 
-def test_the_burst_of_a_late_viewer_is_exact_though_shorter_than_two_periods():
+def test_the_burst_for_a_late_viewer_is_exact_although_shorter_than_two_periods():
     recent, whole = RecentUnits(refresh_s=0.5), encoded(480, 260)
     pictures, _ = decoded(whole, 480, 260)
     lengths = []

@@ -155,7 +155,7 @@ def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
 
 
 @pytest.mark.alone
-def test_rtsp_over_tcp_waits_where_udp_is_dropped():
+def test_rtsp_over_tcp_is_queued_where_udp_is_dropped():
     with driving("relay", lambda t: 5000 if t < 1 else 1000, sent_kbps=2000, tcp=True) as drive:
         until(lambda: drive.lines[-1].t > 1)
         drive.settle()
@@ -169,7 +169,7 @@ def test_rtsp_over_tcp_waits_where_udp_is_dropped():
 
 @needs_root
 @pytest.mark.alone
-def test_two_viewers_share_the_total_though_one_has_a_narrow_link():
+def test_two_viewers_share_the_total_although_one_has_a_narrow_link():
     """Both copies leave the vehicle over one link; most packets of the second one are lost behind it."""
     with driving("netns", lambda t: 20_000, sent_kbps=1400) as drive:
         drive.settle()
@@ -214,7 +214,7 @@ def test_a_delay_is_added_to_the_wait(kind):
         assert drive.lines[-1].dropped == 0
 
 
-def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
+def test_lost_packets_are_retransmitted_through_the_relay(monkeypatch):
     from runner.gst.server import CameraServer, GstRtsp
 
     factory = CameraServer._factory
@@ -274,7 +274,7 @@ def test_queued_packets_do_not_block_their_sender():
 
 
 @needs_root
-def test_nothing_of_a_namespace_stays_behind():
+def test_a_namespace_is_removed_completely():
     before = _names()
     with limited_link("netns", WIDE, *_ends(), print) as one, limited_link("netns", WIDE, *_ends(), print) as two:
         names = [link.vehicle_command[-1] for link in (one, two)]
@@ -384,7 +384,7 @@ out.sendto(b"!" * 1000, (sys.argv[1], int(sys.argv[2])))
 
 
 @needs_root
-def test_both_ways_of_a_namespace_lose_and_delay_any_packet():
+def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
     """As the relay does with UDP. Half of the packets pass one way, and half of those come back."""
     lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=Reverse(lambda t: 5000, 200, 150, loss=0.5))
     with limited_link("netns", lossy, *_ends(), print) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:

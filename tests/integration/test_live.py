@@ -315,7 +315,7 @@ def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     assert {line["kbps"] for line in lines if line.get("event") == "bitrate_predicted"} <= {2500, 4500, 8000}
 
 
-def test_what_is_missing_is_one_line_and_status_1(broker, tmp_path):
+def test_missing_requirements_are_reported_in_one_line_with_status_1(broker, tmp_path):
     port = f"control.port={broker.port}"
     absent = run("vehicle", "source=v4l2", "cameras.front_left.device=/dev/video99", port, f"media.port={free_port()}")
     assert absent.returncode == 1

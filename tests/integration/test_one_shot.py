@@ -56,7 +56,7 @@ def fed_buffers():
         yield buffer
 
 
-def test_it_reads_what_the_binding_reads():
+def test_it_reads_the_same_as_the_binding():
     stated, read, both = [], [], threading.Event()
 
     def on_binding(_pad, info):
@@ -87,7 +87,7 @@ def test_it_reads_what_the_binding_reads():
     assert read[0][2:4] == (bytes(range(16)), bytes(range(32, 40)))  # there are no more bytes
 
 
-def test_looking_keeps_no_memory(playing):
+def test_sampling_leaks_no_memory(playing):
     pipeline, pad = playing
     looks = [0]
 
@@ -110,7 +110,7 @@ def test_looking_keeps_no_memory(playing):
     assert look(LOOKS) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
 
 
-def test_an_owner_that_is_gone_is_called_no_more(playing):
+def test_a_deleted_owner_is_no_longer_called(playing):
     pipeline, pad = playing
     seen = []
     shot = OneShot(pad, lambda _pad, _buffer: seen.append(1))

@@ -63,7 +63,7 @@ def receiving(plans):
         side.stop()
 
 
-def test_a_vehicle_that_starts_later_is_waited_for_in_silence():
+def test_waiting_for_a_vehicle_that_starts_later_is_silent():
     vehicle, plans = compiled()
     with receiving(plans) as (side, messages, more):
         end = time.monotonic() + 3
@@ -96,7 +96,7 @@ def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
     assert all(" works again after " in what for what in back)
 
 
-def test_packets_of_strangers_are_dropped_and_counted():
+def test_packets_of_other_senders_are_dropped_and_counted():
     vehicle, plans = compiled()
     with sending(vehicle, plans), receiving(plans) as (side, messages, more):
         more()
@@ -117,7 +117,7 @@ def test_packets_of_strangers_are_dropped_and_counted():
     assert messages == ["front, rear: packets from hosts other than the vehicle are dropped"]
 
 
-def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
+def test_an_unresponsive_server_is_retried_every_two_seconds():
     """Accepts connections and sends nothing, like a vehicle that hangs."""
     vehicle, plans = compiled()
     with socket.create_server((vehicle.media.host, vehicle.media.port)) as server:
@@ -131,7 +131,7 @@ def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
     assert connected[-1] - connected[0] < 3 * 2.0
 
 
-def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
+def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
     """Another viewer keeps the stream running, so that it does not begin with an IDR picture."""
     vehicle, plans = compiled("media.max_viewers=2")
     with sending(vehicle, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
@@ -147,7 +147,7 @@ def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
         until(lambda: side.sample(SENDING) and not receiver.is_damaged, every_s=0.1)
 
 
-def test_receivers_that_are_rebuilt_leave_nothing():
+def test_rebuilt_receivers_leak_nothing():
     """Python cannot free an object that holds a pad whose probe holds the object."""
     from runner.gst.repair import RepairBuffer
 
@@ -203,7 +203,7 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     assert f"front: {aside.HUNG}" in messages
 
 
-def test_work_that_hangs_in_gstreamer_s_thread_is_named(monkeypatch):
+def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
     from runner import apply
 
     monkeypatch.setattr(apply, "CALL_S", 0.2)

@@ -260,7 +260,7 @@ def test_nothing_is_overwritten(tmp_path):
     assert all((tmp_path / name).read_text() == "mine" for name in names)
 
 
-def test_a_name_that_is_taken_meanwhile_stays_as_it_is(tmp_path):
+def test_a_file_created_meanwhile_is_not_overwritten(tmp_path):
     recordings.claim_files(tmp_path, ["rear"])["rear"].write_text("new")
     (tmp_path / "rear.mkv").write_text("old")
     with pytest.raises(RunError, match=r"rear.mkv was created meanwhile; the recording is .*/\.rear\.mkv\.part"):

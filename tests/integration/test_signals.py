@@ -60,7 +60,7 @@ def test_a_signal_interrupts_the_main_thread(number: signal.Signals) -> None:
     assert ended(child)[:2] == (128 + number, "")
 
 
-def test_a_library_that_makes_another_error_of_it_changes_nothing() -> None:
+def test_a_library_that_converts_the_exception_changes_nothing() -> None:
     child = started(
         """\
         ready()
