@@ -64,7 +64,7 @@ class Mounted:
 
     @property
     def optics(self) -> dict[str, Any]:
-        """As the page is told of it."""
+        """As sent to the page."""
         native = {"width": self.native[0], "height": self.native[1], "left": 0, "top": self.top}
         return {"pose": asdict(self.pose), "fov_deg": self.fov_deg, "lens": self.lens, "native": native}
 

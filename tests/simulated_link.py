@@ -1,4 +1,4 @@
-"""Cameras, a link and reports of what arrives, simulated: the estimator and the cap in a closed loop."""
+"""Simulates cameras, a link and reception reports: the estimator and the cap in a closed loop."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PACKET = 1200  # bytes
 
 @dataclass(repr=False)
 class Link:
-    """A link with a queue that drops what would wait too long.
+    """A link with a queue that drops packets that would wait too long.
 
     kbps     capacity
-    delay_s  further delay of what is sent then, both ways; packets stay in order
+    delay_s  additional delay of packets sent at that time, in each direction; packets stay in order
     queue_s  longest wait
     """
 
@@ -36,13 +36,13 @@ class Link:
 
 
 class Queue:
-    """The queue in front of a link: when the last bit of what it has taken leaves."""
+    """The queue in front of a link; `free` is when the last queued bit has left."""
 
     def __init__(self, link: Link, free: float) -> None:
         self._link, self.free = link, free
 
     def put(self, t: float, size: int) -> float | None:
-        """When that many bytes have left; None: dropped."""
+        """When `size` bytes have left; None: dropped."""
         if self.free - t > self._link.queue_s:
             return None
         self.free = _sent(self._link, max(t, self.free), size)
@@ -50,7 +50,7 @@ class Queue:
 
 
 class Tcp:
-    """A TCP flow: one packet more per round trip, 0.7 of the window after a loss (RFC 9438)."""
+    """A TCP flow: the window grows by one packet per round trip, and shrinks to 0.7 on loss (RFC 9438)."""
 
     PACKET = 1500
 
@@ -70,7 +70,7 @@ class Tcp:
                 self._window, self._reduced = max(2.0, 0.7 * self._window), t
 
     def send(self, t: float, queue: Queue) -> Iterator[tuple[float, str]]:
-        """As much as the window allows: when the sender learns what became of each packet."""
+        """Send as much as the window allows; yields when the sender learns the fate of each packet."""
         while t < self._until and self._flying < self._window:
             self._flying += 1
             left = queue.put(t, self.PACKET)
@@ -79,7 +79,7 @@ class Tcp:
 
 @dataclass(repr=False)
 class Drive:
-    """What a simulated drive did: (t, cap in kbit/s, state), waits in the queue, bytes that arrived, t of losses."""
+    """Result of a simulated drive: (t, cap in kbit/s, state), queueing delays, received bytes, t of losses."""
 
     caps: list[tuple[float, float, str]] = field(default_factory=list)
     waits: list[tuple[float, float]] = field(default_factory=list)
@@ -102,7 +102,7 @@ class Drive:
         return min(cap for t, cap, _ in self.caps if begin <= t < end)
 
     def first(self, since: float, wanted: Callable[[float], bool]) -> float:
-        """s from a time until the cap fulfils a condition."""
+        """Time until the cap fulfils a condition, s."""
         return next(t for t, cap, _ in self.caps if t >= since and wanted(cap)) - since
 
 
@@ -199,7 +199,7 @@ def drive(
 
 
 def _passed(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:
-    """When packets of a frame have left that are neither dropped nor lost, and how many are."""
+    """When the surviving packets of a frame have left, and how many are dropped or lost."""
     left = [queue.put(t, min(PACKET, size - begin)) for begin in range(0, size, PACKET)]
     came = [at for at in left if at is not None and not is_lost()]
     return came, len(left) - len(came)
@@ -229,7 +229,7 @@ def _sent(link: Link, t: float, size: int) -> float:
 
 
 def steps(*values: tuple[float, float]) -> Profile:
-    """A profile that has each value from its time on."""
+    """A step profile: each value applies from its time on."""
 
     def value(t: float) -> float:
         return [v for begin, v in values if begin <= t or begin == values[0][0]][-1]
@@ -238,7 +238,7 @@ def steps(*values: tuple[float, float]) -> Profile:
 
 
 def stalls(*spans: tuple[float, float]) -> Profile:
-    """Delay of a link that stands still for spans of time and then delivers all at once."""
+    """Delay of a link that stalls for spans of time and then delivers everything in a burst."""
 
     def delay(t: float) -> float:
         return next((end - t for begin, end in spans if begin <= t < end), 0.0)
@@ -247,7 +247,7 @@ def stalls(*spans: tuple[float, float]) -> Profile:
 
 
 def jitter(every_s: float, long_s: float, ms: float, seed: int = 3, until: float = 60.0) -> Profile:
-    """Delays that come and go, with these means: time between two, length, and size."""
+    """Temporary delays with these means: interval, duration and size."""
     chance, spans, t = random.Random(seed), [], 1.0
     while t < until:
         t += chance.expovariate(1 / every_s)
@@ -280,7 +280,7 @@ def busy(share: float, mean_s: float, ms: float, seed: int = 1) -> Callable[[int
 
 
 def utilisation(done: Drive, link: Link, limit: Profile, begin: float, end: float) -> float:
-    """Received over what the link and the limit allowed."""
+    """Received bytes as a share of those that link and limit allowed."""
     allowed = [min(link.kbps(t), limit(t)) for t in _times(begin, end)]
     return done.kbps(begin, end) / (sum(allowed) / len(allowed))
 

@@ -20,7 +20,7 @@ Delays = Callable[[], tuple[float, float]]  # s, there and back
 def compared(
     seconds: float, delays: Delays, ahead: Callable[[float], float]
 ) -> Iterator[tuple[float, ClockDifference, float]]:
-    """At each exchange of a simulated link: time, what is known of the difference, and the truth, s."""
+    """At each exchange over a simulated link: time, estimated difference and true difference, s."""
     clocks = ClockComparison()
     for number in count():
         t = number * EVERY_S
@@ -77,7 +77,7 @@ def test_a_step_smaller_than_the_round_trip_is_followed_if_the_machine_reports_i
         t, ahead = number * EVERY_S, 0.0 if number < 50 else 0.058
         clocks.add(t + 0.06, Exchange(t, t + 0.03 + ahead, t + 0.03 + ahead, t + 0.06, (7.0, 9.0 + ahead)))
         known = clocks.difference(t + 0.06)
-        if number != 50:  # then nothing is known
+        if number != 50:  # then the difference is unknown
             assert known
             assert abs(known.ahead_s - ahead) <= known.bound_s
     assert known
@@ -125,7 +125,7 @@ def test_kernels_that_contradict_the_messages_are_not_believed() -> None:
 
 @pytest.mark.parametrize(("answered", "returned"), [(100.03, 99.0), (5000.0, 100.06)])
 def test_an_answer_sent_after_its_arrival_is_rejected(answered: float, returned: float) -> None:
-    """This machine's clock was set back meanwhile, or the other states a wrong time."""
+    """This machine's clock was set back meanwhile, or the peer states a wrong time."""
     clocks = ClockComparison()
     with pytest.raises(ValueError, match="answered after the answer arrived"):
         clocks.add(0.0, Exchange(100.0, 100.03, answered, returned))

@@ -28,10 +28,10 @@ def stream(text: str, lost: str) -> list[tuple[bytes, bool]]:
     ("text", "lost", "expected"),
     [
         ("k...w...w...", "            ", "------------"),
-        ("k...k...", " x      ", "-DDD----"),  # an IDR picture heals at once
+        ("k...k...", " x      ", "-DDD----"),  # an IDR picture heals immediately
         ("k...w...w...", " x          ", "-DDDDDD-----"),  # a wave heals with its last picture
-        ("k...w...w...", "    x       ", "----DDDDDDD-"),  # one that has lost its beginning does not
-        ("k...w...w...", " x   x      ", "-DDDDDDDDDD-"),  # nor one with a loss in it
+        ("k...w...w...", "    x       ", "----DDDDDDD-"),  # a wave whose beginning is lost does not
+        ("k...w...w...", " x   x      ", "-DDDDDDDDDD-"),  # nor does a wave with a loss
         ("k...w...w...", " x        x ", "-DDDDDD---DD"),
         ("k...", "x   ", "DDDD"),  # packets of the IDR picture itself are missing
     ],
@@ -45,7 +45,7 @@ def test_for_unsupported_codecs_only_incomplete_units_count_as_damaged() -> None
 
 
 def test_a_shorter_wave_that_begins_later_heals_first() -> None:
-    """And one of a negative length, from bytes that are no recovery point, does not count."""
+    """A wave of negative length, parsed from bytes that are no recovery point, does not count."""
     wave_of_100 = AUD + SPS + PPS + SEI + bytes.fromhex("06030191") + b"\x80" + SLICE + b"\x9a"
     wrong = AUD + SPS + PPS + SEI + bytes.fromhex("060100") + SLICE + b"\x9a"
     units = [(DELTA, True), (wave_of_100, False), (DELTA, False), (WAVE_OF_4, False), *[(DELTA, False)] * 4]

@@ -89,7 +89,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, there: bool) -> None:
         (place / "mine").write_text("mine\n")
 
     def small_files() -> None:
-        """A limit that the small files keep and a schema exceeds."""
+        """A file size limit that only a schema exceeds."""
         resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
 
     result = process("init", str(place), preexec_fn=small_files, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
@@ -119,7 +119,7 @@ def test_validate_reports_editor_schemas_of_another_version(tod: Command, fleet:
         err == f"{fleet}/{FOLDER}: version 0.0.1, this is tod-runner {own}; your editor may know other keys: {again}\n"
     )
     subprocess.run(["rm", "-r", fleet / FOLDER], check=True)
-    assert tod("validate", f"conf={fleet}").err == ""  # no copies, nothing to be wrong
+    assert tod("validate", f"conf={fleet}").err == ""  # no copies, nothing to report
     assert tod("init", str(fleet), "files=schemas").status == 0
     assert tod("validate", f"conf={fleet}").err == ""
 

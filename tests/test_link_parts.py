@@ -69,7 +69,7 @@ def test_a_full_queue_drops_and_reports_its_length():
     for index in range(20):
         bucket.put(1000, index, 0.0)
     counters = bucket.counters(0.0)
-    assert (counters.packets, counters.dropped) == (3, 7)  # 3000 bytes at once, 10 000 wait
+    assert (counters.packets, counters.dropped) == (3, 7)  # 3000 bytes pass immediately, 10 000 wait
     assert counters.queue_ms == pytest.approx(100)
     bucket.put(1000, 20, 0.0, keep=True)
     assert bucket.counters(0.0).dropped == 7

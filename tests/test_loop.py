@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow  # seconds of real time
 
 
 class Watched:
-    """A loop, and what it published and reported. `publishes` is its answer."""
+    """A loop with its published records and reports. `publishes` is the result of `publish`."""
 
     def __init__(self, *words: str) -> None:
         config = configuration(["vehicle=delivery_robot", "pqos=constant", *words], runnable=False)
@@ -57,7 +57,7 @@ class Watched:
             thread.join(10)
 
     def breathe(self, seconds: float, name: str = "driver") -> float:
-        """Signs of life of an operator. Returns the longest time between two, s: it is longer on a busy machine."""
+        """Send heartbeats of an operator. Returns the longest time between two, s, which grows on a busy machine."""
         longest, last = 0.0, time.monotonic()
         end = last + seconds
         while time.monotonic() < end:
@@ -131,13 +131,13 @@ def test_a_state_that_has_to_wait_is_published_later() -> None:
 
 
 def test_operators_stay_present_after_the_loop_itself_has_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their messages of that time were waiting."""
-    while (silent_s := _stand_still(monkeypatch)) > SILENT_S / 2:  # this process did: the operator was silent indeed
+    """Their messages were queued meanwhile."""
+    while (silent_s := _stand_still(monkeypatch)) > SILENT_S / 2:  # this process stalled: it really was silent
         assert silent_s < 20
 
 
 def _stand_still(monkeypatch: pytest.MonkeyPatch) -> float:
-    """Returns for how long the operator was silent, s."""
+    """Returns how long the operator was silent, s."""
     watched = Watched()
     turn, stood = watched.side.turn, threading.Event()
 
@@ -199,6 +199,6 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
         until(lambda: attention() is UNSET)
         states("other", attention="watching")
         until(lambda: attention() == "watching")
-    told = [report for report in watched.reports if report.startswith("operator driver is ")]
+    states = [report for report in watched.reports if report.startswith("operator driver is ")]
     expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
-    assert told == [f"operator driver is {what}" for what in expected]
+    assert states == [f"operator driver is {what}" for what in expected]

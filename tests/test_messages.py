@@ -13,7 +13,7 @@ from runner.mqtt.messages import MAX_REQUEST_BYTES, read_message
 
 
 def padded(size: int) -> bytes:
-    """A request of that many bytes."""
+    """A request of `size` bytes."""
     bare = json.dumps({"id": "1", "event": ""}).encode()
     return bare.replace(b'""', b'"' + b"x" * (size - len(bare)) + b'"')
 

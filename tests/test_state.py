@@ -107,7 +107,7 @@ def test_refused(mode: str, event: str, keys: dict[str, Any], reason: str) -> No
     assert after.refused == reason
     assert after.commands == ()
     assert after.decision == before.decision
-    assert after.state.t == 2  # time passes for a refused event as well
+    assert after.state.t == 2  # a refused event advances the time, too
     drive.accept("clock_advanced", t=2)
     assert drive.run.state == after.state
 

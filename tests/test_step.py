@@ -383,10 +383,10 @@ def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
 
 
 def test_rules_may_read_the_attention_of_the_person_who_drives() -> None:
-    """It is that of one operator, and unknown once another is in control, or none."""
+    """It belongs to one operator, and is unknown once control passes or nobody is in control."""
     drive = predicted(3000)
     drive.accept("operator_connected", attention="watching")
-    assert drive.run.state.attention is None  # the vehicle states it by an event of its own
+    assert drive.run.state.attention is None  # the vehicle sends a separate event for it
     for event, keys in (
         ("control_passed", {"operator": "bob"}),
         ("operator_disconnected", {}),

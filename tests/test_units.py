@@ -35,7 +35,7 @@ def test_an_incomplete_picture_is_dropped_and_an_incomplete_idr_becomes_grey():
     assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
     assert (
         read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None
-    )  # without a parameter set no grey picture can be made
+    )  # a grey picture needs a parameter set
     grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
     assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
     assert read_unit(grey.data, None, 0).key
@@ -84,7 +84,7 @@ def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods
     assert [u.arrived for u in shown if u.exact] == [tenth / 10 for tenth in range(21, 30)]
     first, second, *_ = recent.burst()
     assert (first.key, first.exact, read_unit(first.data, None, 0).key) == (True, False, True)
-    assert second.arrived == 0.9  # the burst holds only what the newest needs
+    assert second.arrived == 0.9  # the burst has only the units that the newest needs
     assert recent.add(unit(3, key=True)).exact
     assert recent.add(unit(3.1)).exact
 
@@ -155,7 +155,7 @@ def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, r
         assert burst[-1] is everything[-1]
         assert not any(u.key for u in burst[1:])
         assert all(u.arrived >= now - 2 * refresh_s for u in burst[1:])
-        # Only what lies between the IDR and the last two periods is missing.
+        # Only the units between the IDR and the last two periods are missing.
         since = everything[everything.index(burst[0]) + 1 :]
         assert burst[1:] == [u for u in since if u.arrived >= now - 2 * refresh_s]
 

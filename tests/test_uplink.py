@@ -50,7 +50,7 @@ def test_a_prediction_that_is_too_high_fills_no_queue() -> None:
 
 @pytest.mark.parametrize("fps", [15, 30])
 def test_a_queue_that_was_full_before_the_first_picture_is_seen_by_its_losses(fps: float) -> None:
-    """As where all cameras begin with a key frame: its delay is taken for the path's."""
+    """As if all cameras start with a key frame: its delay is mistaken for the path's."""
     link = Link(steps((0, 2300)), queue_s=0.2)
     done = drive(link, steps((0, 3100)), 20, fps=fps, queued_s=0.2)
     assert done.wait_ms(0.95, since=4) <= 100
@@ -72,7 +72,7 @@ def test_a_start_at_half_of_a_right_prediction_is_over_within_a_second(fps: floa
 
 
 def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
-    """The first pictures come 220 ms late, of one camera until others show that the path is shorter."""
+    """The first pictures are 220 ms late; other cameras then show that the path is shorter."""
     uplink, shown = UplinkMemory(), []
     for number in range(40):
         captured = number / 15
@@ -89,7 +89,7 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
 
 
 def test_the_rest_of_a_frame_in_a_later_report_is_no_clock_step() -> None:
-    """Rounded times make it seem older than its first part."""
+    """With rounded times it seems older than its first part."""
     uplink = UplinkMemory()
     for number in range(30):
         captured, queue = number / 15, 0.0 if number < 20 else 0.1
@@ -132,7 +132,7 @@ def test_random_loss_does_not_cut() -> None:
 
 
 def test_a_longer_path_is_not_mistaken_for_a_queue() -> None:
-    """A handover adds 60 ms for good."""
+    """A handover adds 60 ms permanently."""
     done = drive(Link(steps((0, 4000)), lambda t: 0.06 if t >= 5 else 0.0), steps((0, RIGHT)), 15)
     assert done.lowest(5, 15) >= 0.4 * RIGHT
     assert done.lowest(9, 15) >= 0.9 * RIGHT
@@ -163,7 +163,7 @@ def test_the_jitter_of_a_recorded_5g_link_does_not_reduce_the_rate(limit: float)
 def test_frames_that_a_busy_machine_sends_late_do_not_starve_the_video(
     share: float, ms: float, least: float, limit: float
 ) -> None:
-    """Each is late on its own; the queue of a link would delay all that follow. It once left 2 % of the link."""
+    """Each is late independently; a queue would delay all following ones. This once left 2 % of the link."""
     link, total = Link(steps((0, 4000))), steps((0, limit))
     done = drive(link, total, 30, cameras=3, fps=15, late=busy(share, 0.5, ms))
     assert utilisation(done, link, total, 5, 29) >= least
@@ -193,7 +193,7 @@ def test_a_large_drop_of_the_link_is_not_mistaken_for_competing_traffic(kbps: fl
 
 
 def test_after_a_stall_the_rate_is_restored_only_up_to_the_new_capacity() -> None:
-    """As in another cell: half of what arrived before would fill the queue again."""
+    """As in another cell: half of the earlier rate would fill the queue again."""
     link = Link(steps((0, 8000), (20, 800)), delay_s=stalls((20, 22.4)), one_way_s=0.02, queue_s=0.5)
     done = drive(link, steps((0, 8000)), 34, fps=15)
     assert max(cap for t, cap, _ in done.caps if t > 23) <= 1200
@@ -218,7 +218,7 @@ def test_cameras_and_a_tcp_flow_share_the_link(fps: float) -> None:
 
 
 def laps(t: float) -> PositionReported:
-    """500 m northwards at 10 m/s, again and again."""
+    """500 m northwards at 10 m/s, repeatedly."""
     return PositionReported(t=t, lat=48 + 10 * t % 500 / METRES_PER_DEGREE, lon=11)
 
 
@@ -255,14 +255,14 @@ def test_trust_falls_when_the_vehicle_reaches_a_place_and_recovers_while_it_stay
 
 
 def test_trust_falls_at_a_place_even_while_recovering() -> None:
-    """After time in which nothing was measured."""
+    """After a period without measurements."""
     trust = update_trust(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1, 0.3])
 def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_s: float) -> None:
-    """As where a prediction steps with the link, and arrives with the measurement of the step or just after the cut."""
+    """A prediction that steps with the link arrives with the measurement of the step or just after the cut."""
     falls = [(8 * i + 5.0, 8 * i + 7.0) for i in range(6)]
     link = Link(lambda t: 400 if any(a <= t < b for a, b in falls) else 4000)
     done = drive(link, lambda t: 0.9 * link.kbps(t - late_s), 50, fps=15)
@@ -316,7 +316,7 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
         )
         cap = update_cap(cap, link, t, Fraction(limit))
         assert cap.kbps is None or cap.kbps >= LEAST
-        for _ in range(3):  # and time in which no report arrives
+        for _ in range(3):  # periods without a report
             t += passed / 3
             cap = update_cap(cap, link, t, Fraction(limit))
     for _ in range(500):

@@ -1,4 +1,4 @@
-"""Shared by the tests of the operator's page: a browser's page, and what it shows."""
+"""Shared by the tests of the operator's page: a browser page and its contents."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def measure(page):
 
 
 def all_live(page, seconds=rig.WAIT_S):
-    """Every camera has been live at some time; on a busy machine hardly ever all at the same moment."""
+    """Every camera has been live at some time; on a busy machine rarely all at the same time."""
     waiting = set(measure(page))
 
     def seen():

@@ -1,4 +1,4 @@
-"""Keys of everybody for the parts, where the environment asks for them by KEYS=1."""
+"""Keys for all parties, if requested in the environment by KEYS=1."""
 
 from __future__ import annotations
 

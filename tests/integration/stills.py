@@ -35,7 +35,7 @@ image = pytest.importorskip("PIL.Image")
 pytest.importorskip("cv2")
 pytest.importorskip("numba")
 
-FPS = 1  # as the page knows it; pictures come more often, so that none is late on a busy machine
+FPS = 1  # configured; pictures are sent more often, so that none is late on a busy machine
 EVERY_S = 0.4
 
 

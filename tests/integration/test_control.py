@@ -1,4 +1,4 @@
-"""The control link under operators that stall, brokers that vanish, floods, garbage, and rules that fail."""
+"""The control link with stalled operators, vanishing brokers, floods, invalid messages and failing rules."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def stack():
 
 
 class Present:
-    """An operator that sends signs of life until it leaves."""
+    """An operator that sends heartbeats until it leaves."""
 
     def __init__(self, broker, stack, name=""):
         self.operator = Operator(broker, name=name)
@@ -101,21 +101,21 @@ def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_
     waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path)
 
 
-@pytest.mark.soak  # reconnecting may take a second of it
+@pytest.mark.soak  # up to a second of it is for reconnecting
 @pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
 def test_a_stalled_operator_is_back_immediately(broker, vehicle, ports, stall_s, tmp_path):
     assert waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path) < 1.5
 
 
 def waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path):
-    """s from its waking until the vehicle sends again."""
+    """Time from its wake-up until the vehicle sends again, s."""
     onlooker = Operator(broker)
     with process("operator", *ROBOT, *ports, stdout=subprocess.DEVNULL) as operator:
         onlooker.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
         until(lambda: any("is present" in note for note in notes(tmp_path)))
         operator.send_signal(signal.SIGSTOP)
         onlooker.state(paused)
-        time.sleep(stall_s - 2.1)  # gone after 1 s, paused after another one
+        time.sleep(stall_s - 2.1)  # offline after 1 s, paused after another one
         operator.send_signal(signal.SIGCONT)
         woken = time.monotonic()
         onlooker.state(sending)
@@ -205,7 +205,7 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
         assert int(flood.communicate()[0]) > 20_000
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
     assert sorted(waits)[len(waits) * 9 // 10] < 0.2
-    assert max(waits) < 1  # while the flood begins, everything on the machine waits
+    assert max(waits) < 1  # when the flood begins, everything on the machine is delayed
     assert until(lambda: good.telemetry[-1]["refused"]) > 10_000
 
 
@@ -428,7 +428,7 @@ def test_no_message_is_queued_while_the_broker_is_away():
 
 
 class Stalling:
-    """Passes one connection on to a broker, with little room to hold what it has not passed on."""
+    """Forwards one connection to a broker, with a small buffer."""
 
     def __init__(self, broker, stack):
         self.endpoint, self.carries = Endpoint("127.0.0.1", free_port()), threading.Event()
@@ -456,7 +456,7 @@ class Stalling:
 
 
 def test_periodic_messages_are_not_queued_on_a_stalled_link(broker, stack):
-    """Else it would take the first part of a second after an outage, when pictures should return."""
+    """Otherwise old messages would fill the link right after an outage, when pictures should return."""
     seen = []
     link_there = Stalling(broker, stack)
     own = {topic("x", "request", "+"): lambda message: None}

@@ -40,15 +40,15 @@ image = pytest.importorskip("PIL.Image")
 ROUNDS = int(os.environ.get("TOD_TASK_ROUNDS", "20"))
 YAWS = {"front": 0, "left": 55, "right": -55, "rear": 180}
 FULL_KBPS, TOTAL_KBPS = 800, 1600
-REPEATED_S = 1  # from then on a repeated picture is a fault
-LOST_MS = 1000  # without a picture for so long a camera is lost: status.js
-MORE_MS = 200  # than late_ms may pass from a cause to its mark
+REPEATED_S = 1  # a picture repeated for this long is a fault
+LOST_MS = 1000  # without a picture for this long a camera counts as lost: status.js
+MORE_MS = 200  # that may pass from a cause to its mark in addition to late_ms
 WIDE, STOPPED, QUEUE_MS = 50_000, 20, 60_000  # kbit/s of the link, and how long packets may wait for it
 RED, AMBER = (224, 27, 36), (255, 176, 0)  # of the marks: overlay.js
 
 
 class Drive:
-    """A vehicle whose cameras fail when told to, and the link between it and an operator's page."""
+    """A vehicle whose cameras fail on command, and the link between it and an operator's page."""
 
     def __init__(self, url, vehicle, fed, shaper):
         self.url, self.vehicle, self._fed, self._shaper = url, vehicle, fed, shaper
@@ -65,7 +65,7 @@ class Drive:
         return self._shaper.limit(Rates(kbps, None))
 
     def stall(self, stopped_ms, then_kbps):
-        """Stop the link for a while; then what has queued up lasts, if it carries little more than is sent."""
+        """Stop the link for a while; if it then carries only slightly more than is sent, the queue lasts."""
         began = 1000 * time.time()
         self.limit(STOPPED)
         time.sleep(max(0.0, (began + stopped_ms) / 1000 - time.time()))
@@ -161,7 +161,7 @@ def driver(request, page, drive):
 
 @pytest.fixture
 def typist(page, drive):
-    """Whoever drives with the keyboard: what buttons do is up to the configuration."""
+    """For a driver with a keyboard: the functions of buttons depend on the configuration."""
     return Driver(page, drive.vehicle.inputs, "keys")
 
 
@@ -178,7 +178,7 @@ def selected(page):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_look_aside(driver, page, side):
-    """One press selects the picture beside the front camera's, another makes it the large one."""
+    """One press selects the picture next to the front camera's, another enlarges it."""
     front, aside = box(page, "front"), box(page, side)
     assert (aside["x"] < front["x"]) == (side == "left")
     assert aside["height"] > 0.4 * page.viewport_size["height"]
@@ -244,7 +244,7 @@ def test_open_the_map_in_the_drawer(typist, page):
 
 
 def test_take_control_back_from_another_page(typist, page, chromium, drive):
-    """It asks first: who drives may sit there."""
+    """It asks for confirmation: the driver may be using the other page."""
     with opened(chromium, drive.url) as other:
         take_control(other)
         until(lambda: page.evaluate("tod.control") == "another")
@@ -285,7 +285,7 @@ def marked_ms(page, camera, wanted, cause_ms):
 
 
 def settled(page):
-    """Wait until all pictures have been live for a while, and then for any part of a frame interval."""
+    """Wait until all pictures have been live for a while, plus a random part of a frame interval."""
 
     def is_settled():
         quiet = all(not marks(page, name, 1000 * time.time() - 700) for name in YAWS)
@@ -323,7 +323,7 @@ def test_notice_a_frozen_rear_view(page, drive):
 
 
 def test_notice_a_lost_front_view(page, drive):
-    """It is marked as frozen first, and as lost once it has been gone for as long as that means."""
+    """It is first marked as frozen, later as lost."""
     frozen, lost = [], []
     for number in range(ROUNDS):
         settled(page)
@@ -352,7 +352,7 @@ def test_notice_a_picture_that_is_repeated_as_new(page, drive):
 
 
 def test_notice_a_late_picture(page, drive):
-    """The link stops for little longer than a picture may take, and then carries little more than is sent."""
+    """The link stops for slightly longer than the latency limit, and then carries slightly more than is sent."""
     sent, late_ms = drive.sent_kbps(), drive.vehicle.page.late_ms
     assert sent > 0.5 * TOTAL_KBPS, "what is sent is less than what a full queue lasts for"
     drive.stall(2 * late_ms, 1.05 * sent)

@@ -65,7 +65,7 @@ def test_a_camera_that_is_off_is_not_reconnected_repeatedly(robot, monkeypatch):
     side.turn([Command("mast", "sending", False)])
     reports = []
     with live_frames(overrides, cameras=["mast"], report=lambda *what: reports.append(what)) as frames:
-        time.sleep(4)  # it would have been rebuilt after 2 s
+        time.sleep(4)  # long enough for a rebuild, after 2 s
         assert reports == []
         side.turn([Command("mast", "sending", True)])
         assert until(frames.next).camera == "mast"

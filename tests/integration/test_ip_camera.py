@@ -74,7 +74,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
         time.sleep(frozen_s - 1)
         frozen = counts()
         camera.send_signal(signal.SIGCONT)
-        until(lambda: not side.sources(), seconds=12)  # 10 s between two attempts, at most
+        until(lambda: not side.sources(), seconds=12)  # at most 10 s between two attempts
         until(lambda: all(now > then + 10 for now, then in zip(counts(), frozen, strict=True)))
         assert client.errors == []
         messages = [line.removeprefix("rear: ") for line in reported]

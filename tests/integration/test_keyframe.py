@@ -77,7 +77,7 @@ def test_data_without_a_parameter_set_makes_no_picture():
 
 @pytest.mark.parametrize("lost", [[13], [3, 17], [10, 11, 12]])
 def test_a_picture_that_is_not_marked_as_damaged_is_exact(lost):
-    """However a decoder conceals what is missing."""
+    """Whatever the error concealment of a decoder."""
     units = encoded(480, 260)
     whole, _ = decoded(units, 480, 260)
     came = [number for number in range(len(units)) if number not in lost]

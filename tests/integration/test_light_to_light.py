@@ -1,4 +1,4 @@
-"""Glass-to-glass latency, read by the page from the picture of a counter, agrees with what the page states."""
+"""Glass-to-glass latency, read by the page from the picture of a counter, agrees with the reported latency."""
 
 import re
 import shutil

@@ -115,7 +115,7 @@ def test_the_loss_of_the_end_of_a_frame_is_detected_before_the_next_frame(monkey
             return Gst.PadProbeReturn.DROP
 
     monkeypatch.setattr("runner.apply.Receiver", Lossy)
-    if not by_time:  # as if only later packets showed what is missing
+    if not by_time:  # as if only later packets revealed the loss
         monkeypatch.setattr(repair.RepairBuffer, "request_tail", lambda self: None)
     with streaming("fps_max=3") as (side, _, plans, _):
         knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}

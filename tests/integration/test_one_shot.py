@@ -1,4 +1,4 @@
-"""Looking at a buffer now and then: what is read is what GStreamer's own binding reads, and no memory is kept."""
+"""Sampling single buffers: the values are those of GStreamer's own binding, and no memory leaks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runner.gst import GLib, Gst
 from runner.gst.one_shot import OneShot
 from runner.plans import compile_plans
 
-LOOKS = 20_000
+SAMPLES = 20_000
 STAMPED = 3_900_000_000 * Gst.SECOND
 FED = "appsrc name=fed format=time ! identity name=seen ! fakesink sync=false"
 MADE = "videotestsrc ! video/x-raw,width=40,height=30 ! identity name=seen ! fakesink sync=false"
@@ -106,8 +106,8 @@ def test_sampling_leaks_no_memory(playing):
         until(looked, every_s=0)
         return resident_kb()
 
-    begun = look(LOOKS // 4)
-    assert look(LOOKS) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
+    begun = look(SAMPLES // 4)
+    assert look(SAMPLES) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
 
 
 def test_a_deleted_owner_is_no_longer_called(playing):

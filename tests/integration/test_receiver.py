@@ -1,4 +1,4 @@
-"""The operator's receivers: a vehicle that starts late or goes away, strangers, a link that is cut."""
+"""The operator's receivers: a vehicle that starts late or disappears, other senders, a link that is cut."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
         more()
         assert side.sample(SENDING)["front"].damaged == 0
         receiver = side._receivers["front"]
-        side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+        side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
         more()
         until(lambda: side.sample(SENDING)["front"].damaged > 0 or not receiver.is_damaged, every_s=0.1)
         seen = side.sample(SENDING)["front"]
@@ -160,7 +160,7 @@ def test_rebuilt_receivers_leak_nothing():
         more()
         before, receiver = buffers(), side._receivers["front"]
         for number in range(1, 4):
-            side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+            side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
             until(lambda n=number: side.sample(SENDING)["front"].rebuilt == n, every_s=0.1)
             more()
         until(lambda: buffers() == before, every_s=0.2)

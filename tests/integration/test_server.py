@@ -24,7 +24,7 @@ OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only used to find the route
 
 
 class Vehicle:
-    """Some streaming cameras, and what the tests do with them."""
+    """Several streaming cameras, and helpers of the tests."""
 
     def __init__(self, side, vehicle, reported):
         self.side, self.reported = side, reported
@@ -106,7 +106,7 @@ def test_a_url_that_is_not_text_is_rejected_without_a_traceback(line, capfd):
 
 @pytest.mark.parametrize("pauses", [3, pytest.param(20, marks=pytest.mark.soak)])
 def test_no_packet_is_lost_after_a_pause(pauses):
-    """Over UDP and TCP at once: queues stand between the stream and its sinks. Each frame has several packets."""
+    """With UDP and TCP together there are queues between the stream and its sinks. Each frame has several packets."""
     with serving() as vehicle, watched(vehicle) as over_udp, watched(vehicle, udp=False) as over_tcp:
         vehicle.turn(bitrate=4000)
         for _ in range(pauses):
@@ -162,7 +162,7 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
         until(lambda: vehicle.side.push(CAMERA, frame))
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [200, 200, 200]
-        assert vehicle.pipelines() == 1  # the one that the first client asked for
+        assert vehicle.pipelines() == 1  # the one requested by the first client
 
 
 def test_a_camera_can_be_reopened_immediately():
@@ -479,7 +479,7 @@ def test_a_pipeline_that_fails_with_viewers_is_torn_down_and_rebuilt(capfd):
             with one, other, idle:
                 assert idle.ask("DESCRIBE") == 200
                 assert one.open() == [200, 200, 200]
-                other.open(udp=True)  # it may come too late
+                other.open(udp=True)  # may be too late
                 until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
             assert vehicle.pipelines(SMALL_CAMERA) == number
         assert any("Failed after iterations" in report for report in vehicle.reported)

@@ -197,11 +197,11 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
 
 def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both):
     """None before that clock is compared with the vehicle's, and none of the future."""
-    heard = []
+    received = []
 
     class Steered(Listener):
         def on_steering(self, at, rad):
-            heard.append((at, rad))
+            received.append((at, rad))
 
     station, vehicle, _ = both
     station.listeners.append(Steered())
@@ -211,8 +211,8 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     at = time.time()
     vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
     vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
-    until(lambda: heard)
-    assert heard == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
+    until(lambda: received)
+    assert received == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
 
 
 def test_the_heartbeat_states_the_drivers_attention(both):
@@ -243,13 +243,13 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
         return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0
 
     until(lambda: 40 <= reported() < 60, every_s=0.05)
-    until(lambda: reported(ms=130) >= 130, every_s=0.05)  # at once, not with the next sample
+    until(lambda: reported(ms=130) >= 130, every_s=0.05)  # immediately, not with the next sample
     until(lambda: 40 <= reported() < 60, every_s=0.05)
     until(lambda: reported(silent=["rear"]) > 500, every_s=0.05)  # the longer it sends nothing
     until(lambda: 40 <= reported() < 60, every_s=0.05)
     cameras = {name: {**camera, "fault": "it repeats"} for name, camera in STATE["cameras"].items()}
     vehicle.publish("state", {**STATE, "t": 2.0, "cameras": cameras})
-    until(lambda: reported() == 0, every_s=0.05)  # pictures come, and nobody knows how old what they show is
+    until(lambda: reported() == 0, every_s=0.05)  # pictures arrive whose age is unknown
 
 
 def test_the_latency_of_a_source_without_capture_times_is_unknown(both):

@@ -105,7 +105,7 @@ def test_both_sides_store_what_they_send_and_receive(sides, tmp_path):
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
         assert found[-4:] == sizes  # a caller sends before any knob is turned
         assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames continue while both sides stop
-        # On a busy machine packets get lost on loopback, too; what arrives is kept as it is.
+        # On a busy machine packets get lost on loopback, too; what arrives is stored unchanged.
         whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # A receiver that joins a running stream begins with the next parameter sets.
@@ -263,7 +263,7 @@ def test_a_directory_that_cannot_be_made_ends_the_file_and_not_the_stream(sides,
 
 
 def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
-    """A pipe that nobody reads takes 64 kB and then blocks."""
+    """A pipe without a reader accepts 64 kB and then blocks."""
     monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", 20_000)
     sides = Sides(tmp_path)
 
