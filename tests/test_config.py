@@ -284,7 +284,7 @@ REAR, GRAPH, PAPER, ROBOT = (
             "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
-        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: is required by this rule"),
+        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: required by this rule"),
         (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number from 0"),
         (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
         (

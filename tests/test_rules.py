@@ -467,7 +467,7 @@ def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: 
         ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?"),
         ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter; share_by_demand takes none"),
         ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
-        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: is required by this rule"),
+        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: required by this rule"),
         ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number from 0"),
         ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number from 0"),
         ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number from 0"),

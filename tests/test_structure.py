@@ -47,9 +47,7 @@ def test_no_import_breaks_a_contract(copy: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("inside", ["{}\n", "def hidden() -> None:\n    {}\n", "if TYPE_CHECKING:\n    {}\n"])
-def test_a_wrong_import_is_detected_anywhere(
-    copy: Path, module: str, line: str, contract: str, inside: str
-) -> None:
+def test_a_wrong_import_is_detected_anywhere(copy: Path, module: str, line: str, contract: str, inside: str) -> None:
     path = copy / "runner" / f"{module}.py"
     path.write_text(f"{path.read_text()}\n\n{inside.format(line)}")
     done = lint(copy)

@@ -33,9 +33,7 @@ def test_a_unit_without_a_picture_is_useless(data):
 def test_an_incomplete_picture_is_dropped_and_an_incomplete_idr_becomes_grey():
     sps = b"\0\0\0\1" + bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
-    assert (
-        read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None
-    )  # a grey picture needs a parameter set
+    assert read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None  # a grey picture needs a parameter set
     grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
     assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
     assert read_unit(grey.data, None, 0).key

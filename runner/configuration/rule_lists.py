@@ -51,7 +51,7 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
             raise ModelError(f"{name}.{key}", value, "must be above 0")
     for key, parameter in known.items():
         if key not in parameters and parameter.default is inspect.Parameter.empty:
-            raise ModelError(f"{name}.{key}", "missing", "is required by this rule")
+            raise ModelError(f"{name}.{key}", "missing", "required by this rule")
     return RuleCall(found, {key: exact(value) for key, value in parameters.items()})
 
 

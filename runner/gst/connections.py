@@ -53,7 +53,7 @@ class RtspConnection:
     def __str__(self) -> str:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
 
-    def without_request_s(self, now: float) -> float:
+    def unused_s(self, now: float) -> float:
         """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
         return now - self.viewer.since if self.last_request == self._began else 0.0
 

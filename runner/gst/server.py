@@ -496,7 +496,7 @@ class CameraServer:
 
     def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
         """Close those whose client makes no request, to free threads for other handshakes."""
-        silent = [each for connection in connections if (each := (connection.without_request_s(now), connection))[0] > 0]
+        silent = [each for connection in connections if (each := (connection.unused_s(now), connection))[0] > 0]
         for idle_s, connection in silent:
             if idle_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
                 connection.close()
