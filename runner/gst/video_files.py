@@ -49,7 +49,7 @@ class VideoFile:
     def __init__(
         self, files: VideoFiles, camera: str, side: str, captured: Captured, on_report: Callable[[str, str], None]
     ) -> None:
-        self._files, self._capture_timesra, self._side = files, camera, side
+        self._files, self._camera, self._side = files, camera, side
         self._captured, self._on_report = captured, on_report
         self._capture_times: dict[int, float] = {}  # by stream time, ns, until the file begins
         self._file, self._first = "", 0  # its name, and the stream time of its first frame
@@ -77,7 +77,7 @@ class VideoFile:
             after_s = (buffer.pts - self._first) / Gst.SECOND
             if abs(captured - after_s - self._ahead) > SHIFT_S:
                 self._ahead = captured - after_s
-                self._files.on_shift(self._capture_timesra, self._file, after_s, captured)
+                self._files.on_shift(self._camera, self._file, after_s, captured)
         return Gst.PadProbeReturn.OK
 
     def _on_first_parsed(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
@@ -88,7 +88,7 @@ class VideoFile:
         self._capture_times.clear()
         parts = pad.get_parent_element().get_parent()
         try:
-            path = _new_file(self._files.directory / DIRECTORY, self._capture_timesra, self._side)
+            path = _new_file(self._files.directory / DIRECTORY, self._camera, self._side)
         except OSError as error:
             self._fail(parts, str(error))
             return Gst.PadProbeReturn.REMOVE
@@ -98,7 +98,7 @@ class VideoFile:
         if sink.sync_state_with_parent():  # otherwise it has posted an error
             self._file, self._first = str(path.relative_to(self._files.directory)), first
             self._ahead = captured
-            self._files.on_video(self._capture_timesra, self._file, captured)
+            self._files.on_video(self._camera, self._file, captured)
         return Gst.PadProbeReturn.REMOVE
 
     def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:
@@ -115,14 +115,14 @@ class VideoFile:
         parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
         if not self._failed:
             self._failed = True
-            self._on_report(self._capture_timesra, f"no video is kept: {why}")
+            self._on_report(self._camera, f"no video is kept: {why}")
 
     def _on_overrun(self, queue: Gst.Element) -> None:
         """From the stream's thread, when the queue is full for the first time."""
         queue.set_property("silent", True)  # once is enough
         if not (self._overran or self._failed):
             self._overran = True
-            self._on_report(self._capture_timesra, "the disk is too slow: frames are missing in the video file")
+            self._on_report(self._camera, "the disk is too slow: frames are missing in the video file")
 
 
 def concerns_file(message: Gst.Message) -> bool:
