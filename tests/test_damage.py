@@ -68,10 +68,10 @@ def test_the_first_bytes_of_a_unit_suffice() -> None:
 
 
 def test_units_missed_before_the_first_one_cause_damage() -> None:
-    damage = Damage("h264", lasts=True)
+    damage = Damage("h264", is_damaged=True)
     assert [damage.add(False, lambda: DELTA), damage.add(False, lambda: KEY), damage.add(False, lambda: DELTA)] == [
         True,
         False,
         False,
     ]
-    assert not Damage("vp8", lasts=True).lasts
+    assert not Damage("vp8", is_damaged=True).is_damaged

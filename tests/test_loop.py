@@ -199,6 +199,6 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
         until(lambda: attention() is UNSET)
         states("other", attention="watching")
         until(lambda: attention() == "watching")
-    states = [report for report in watched.reports if report.startswith("operator driver is ")]
+    reported = [report for report in watched.reports if report.startswith("operator driver is ")]
     expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
-    assert states == [f"operator driver is {what}" for what in expected]
+    assert reported == [f"operator driver is {what}" for what in expected]

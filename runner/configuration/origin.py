@@ -95,7 +95,7 @@ class Composed:
             above = (part for part in inside if len(part.package) < length)
             holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
             if length < len(path):  # the key is missing: the part that defines its surroundings, the most local first
-                writers = [part for part in holders if isinstance(_held(part, path[:length]), dict | list)]
+                writers = [part for part in holders if isinstance(_value_in(part, path[:length]), dict | list)]
                 holders = sorted(writers or holders, key=_locality)
             candidates = [*holders, *makers] if length == len(path) else [*makers, *holders]
             if candidates:
@@ -107,7 +107,7 @@ class Composed:
         """The parts down to the one whose list contains the path: a list replaces those of all earlier files."""
         lists = [path[:depth] for depth, key in enumerate(path) if isinstance(key, int)]
         for index, part in enumerate(self.parts):
-            if any(isinstance(_held(part, place), list) for place in lists):
+            if any(isinstance(_value_in(part, place), list) for place in lists):
                 return self.parts[: index + 1]
         return self.parts
 
@@ -137,7 +137,7 @@ def _states(part: Part, path: schema.Path, value: Any) -> bool:
         return False
     inner = path[len(part.package) :]
     above = (value_at(part.content, inner[:length]) for length in range(len(inner) + 1))
-    if any(isinstance(held, str) and "${" in held for held in above):
+    if any(isinstance(each, str) and "${" in each for each in above):
         return True
     return _holds(part.content, inner) and value_at(part.content, inner) == value
 
@@ -146,7 +146,7 @@ def _locality(part: Part) -> int:
     return -len(part.package)
 
 
-def _held(part: Part, path: schema.Path) -> Any:
+def _value_in(part: Part, path: schema.Path) -> Any:
     """The value of a part at a path of the whole document; None if missing."""
     inside = path[: len(part.package)] == part.package
     return value_at(part.content, path[len(part.package) :]) if inside else None

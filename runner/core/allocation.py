@@ -79,14 +79,14 @@ def allocate_above_floors(
         return allocate(demands, total, weights)
     if total <= _sum(lowest.values()):
         return dict.fromkeys(demands, ZERO) | allocate(lowest, total, dict.fromkeys(lowest, Fraction(1)))
-    held: dict[str, Kbps] = {}
+    at_floor: dict[str, Kbps] = {}
     while True:
-        others = {name: own for name, own in demands.items() if name not in held}
-        shares = allocate(others, total - _sum(held.values()), weights)
-        below = {name: floor for name, floor in lowest.items() if name not in held and shares[name] < floor}
+        others = {name: own for name, own in demands.items() if name not in at_floor}
+        shares = allocate(others, total - _sum(at_floor.values()), weights)
+        below = {name: floor for name, floor in lowest.items() if name not in at_floor and shares[name] < floor}
         if not below:
-            return {name: held[name] if name in held else shares[name] for name in demands}
-        held |= below
+            return {name: at_floor[name] if name in at_floor else shares[name] for name in demands}
+        at_floor |= below
 
 
 def shed(

@@ -127,8 +127,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             since = event.t if state.operator_since is None else state.operator_since
             return {"operator_since": since, "operator_lost": None}
         case ev.OperatorDisconnected():
-            gone = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
-            return gone if state.operator_lost is None else {}
+            changes = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
+            return changes if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
         case ev.SteeringReported():

@@ -201,7 +201,7 @@ class Receiver:
     @property
     def is_damaged(self) -> bool:
         """Whether the newest picture shows unrecovered packet loss."""
-        return self._begun and self._damage.lasts
+        return self._begun and self._damage.is_damaged
 
     def take_packets(self) -> tuple[int, int]:
         """RTP packets received, and initially missing, since the last call. From any one thread."""
@@ -227,7 +227,7 @@ class Receiver:
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
         # A stream that others watch continues: what was missed meanwhile shows until a picture is healed.
-        self._damage = Damage(self._codec, lasts=self._built)
+        self._damage = Damage(self._codec, is_damaged=self._built)
         self._built = True
         self._close_filter()
         self._progress = (self._frames, time.monotonic())

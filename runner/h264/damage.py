@@ -16,12 +16,12 @@ class Damage:
     after a recovery point (ITU-T H.264, D.2.8). A loss within the wave damages the part that is already refreshed.
     For other codecs healing is unknown; only incomplete units count as damaged.
 
-    lasts  whether units before the first one were missed
+    is_damaged  whether units before the first one were missed
     """
 
-    def __init__(self, codec: str, *, lasts: bool = False) -> None:
+    def __init__(self, codec: str, *, is_damaged: bool = False) -> None:
         self._codec = codec
-        self.lasts = lasts and codec in CODECS  # until the picture is healed
+        self.is_damaged = is_damaged and codec in CODECS  # until the picture is healed
         self._left: int | None = None  # remaining frames of the healing wave; None: none has begun since the loss
 
     def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:
@@ -31,11 +31,11 @@ class Damage:
         head        returns its first HEAD_BYTES; called only while the picture is damaged
         """
         if incomplete:
-            self.lasts, self._left = self._codec in CODECS, None
+            self.is_damaged, self._left = self._codec in CODECS, None
             return True
-        if self.lasts and self._heals(head()):
-            self.lasts, self._left = False, None
-        return self.lasts
+        if self.is_damaged and self._heals(head()):
+            self.is_damaged, self._left = False, None
+        return self.is_damaged
 
     def _heals(self, head: bytes) -> bool:
         key, recovery = starts(head, self._codec)

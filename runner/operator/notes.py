@@ -44,16 +44,15 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
         return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s"
     reasons = [cameras[name].reason for name in changed]
     if len(changed) > 1:
-        each = [
-            reason.split("; ")[1:] for reason in reasons
-        ]  # first the camera's own reason, then those of the whole decision
-        shared = [part for part in each[0] if all(part in others for others in each)]
+        # Each has the camera's own reason first, then those of the whole decision.
+        common = [reason.split("; ")[1:] for reason in reasons]
+        shared = [part for part in common[0] if all(part in parts for parts in common)]
         total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
         reasons = ["; ".join([total, *shared])]
-    alike: dict[str, list[str]] = {}
+    names_by_change: dict[str, list[str]] = {}
     for name, change in changed.items():
-        alike.setdefault(change, []).append(name)
-    listed = "; ".join(f"{', '.join(names)} {change}" for change, names in alike.items())
+        names_by_change.setdefault(change, []).append(name)
+    listed = "; ".join(f"{', '.join(names)} {change}" for change, names in names_by_change.items())
     return f"{cause}: {listed} ({reasons[0]})"
 
 

@@ -203,9 +203,9 @@ class Station:
 
     def captured_here(self, name: str, captured: float | None) -> float | None:
         """Convert a camera's capture time, s since 1970, from the vehicle's clock to this machine's; None: unknown."""
-        return None if captured is None or self.untimed(name) else self._here(captured)
+        return None if captured is None or self.untimed(name) else self._to_own_clock(captured)
 
-    def _here(self, at: float) -> float | None:
+    def _to_own_clock(self, at: float) -> float | None:
         """Convert a past time, s since 1970, from the vehicle's clock to this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
         if clock is None or self._was_set():
@@ -424,7 +424,7 @@ class Station:
 
     def _on_steering(self, message: MqttMessage) -> None:
         steering = read_steering(message.payload)
-        at = None if message.retained else self._here(steering.at)
+        at = None if message.retained else self._to_own_clock(steering.at)
         if at is not None:
             for listener in self.listeners:
                 listener.on_steering(at, steering.rad)
@@ -457,8 +457,8 @@ class Station:
         self._connected_at = None
         if self._vehicle.name not in self._vehicles:
             online = sorted(name for name, is_online in self._vehicles.items() if is_online)
-            known = f"online are {', '.join(online)}" if online else "no vehicle is online"
-            self.note(f"the broker knows no vehicle named {self._vehicle.name}, {known}")
+            known = f"online: {', '.join(online)}" if online else "no vehicle is online"
+            self.note(f"the broker knows no vehicle named {self._vehicle.name}; {known}")
 
     def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)

@@ -324,7 +324,7 @@ def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
     station.connect()
     try:
         until(lambda: station.take({}) is None and listener.notes, every_s=0.2)
-        assert listener.notes == ["the broker knows no vehicle named delivery_robott, online are delivery_robot"]
+        assert listener.notes == ["the broker knows no vehicle named delivery_robott; online: delivery_robot"]
     finally:
         station.close()
 
