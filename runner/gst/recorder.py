@@ -199,7 +199,7 @@ class Recorder:
         if self._finishing or self._end is not None:
             return f"the file was not finished within {WRITE_S:g} s" if stalled_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
-            return f"frames are queued, but none was encoded and written for {WRITE_S:g} s" if stalled_s > WRITE_S else None
+            return f"frames are queued, but none was written for {WRITE_S:g} s" if stalled_s > WRITE_S else None
         return f"no frame for {SILENT_S:g} s" if stalled_s > SILENT_S else None
 
     def _count_down(self) -> None:
