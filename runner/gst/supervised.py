@@ -81,7 +81,7 @@ class SupervisedPipeline:
             self.rebuilt += 1
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
-            self._outage.failed(why, self._lost)
+            self._outage.report_failure(why, self._lost)
         self.stop()
         self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._retry_start)
 
@@ -105,7 +105,7 @@ class SupervisedPipeline:
     def _on_working(self, attempt: int) -> bool:
         if attempt == self._attempt and self._pipeline is not None:
             self._works = self._worked = True
-            self._outage.over(time.monotonic())
+            self._outage.report_recovery(time.monotonic())
         return False
 
 
