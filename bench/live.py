@@ -187,19 +187,19 @@ def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
 def _recorded() -> Iterator[list[float]]:
     """Times at which knobs are set in the meantime."""
     times: list[float] = []
-    original = knobs.KnobPanel._set_waiting
+    original = knobs.KnobPanel._apply_pending
 
     def timed(self: knobs.KnobPanel) -> None:
-        waiting = bool(self._waiting)
+        pending = bool(self._pending)
         original(self)
-        if waiting:
+        if pending:
             times.append(time.perf_counter())
 
-    knobs.KnobPanel._set_waiting = timed
+    knobs.KnobPanel._apply_pending = timed
     try:
         yield times
     finally:
-        knobs.KnobPanel._set_waiting = original
+        knobs.KnobPanel._apply_pending = original
 
 
 def _until(done: Any, seconds: float = 10) -> None:

@@ -12,7 +12,7 @@ from importlib import import_module
 from runner.errors import RunError, UserError
 from runner.system import signals
 
-# Everything else is imported once signals are handled: an interrupted import would print a traceback.
+# All other modules are imported once signals are handled: an interrupted import would print a traceback.
 
 USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
 
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
         if argv is None and signals.received():
-            # A normal exit would wait for library threads that may still be in Python.
+            # A normal exit would wait for library threads that may still run Python code.
             with suppress(OSError):
                 sys.stdout.flush()
             os._exit(status)
@@ -67,7 +67,7 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
     except KeyboardInterrupt:
         return 128 + (signals.received() or signal.SIGINT)
     except BrokenPipeError:
-        # The reader of our output is gone; the interpreter would complain again when it flushes.
+        # The reader of our output has closed it; the interpreter would fail again on its final flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:  # a full disk, a file without read permission

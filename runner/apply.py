@@ -1,4 +1,4 @@
-"""The only interface to GStreamer: builds plans, carries out commands, reports what is applied.
+"""The only interface to GStreamer: builds plans, executes commands, reports the applied values.
 
 Nothing else imports `gi`, and nothing in runner/gst/ is imported from anywhere else.
 """
@@ -20,7 +20,7 @@ from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
 from runner.gst.credentials import log_in
-from runner.gst.outage import Gathered
+from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
@@ -77,13 +77,13 @@ __all__ = [
     "write_clip",
 ]
 
-CALL_S = 10.0  # a call into GLib's thread takes milliseconds; after this long it hangs
-TAILS_MS = 10  # how often receivers look for frames that do not end
+CALL_S = 10.0  # timeout of a call into GLib's thread, which normally takes milliseconds
+TAILS_MS = 10  # how often receivers check for frames whose end is missing
 STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
 def check_machine(plans: Sequence[Plan]) -> None:
-    """Check that every plugin of the vehicle's side is installed and every source opens: files, devices.
+    """Check that every plugin of the vehicle's side is installed and every source (file, device) opens.
 
     raises  RunError with the remedy, for all cameras at once
     """
@@ -127,9 +127,9 @@ class _Glib:
         self._loop = GLib.MainLoop()
         self._calls: deque[Callable[[], None]] = deque()
         # One watch for all calls: see runner/gst/one_shot.py.
-        self._called = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._watch = GLib.unix_fd_add_full(
-            GLib.PRIORITY_DEFAULT_IDLE, self._called, GLib.IOCondition.IN, self._on_called
+            GLib.PRIORITY_DEFAULT_IDLE, self._wakeup, GLib.IOCondition.IN, self._on_wakeup
         )
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
         self._thread.start()
@@ -137,36 +137,36 @@ class _Glib:
     def call(self, what: str, function: Callable[[], None]) -> None:
         """Run a function in the loop's thread and wait for it; its exceptions are raised here.
 
-        what    the function's work, for messages
-        raises  RunError if it is not done within CALL_S, or the loop has ended
+        what    description of the work, for messages
+        raises  RunError if it takes longer than CALL_S, or the loop has ended
         """
-        if self._called < 0:
+        if self._wakeup < 0:
             raise RunError(f"GStreamer's thread has ended: {what}")
         done = threading.Event()
         raised: list[BaseException] = []
 
-        def once() -> None:
+        def run() -> None:
             try:
                 function()
             except BaseException as error:
                 raised.append(error)
             done.set()
 
-        self._calls.append(once)
-        os.eventfd_write(self._called, 1)
+        self._calls.append(run)
+        os.eventfd_write(self._wakeup, 1)
         if not done.wait(CALL_S):
             raise RunError(f"GStreamer hangs: {what} takes more than {CALL_S:g} s")
         if raised:
             raise raised[0]
 
-    def _on_called(self, *_: object) -> bool:
-        os.eventfd_read(self._called)
+    def _on_wakeup(self, *_: object) -> bool:
+        os.eventfd_read(self._wakeup)
         while self._calls:
             self._calls.popleft()()
         return True
 
     def end(self, stop: Callable[[], None]) -> None:
-        """Run the last function, let state changes finish, end the loop. Whatever hangs by then is left alone."""
+        """Run the last function, let state changes finish, and end the loop. Anything that still hangs is abandoned."""
         try:
             self.call("stopping", stop)
             settle(STOP_S)
@@ -178,12 +178,12 @@ class _Glib:
         self._thread.join(timeout=5)
         if not self._thread.is_alive():
             GLib.source_remove(self._watch)
-            called, self._called = self._called, -1  # its number may soon be another file's
-            os.close(called)
+            wakeup, self._wakeup = self._wakeup, -1  # its number may soon be reused
+            os.close(wakeup)
 
 
-def _kept(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
-    """The plans to build: each with a file, if video is kept.
+def _with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
+    """The plans to build: each with a video file, if requested.
 
     raises  RunError with the packages to install
     """
@@ -200,12 +200,12 @@ def _captured(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
 
 
 class VehicleSide:
-    """All cameras of the vehicle, streaming. Keeps the wanted value of each knob, and sets them again after a rebuild.
+    """All cameras of the vehicle, streaming. Stores the wanted value of each knob, to set it again after a rebuild.
 
     on_report  called, from another thread, when a camera's pipeline starts, stops or fails
-    video      where to keep what is sent; None: nowhere
-    keyring    of this vehicle: viewers are admitted by certificate and password, everything is encrypted; None: nothing
-    raises     RunError if the port is in use, or something that `video` needs is not installed
+    video      where to store the sent streams; None: nowhere
+    keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
+    raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
     """
@@ -220,7 +220,7 @@ class VehicleSide:
     ) -> None:
         self._on_report, self._video = on_report, video
         passphrase = keyring.passphrase if keyring else None
-        plans = _kept(plans, video, "vehicle")
+        plans = _with_video(plans, video, "vehicle")
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
@@ -240,7 +240,7 @@ class VehicleSide:
         self._glib.call("starting the cameras", start)
 
     def turn(self, commands: Iterable[Command]) -> None:
-        """Carry out commands: those for one camera between the same two of its frames. Returns at once."""
+        """Execute commands; those for one camera take effect between the same two frames. Returns immediately."""
         changed: dict[str, dict[str, KnobValue]] = {}
         for command in commands:
             changed.setdefault(command.camera, {})[command.knob] = command.value
@@ -252,7 +252,7 @@ class VehicleSide:
                 pipeline.turn(self._wanted_of(name), values)
 
     def copies(self) -> dict[str, int]:
-        """By camera, the viewers outside the vehicle: each is sent a copy of the stream."""
+        """By camera, the number of viewers outside the vehicle: each is sent a copy of the stream."""
         return self._server.copies() if self._server else {}
 
     def give_control(self, operator: str) -> None:
@@ -261,14 +261,14 @@ class VehicleSide:
             self._server.controller = operator
 
     def push(self, camera: str, frame: Any) -> bool:
-        """One frame, captured now, for a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
+        """Push a frame, captured now, of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
         if camera not in self._wanted:
             raise ValueError(f"camera {camera!r}: no such camera{suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
         return pipeline is not None and pipeline.push(frame)
 
     def push_shared(self, camera: str, picture: SharedPicture) -> bool:
-        """One picture in shared memory, with its capture time; returns False where nobody is watching."""
+        """Push a picture in shared memory, with its capture time; returns False if nobody is watching."""
         pipeline = self._pipeline(camera)
         if pipeline is None:
             os.close(picture.memory)
@@ -283,21 +283,21 @@ class VehicleSide:
         return {name: p.counters() if (p := self._pipeline(name)) else (0, 0) for name in self._wanted}
 
     def stages(self) -> dict[str, tuple[float, float]]:
-        """By camera, ms that a picture took from its capture to the encoder, and through it; unknown ones are left out.
+        """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.
 
-        To be called a few times a second, from one thread: each call also looks at the next picture of each source.
+        To be called a few times a second, from one thread: each call also checks the next picture of each source.
         """
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: stages for name, pipeline in pipelines.items() if (stages := pipeline.stages())}
 
     def send_key_frames(self, cameras: Iterable[str]) -> None:
-        """Let the encoders of these cameras start anew, as their graphs allow; unknown cameras are left out."""
+        """Make the encoders of these cameras send key frames, as their graphs allow; unknown cameras are ignored."""
         for name in cameras:
             if name in self._wanted and (pipeline := self._pipeline(name)):
                 pipeline.send_key_frame()
 
     def faults(self) -> list[str]:
-        """Values that elements refused since the last call; each is a bug or a wrong graph."""
+        """Values that elements rejected since the last call; each is a bug or an error in a graph."""
         faults = []
         for name in self._wanted:
             pipeline = self._pipeline(name)
@@ -312,7 +312,7 @@ class VehicleSide:
         return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
 
     def untimed(self) -> frozenset[str]:
-        """Cameras whose source does not know when its last picture was captured."""
+        """Cameras whose source does not know the capture time of its last picture."""
         pipelines = ((name, self._pipeline(name)) for name in self._wanted)
         return frozenset(name for name, pipeline in pipelines if pipeline and pipeline.untimed)
 
@@ -331,16 +331,21 @@ class VehicleSide:
         source = None
         if plan.frozen_s is not None:
             source = WatchedSource(plan, lambda what: self._on_report(name, what))
-            source.take_place(pipeline, plan)
+            source.install(pipeline, plan)
         elif problem := log_in(pipeline, plan):
             self._on_report(name, problem)
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
-            pipeline, plan, self._wanted_of(name), self._turned, lambda what: self._on_report(name, what), source
+            pipeline,
+            plan,
+            self._wanted_of(name),
+            self._on_knobs_turned,
+            lambda what: self._on_report(name, what),
+            source,
         )
 
-    def _turned(self) -> None:
+    def _on_knobs_turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built
 
     def _wanted_of(self, name: str) -> Mapping[str, KnobValue]:
@@ -360,11 +365,11 @@ class OperatorSide:
     on_unit     called, from the camera's streaming thread, with each access unit received
     on_picture  called, from the camera's streaming thread, with each decoded picture
     arrivals    record when each access unit arrived, for the samples
-    video       where to keep what is received; None: nowhere
+    video       where to store the received streams; None: nowhere
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
-    keyring     of this operator; None: to a vehicle that does not ask
-    vehicle     its name, as its certificate must state it
-    raises      RunError if something that `video` needs is not installed
+    keyring     of this operator; None: no authentication
+    vehicle     its name, which its certificate must state
+    raises      RunError if a plugin that `video` needs is not installed
     """
 
     def __init__(
@@ -379,16 +384,16 @@ class OperatorSide:
         keyring: Keyring | None = None,
         vehicle: str = "",
     ) -> None:
-        plans = _kept(plans, video, "operator")
+        plans = _with_video(plans, video, "operator")
         self._glib = _Glib()
-        self._gathered = gathered = Gathered(on_report)
+        self._reports = reports = ReportMerger(on_report)
         login: StreamLogin | None = None
         if keyring:
             from runner.gst.secure import StreamLogin
 
-            login = StreamLogin(keyring, vehicle, lambda what: gathered("keys", what))
+            login = StreamLogin(keyring, vehicle, lambda what: reports("keys", what))
         self._receivers = {
-            plan.camera.name: Receiver(plan, gathered, on_unit, on_picture, arrivals, video, operator, login)
+            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login)
             for plan in plans
         }
 
@@ -400,9 +405,9 @@ class OperatorSide:
         self._glib.call("starting the receivers", start)
 
     def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
-        """What was received of each camera; to be called a few times a second.
+        """Reception of each camera; to be called a few times a second.
 
-        sending  which cameras should send; one that should but is silent is rebuilt. Unknown ones are left out
+        sending  which cameras should send; a silent one that should is rebuilt. Unknown ones are omitted
         raises   RunError if GStreamer hangs
         """
         samples: dict[str, Reception] = {}
@@ -421,7 +426,7 @@ class OperatorSide:
         return True
 
     def take_arrivals(self) -> Arrivals:
-        """What has arrived since the last call; to be called from one thread."""
+        """Arrivals since the last call; to be called from one thread."""
         receivers = self._receivers
         counted = [receiver.take_packets() for receiver in receivers.values()]
         return Arrivals(
@@ -439,11 +444,11 @@ class OperatorSide:
                 receiver.stop()
 
         self._glib.end(stop)
-        self._gathered.flush()
+        self._reports.flush()
 
 
 class RecordingSide:
-    """Cameras of the vehicle, each recorded from its source into a file.
+    """Records cameras of the vehicle, each from its source into a file.
 
     files       by camera, the file that is written
     duration_s  length of the recordings, s; None: until `finish`
@@ -455,7 +460,7 @@ class RecordingSide:
         self._for_each("starting the recorders", Recorder.start)
 
     def sample(self) -> dict[str, Recorded]:
-        """What was recorded of each camera so far."""
+        """Progress of each camera's recording."""
         samples: dict[str, Recorded] = {}
 
         def sample() -> None:
@@ -465,11 +470,11 @@ class RecordingSide:
         return samples
 
     def finish(self) -> None:
-        """Let every file end with what its source has delivered by now; returns at once."""
+        """Finish every file with all frames delivered so far; returns immediately."""
         self._for_each("ending the files", Recorder.finish)
 
     def stop(self) -> None:
-        """End at once; unfinished files stay incomplete."""
+        """Stop immediately; unfinished files stay incomplete."""
 
         def stop() -> None:
             for recorder in self._recorders.values():
@@ -489,7 +494,7 @@ class RecordingSide:
 
 
 def discover(path: Path, where: str) -> Form:
-    """Form of a clip, see `runner.gst.sequence.discover`."""
+    """Format of a clip, see `runner.gst.sequence.discover`."""
     from runner.gst import sequence
 
     return sequence.discover(path, where)

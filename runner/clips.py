@@ -68,7 +68,7 @@ def clip_path(view: View, seconds: float, cache: Path) -> Path:
 
 
 def rendered(camera: Camera) -> str | None:
-    """The camera's clip, if its source renders one and it is in the cache."""
+    """Path of the camera's rendered clip; None if its source renders none or it is not in the cache."""
     if not camera.source.render:
         return None
     path = clip_path(view(camera), camera.source.render_s, cache_directory())

@@ -42,7 +42,7 @@ class ConfigError(UserError):
 
 
 class RunError(Exception):
-    """A run failed on this machine: exit status 1. The text gives the remedy."""
+    """A run failed on this machine: exit status 1. The text includes the remedy."""
 
     def __init__(self, text: str) -> None:
         super().__init__(redacted(text))
@@ -51,7 +51,7 @@ class RunError(Exception):
 class MissingBindings(ImportError):
     """GStreamer's Python bindings, or parts of them, cannot be loaded.
 
-    missing  by part, why it does not load and what provides it
+    missing  by part, why it fails to load and which package provides it
     """
 
     def __init__(self, missing: Mapping[str, str]) -> None:

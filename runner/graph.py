@@ -27,14 +27,14 @@ from runner.core.model import (
 )
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
-# Settings of a graph that depend on the frame rate: by key, the placeholder they fill, and how its value is computed.
+# Settings of a graph that depend on the frame rate: by key, the placeholder that they fill and its computation.
 _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
     "key_interval_s": ("key_interval_frames", lambda seconds, fps: seconds * fps),
     "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
 }
-# Without colorimetry each decoder takes that of the picture's size: colours would change where a picture is scaled.
+# Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
 _PICTURE = "pixel-aspect-ratio=1/1,colorimetry=bt709"
-# Caps of what a camera delivers that is not raw. A raw format has its own name.
+# Caps of encoded formats that a camera delivers; raw formats are named directly.
 _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
@@ -50,10 +50,10 @@ _RECORDED = (
     Element("recorded", "identity", {"single-segment": True}),
 )
 _WRITER = Element("writer", "filesink", {})
-# The branch after the tee writes a side's video, as sent or received, into a file. Its names have a hyphen, which those
-# of a graph cannot have. Its queue drops the oldest data, so that a slow disk never blocks the stream: 8 MB are 10 s at
-# 6 Mbit/s. The gate is closed when nothing can be written any more, see runner/gst/video_files.py. Each frame is
-# written at once, in case the process is killed.
+# The branch after the tee writes a side's video, as sent or received, into a file. Its element names contain a hyphen,
+# which is not allowed in a graph. Its queue drops the oldest data, so that a slow disk never blocks the stream: 8 MB
+# are 10 s at 6 Mbit/s. The gate closes when writing fails, see runner/gst/video_files.py. Each frame is written
+# immediately, in case the process is killed.
 _TEE = Element("video-tee", "tee", {})
 _FILE_GATE = Element("video-gate", "valve", {})
 _FILE_QUEUE = Element(
@@ -68,13 +68,13 @@ _FILE_SINK = Element(
     {"sync": False, "async": False, "enable-last-sample": False, "buffer-mode": "unbuffered"},
 )
 _COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
-CODECS = ("h264", "h265")  # whose access units are supported: for files and for the operator's page
-_FROZEN_INTERVALS = 10  # of frames: a source with a low frame rate is not frozen
+CODECS = ("h264", "h265")  # supported in video files and on the operator's page
+_FROZEN_INTERVALS = 10  # frame intervals, so that a low frame rate does not count as frozen
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """One camera compiled: nothing left to look up, nothing started.
+    """One compiled camera: everything resolved, nothing started.
 
     source     elements that produce raw frames; a stand-in while their clip is not rendered
     loops      whether the source is a clip that restarts at its end
@@ -84,7 +84,7 @@ class Plan:
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
     recorder   elements that follow the source when it is recorded, without the file; empty if it is not recorded
-    bag        pictures that are pushed into the first element of the source; None: it needs none
+    bag        pictures that are pushed into the first element of the source; None: none
     video      whether each side also writes what it sends or receives into a file
     """
 
@@ -108,13 +108,13 @@ class Plan:
 
     @property
     def frozen_s(self) -> float | None:
-        """Without a frame for this long, s, the source is frozen and has to be replaced; None: it is not watched."""
+        """Without a frame for this long, s, the source counts as frozen and is replaced; None: it is not watched."""
         frozen_s = self.camera.source.frozen_s
         return None if frozen_s is None else max(frozen_s, _FROZEN_INTERVALS / float(self.camera.fps))
 
     @property
     def pipeline(self) -> str:
-        """The vehicle's side as GStreamer parses it, knobs not yet turned."""
+        """The vehicle's side as GStreamer parses it, before knobs are turned."""
         return launch((*self.source, *self._teed("vehicle", self.vehicle))) + self._file_branch
 
     @property
@@ -215,7 +215,7 @@ def compile_graph(
 
 
 def bag_topic(camera: Camera) -> BagTopic | None:
-    """The pictures of a bag that a camera's source plays; None: it plays none, or they are not named."""
+    """The bag and topic that a camera's source plays; None if it plays none or they are not configured."""
     path, topic = (camera.mount.get(key, camera.source.settings.get(key)) for key in ("bag", "topic"))
     return BagTopic(str(path), str(topic)) if camera.source.plays_bags and path and topic else None
 
@@ -236,7 +236,7 @@ def check_video(graph: Graph) -> None:
 def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
     """The element properties that turning a knob to a value sets, in the order of the graph.
 
-    raises  ModelError if the kind of value does not fit the knob
+    raises  ModelError if the type of the value does not fit the knob
     """
     quantities = _quantities(camera, value)
     turned: list[Assignment] = []
@@ -252,7 +252,7 @@ def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]
 
 
 def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:
-    """Elements of a camera as they are built with these knobs turned; settings of other elements are left out."""
+    """Elements of a camera with these knobs turned; settings of other elements are ignored."""
     by_element: dict[str, dict[str, Value]] = {}
     for knob, value in knobs.items():
         for name, key, filled in assignments(camera, knob, value):
@@ -300,7 +300,7 @@ def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
 def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:
     """Length of the rate control's buffer, ms, if the graph states it in frames.
 
-    At least 1 kbit: x264 rounds down to whole kbit, and takes a buffer of 0 for one without limit.
+    At least 1 kbit: x264 rounds down to whole kbit, and treats 0 as unlimited.
     """
     key = "vbv_frames"
     if key not in camera.graph.settings:
@@ -355,7 +355,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
 
 
 def _capture_caps(capture: Capture) -> str | None:
-    """Caps of what a V4L2 camera is to deliver; None: anything."""
+    """Caps requested from a V4L2 camera; None: any."""
     if capture.format is None:
         return None
     caps = [_ENCODED.get(capture.format, "video/x-raw")]

@@ -52,7 +52,7 @@ class LaneSet:
 
 
 def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag: BagTopic | None = None) -> LaneSet:
-    """One line for some lanes of a camera.
+    """One line for several lanes of a camera.
 
     plan    the camera at the size and rate of the sequence
     decode  the line that decodes the sequence to I420 frames
@@ -60,7 +60,7 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag:
     roi     part of the full image that is encoded
     raises  ModelError if the graph's bitrate knob names no element that frames pass through
     """
-    before, behind = cut(plan)
+    before, after = cut(plan)
     factors = sorted({lane.scaling for lane in lanes})
     parts = [f"{decode} ! tee name={FRAMES}"]
     for i, factor in enumerate(factors):
@@ -68,7 +68,7 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag:
         parts.append(f"{FRAMES}. ! {QUEUE} ! {launch(shared)} ! tee name=scaled_{i}" if shared else "")
     names = []
     for j, lane in enumerate(lanes):
-        own = _turned(plan, behind, {"bitrate": lane.kbps}, f"_lane{j}")
+        own = _turned(plan, after, {"bitrate": lane.kbps}, f"_lane{j}")
         parts.append(f"scaled_{factors.index(lane.scaling)}. ! {QUEUE} ! {launch(own)} ! {SINK.format(f'sink_{j}')}")
         names.append(LaneNames(f"{encoder(plan)}_lane{j}", f"{_counter(plan)}_lane{j}", f"sink_{j}"))
     return LaneSet(" ".join(parts), plan.camera.fps, tuple(names), bag)
@@ -76,13 +76,13 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag:
 
 def fragment(plan: Plan, roi: Roi, lane: Lane) -> str:
     """The elements that produce a lane's pictures, as text: any change of graph or settings changes it."""
-    before, behind = cut(plan)
+    before, after = cut(plan)
     knobs: dict[str, KnobValue] = {"roi": roi, "size": output_size(roi, lane.scaling), "bitrate": lane.kbps}
-    return launch(turn_elements(plan.camera, (*before, *behind), knobs))
+    return launch(turn_elements(plan.camera, (*before, *after), knobs))
 
 
 def cut(plan: Plan) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
-    """The live line without its wire: the part before the encoder, and the part from it on."""
+    """The live line without its wire, divided at the encoder, which begins the second part."""
     vehicle = plan.vehicle if plan.serves else plan.vehicle[:-1]
     at = next(i for i, element in enumerate(vehicle) if element.name == encoder(plan))
     operator = plan.operator[1:-1]

@@ -1,8 +1,8 @@
 """Records that both sides publish and log: state, telemetry, replies, samples, lines of a drive. Pure.
 
-Each record is a frozen dataclass whose fields are the keys of its JSON; only this module writes and reads that JSON;
+Each record is a frozen dataclass whose fields are the keys of its JSON. Only this module writes and reads that JSON;
 schemas/control.schema.json and schemas/drive.schema.json describe the same records. Bitrates are kbit/s, sizes px,
-times s. `t` counts from the start of the run or of the log that holds the record; at an operator's station, which
+times s. `t` counts from the start of the run or of the log that contains the record; at an operator's station, which
 has no such start, from 1970.
 """
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Position of the vehicle: degrees (WGS-84), and if known the speed in m/s and the course in degrees."""
+    """Position of the vehicle in degrees (WGS-84), and, if known, speed in m/s and heading in degrees."""
 
     lat: float
     lon: float
@@ -89,7 +89,7 @@ class DecisionMade:
 class CameraState(CameraDecision):
     """The decision for one camera, the values read back as applied, and the fault of its source, if any.
 
-    untimed  True: its source does not know when pictures are captured: their latency is unknown; absent otherwise
+    untimed  True: its source provides no capture times, so latency is unknown; absent otherwise
     """
 
     weight: Number
@@ -109,10 +109,10 @@ class VehicleState:
     """State of a vehicle that is online.
 
     cause       the event that triggered the decision
-    asked_kbps  the total that the prediction or the operator gives; None in older logs
-    total_kbps  the same after what rules have taken away, such as the cap by the measured link
+    asked_kbps  the total of the prediction or the operator; None in older logs
+    total_kbps  the same after rules have lowered it, such as the cap by the measured link
     fault       why the rules could not decide, so that an earlier decision stays in force
-    attention   of the person who drives; absent: the operator in control states none
+    attention   of the driver; absent: the operator in control states none
     """
 
     t: float = field(compare=False)
@@ -127,7 +127,7 @@ class VehicleState:
 
     @property
     def total_words(self) -> str:
-        """The total in kbit/s, and what was asked for where that is more: 1800 of 3000."""
+        """The total in kbit/s, and the requested one if that is more: 1800 of 3000."""
         less = self.asked_kbps is not None and self.total_kbps < self.asked_kbps
         return f"{self.total_kbps:.6g} of {self.asked_kbps:.6g}" if less else f"{self.total_kbps}"
 
@@ -159,7 +159,7 @@ class Telemetry:
     """Measured on the vehicle, a few times a second: also its heartbeat.
 
     refused       requests refused since the start
-    errors        exceptions that the control loop survived since the start
+    errors        exceptions caught by the control loop since the start
     speed_factor  as in `SpeedAdvice`; None: not advised
     """
 
@@ -176,7 +176,7 @@ class Telemetry:
 class SpeedAdvice:
     """Share of full speed that the latency of the operator's pictures allows, ten times a second.
 
-    The driving function must assume 0 as soon as `expires_s` have passed without a newer one.
+    The driving function must assume 0 once `expires_s` have passed without a newer one.
 
     latency_ms  glass to glass, at most; None: unknown
     """
@@ -189,7 +189,7 @@ class SpeedAdvice:
 
 @dataclass(frozen=True, slots=True)
 class SteeringAngle:
-    """The steering angle, as soon as it is reported: a picture shows where the wheels led when it was captured.
+    """The steering angle as of its report, to match it to the picture captured at that time.
 
     at   when it was reported, s since 1970 by the vehicle's clock, as capture times are
     rad  as in `runner.core.events.SteeringReported`
@@ -210,7 +210,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Reply(Outcome):
-    """The answer to the request of that id."""
+    """The answer to the request with that id."""
 
     id: str
 
@@ -221,8 +221,8 @@ class ClockAnswer:
 
     sent                of the report that is answered
     received, answered  s since 1970, by the vehicle's clock
-    set_s               how far that is ahead of the vehicle's monotonic clock
-    error_s             by how much that may differ from UTC, by the kernel's own account; None: not synchronised
+    set_s               how far that clock is ahead of the vehicle's monotonic clock
+    error_s             its maximum error against UTC according to the kernel; None: not synchronised
     """
 
     sent: float
@@ -245,14 +245,14 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class LatencyStages:
-    """Parts of the latency from capture to decoding, ms, each of a picture sampled lately; None: unknown.
+    """Parts of the latency from capture to decoding, ms, each of a recently sampled picture; None: unknown.
 
     capture  to the encoder's input on the vehicle, with conversion, cropping and scaling
     encode   through the encoder
-    link     from there to the operator's side: all that the other stages do not account for. The only one that depends
-             on the clocks, and right to within their `clock_bound_ms`
+    link     from there to the operator's side: the remainder. The only part that depends on the clocks, accurate to
+             within `clock_bound_ms`
     buffer   in the jitter buffer
-    decode   from the whole access unit to its picture
+    decode   from the complete access unit to its picture
     """
 
     capture: float | None = None
@@ -267,15 +267,15 @@ class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
     lost        RTP packets that never arrived
-    damaged     frames whose picture shows that packets were lost, until it is healed; None in older logs
-    buffer_ms   how long a picture waits for packets that are sent again; None: they are not
+    damaged     frames whose picture shows packet loss, until it is healed; None in older logs
+    buffer_ms   how long a picture waits for retransmitted packets; None: no retransmission
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
     stages_ms   the parts of it; None in older logs
     arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
 
-    Latencies are right to within the sample's `clock_bound_ms`.
+    Latencies are accurate to within the sample's `clock_bound_ms`.
     """
 
     fps: float
@@ -304,8 +304,8 @@ class Sample:
     dropped         invalid messages on the control link
     speed_factor    as in `SpeedAdvice`; None: not advised
     clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
-    clock_bound_ms  by how much that may be wrong, and with it each latency; None: unknown. Older logs lack it: there
-                    `clock_ahead_ms` is what a negative latency showed, and latencies are the difference of both clocks
+    clock_bound_ms  maximum error of that and of each latency; None: unknown. Older logs lack it: there
+                    `clock_ahead_ms` was derived from negative latencies, and latencies are differences of both clocks
     """
 
     t: float
@@ -322,11 +322,11 @@ class Sample:
 
 
 class Arrival(NamedTuple):
-    """A frame as it arrived, encoded.
+    """Arrival of an encoded frame.
 
-    arrived   s, by this machine's monotonic clock: when its last packet came
-    captured  s, by the vehicle's clock; since any time, if the transport carries the RTP timestamp only
-    whole     whether no packet of it was missing at first
+    arrived   of its last packet, s by this machine's monotonic clock
+    captured  s by the vehicle's clock; from an arbitrary origin if the transport carries only the RTP timestamp
+    whole     whether no packet of it was initially missing
     """
 
     arrived: float
@@ -336,12 +336,12 @@ class Arrival(NamedTuple):
 
 
 class Arrivals(NamedTuple):
-    """What the operator's side has received since it was last asked.
+    """What the operator's side has received since the last call.
 
-    frames         by camera; packets that are missing are not waited for
+    frames         by camera, without waiting for missing packets
     newest         by camera, the newest access unit that has left the jitter buffer
-    packets, lost  RTP packets of all cameras received, and missing at first
-    damaged        cameras whose newest picture shows that packets were lost for good
+    packets, lost  RTP packets of all cameras received, and initially missing
+    damaged        cameras whose newest picture shows unrecovered packet loss
     """
 
     frames: Mapping[str, Sequence[Arrival]]
@@ -355,9 +355,9 @@ class UnitReceived(NamedTuple):
     """A frame as the operator's side received it; a list in JSON, since there are hundreds a second.
 
     ago_s    s from the arrival of its last packet to the report
-    delay_s  s from its capture, by the vehicle's clock, to that arrival; less a constant, since clocks differ
-    bytes    without the headers of packets
-    whole    whether no packet of it was missing at first
+    delay_s  s from its capture, by the vehicle's clock, to that arrival; minus a constant, since clocks differ
+    bytes    without packet headers
+    whole    whether no packet of it was initially missing
     """
 
     camera: str
@@ -372,12 +372,12 @@ class ReceptionReport:
     """What the operator's side has received since its previous report; the vehicle estimates the uplink from it.
 
     at             s, by the operator's monotonic clock
-    as_of          s, the vehicle's time that the operator assumed, see `runner.vehicle.operators`
+    as_of          s, the operator's estimate of the vehicle's time, see `runner.vehicle.operators`
     units          in order of arrival
-    packets, lost  RTP packets of all cameras received, and missing at first: some may have been repaired
-    latency_ms     age of the oldest picture on show, from capture to decoding, at most; absent: unknown
-    damaged        cameras whose newest picture shows that packets were lost for good; absent: none
-    sent           s since 1970, by the operator's clock; given where the vehicle is to answer with a `ClockAnswer`
+    packets, lost  RTP packets of all cameras received, and initially missing: some may have been recovered
+    latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding; absent: unknown
+    damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
+    sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
     """
 
     at: float
@@ -435,7 +435,7 @@ class VideoBegan:
 
 @dataclass(frozen=True, slots=True)
 class VideoShifted:
-    """From a frame on, times in a video file are off by another amount: a pause, or a receiver that smooths them.
+    """From a frame on, the offset of times in a video file changes, by a pause or a receiver that smooths them.
 
     after_s   s from the file's first frame to this one, by the file
     captured  capture time of this one, s since 1970
@@ -536,7 +536,7 @@ _prepared = set[type[Any]]()
 
 
 def _prepare(kind: type[Any]) -> None:
-    """Let msgspec build its description of a type: at the first use it crashes if two threads do so at once (0.22)."""
+    """Let msgspec build its description of a type: msgspec (0.22) crashes if two threads race to do so on first use."""
     with _preparing:
         msgspec.json.Decoder(kind)
         _prepared.add(kind)
@@ -564,7 +564,7 @@ _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if 
 
 
 def decision_to_json(decision: Decision) -> Json:
-    """The JSON object of a decision; no intermediate record, since a replay writes thousands per second."""
+    """The JSON object of a decision; without an intermediate record, since a replay writes thousands per second."""
     cameras = {name: _decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
     return {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
 

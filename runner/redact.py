@@ -1,4 +1,4 @@
-"""Remove passwords from addresses in everything that is shown, logged or stored."""
+"""Removes passwords from addresses in everything that is shown, logged or stored."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']
 
 
 def has_password(address: str) -> bool:
-    """Whether an address holds a user name or a password."""
+    """Whether an address contains a user name or a password."""
     return bool(_USER.search(address) or _NAMED.search(address))
 
 

@@ -8,5 +8,5 @@ import runner
 
 
 def directory(name: str) -> Path:
-    """The packaged conf/ or schemas/: inside the installed package; in a checkout a link to the one beside it."""
+    """The packaged conf/ or schemas/: inside the installed package; in a checkout linked to the top-level one."""
     return (Path(runner.__file__).parent / name).resolve()

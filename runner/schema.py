@@ -1,7 +1,7 @@
-"""Check documents against the JSON Schemas in schemas/ and report problems in plain words.
+"""Checks documents against the JSON Schemas in schemas/ and reports problems in plain language.
 
-Two libraries share the work: jsonschema-rs checks whether a document is valid, a hundred times faster than jsonschema,
-which lists the errors of an invalid one.
+Two libraries share the work: jsonschema-rs checks validity, a hundred times faster than jsonschema, which lists the
+errors of an invalid document.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 Path = tuple[str | int, ...]
 DEEPEST_JSON = 32  # levels; a composed configuration has ten
-MOST_ERRORS = 50  # of a message or a line that are explained; each takes time
+MAX_ERRORS = 50  # explained per message or line; each takes time
 LONGEST_SHOWN = 80  # characters of a value in a message
 _BASE = "json-schema:///"
-LONGEST_WHOLE = 300  # digits; a number that is written out again as a float must fit into one
+LONGEST_WHOLE = 300  # digits; the number must fit into a float
 
 _TYPES = {
     "integer": "a whole number",
@@ -41,7 +41,7 @@ _TYPES = {
 _PATTERNS = {
     "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
     "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
-    r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation in its place
+    r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation instead
 }
 
 
@@ -89,7 +89,7 @@ def shortened(text: str) -> str:
 
 @cache
 def _compiled(reference: str) -> Any:
-    """The jsonschema-rs validator for a reference; relative references need a base there."""
+    """The jsonschema-rs validator for a reference; it needs a base for relative references."""
     from jsonschema_rs import Draft202012Validator
 
     return Draft202012Validator({"$ref": f"{_BASE}{reference}"}, registry=_compiled_registry())
@@ -145,7 +145,7 @@ def referred(reference: str, schema: str) -> tuple[Any, str]:
 
 
 def read_json(text: str | bytes) -> Any:
-    """A JSON document from outside; its numbers must be finite: NaN, Infinity and 1e999 are rejected.
+    """Parse untrusted JSON; numbers must be finite: NaN, Infinity and 1e999 are rejected.
 
     raises  ValueError, also if it is nested deeper than any of our messages
     """
@@ -242,7 +242,7 @@ def _registry() -> Any:
     from referencing.jsonschema import DRAFT202012
 
     def resource(name: str) -> Any:
-        # With its own $schema, jsonschema would continue with its own class instead of `_draft`.
+        # With $schema, jsonschema would switch to its own class instead of `_draft`.
         content = {key: value for key, value in schema_document(name).items() if key != "$schema"}
         return DRAFT202012.create_resource(content)
 
@@ -250,7 +250,7 @@ def _registry() -> Any:
 
 
 def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
-    """What YAML can express and JSON Schema cannot check: keys that are not text, numbers that are not finite."""
+    """Problems that YAML allows but JSON Schema cannot check: keys that are not text, numbers that are not finite."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if isinstance(key, str):
@@ -267,8 +267,8 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:
-    """The problems of a document, MOST_ERRORS at most: it may come from an attacker; None if it is valid."""
-    found = _explained(islice(_errors(reference, document), MOST_ERRORS))
+    """The problems of a document, at most MAX_ERRORS since it may be hostile; None if it is valid."""
+    found = _explained(islice(_errors(reference, document), MAX_ERRORS))
     return None if not found else "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
 
 
@@ -293,7 +293,7 @@ def _explain(error: Any) -> Iterator[Finding]:
                 if key not in value:
                     yield Finding((*path, key), "missing", "must be given")
         case "anyOf":
-            # Of several forms, the one of the right type was meant.
+            # Explain the alternative whose type matches.
             meant = [inner for inner in error.context if inner.validator != "type"]
             yield from _explain((meant or error.context)[0])
         case "propertyNames" | "not" | "if":

@@ -35,7 +35,7 @@ def shared_cache(factory: pytest.TempPathFactory) -> Path:
 
 
 class Drive:
-    """A run that takes events by the keys of their JSON; time does not advance unless `t` is given."""
+    """A run that accepts events as JSON keys; time does not advance unless `t` is given."""
 
     def __init__(self, *overrides: str) -> None:
         self.vehicle = vehicle(*overrides)
@@ -70,7 +70,7 @@ class Result(NamedTuple):
 
     @property
     def problems(self) -> list[str]:
-        """The reported problems, after checking that everything else is as usual for wrong input."""
+        """The reported problems, after checking that everything else is as expected for invalid input."""
         *problems, summary = self.err.splitlines()
         count = len(problems)
         assert self.status == 2, self.err

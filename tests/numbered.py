@@ -18,7 +18,7 @@ def numbered(number: int) -> np.ndarray:
 
 
 def number_of(picture: np.ndarray) -> int | None:
-    """The number in a picture; None where it shows damage, as after lost packets."""
+    """The number in a picture; None if it is damaged, for example by packet loss."""
     height, width = picture.shape[:2]
     seen = [int(picture[height // 2, round((bit + 0.5) * width / BITS)].mean()) for bit in range(BITS)]
     clear = all(grey < 64 or grey > 192 for grey in seen)

@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import UNCAPPED, advanced, believed, started
+from runner.core.link_cap import UNCAPPED, believed_limit, start_cap, update_cap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -53,7 +53,7 @@ class Queue:
 
 
 class Tcp:
-    """A TCP flow: one packet more per round trip, 0.7 of the window after a loss (RFC 9438)."""
+    """A TCP flow: the window grows by one packet per round trip, and shrinks to 0.7 on loss (RFC 9438)."""
 
     PACKET = 1500
 
@@ -105,7 +105,7 @@ class Drive:
         return min(cap for t, cap, _ in self.caps if begin <= t < end)
 
     def first(self, since: float, wanted: Callable[[float], bool]) -> float:
-        """s from a time until the cap fulfils a condition."""
+        """Time until the cap fulfils a condition, s."""
         return next(t for t, cap, _ in self.caps if t >= since and wanted(cap)) - since
 
 
@@ -139,7 +139,7 @@ def drive(
     rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
     link_queue, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
-    done, cap = Drive(tcp=tcp.delivered), started(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
+    done, cap = Drive(tcp=tcp.delivered), start_cap(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
     events: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -192,8 +192,10 @@ def drive(
             uplink, estimated = estimate(uplink, what)
             if estimated:
                 measured = _measured(t, estimated, 2 * link.one_way_s)
-                cap = advanced(cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None)
-            trusted = float(believed(cap, Fraction(limit(t)), Fraction(1, 2)))
+                cap = update_cap(
+                    cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None
+                )
+            trusted = float(believed_limit(cap, Fraction(limit(t)), Fraction(1, 2)))
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done

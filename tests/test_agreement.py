@@ -10,7 +10,7 @@ def of(*overrides: str) -> dict[str, object]:
     return dict(settings(configuration(["vehicle=delivery_robot", *overrides]).document))
 
 
-def test_what_belongs_to_one_side_need_not_agree() -> None:
+def test_settings_of_one_side_need_not_agree() -> None:
     own = of("source=v4l2", "cameras.front.device=/dev/video7", "media.host=192.0.2.1", "page.port=1", "pqos=constant")
     assert differences(of("source=test"), own) is None
 

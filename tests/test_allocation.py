@@ -59,7 +59,7 @@ def test_allocate(
 
 
 @given(cameras, bitrates)
-def test_it_spends_what_it_may_and_gives_nobody_more_than_the_demand(
+def test_the_total_is_spent_and_no_camera_gets_more_than_its_demand(
     given: dict[str, tuple[Fraction, Fraction]], total: Fraction
 ) -> None:
     demands, weights = {n: d for n, (d, _) in given.items()}, {n: w for n, (_, w) in given.items()}
@@ -86,7 +86,7 @@ def test_the_order_of_cameras_does_not_matter(
 
 
 @given(cameras, bitrates, bitrates)
-def test_more_for_all_is_less_for_nobody(
+def test_a_larger_total_reduces_no_share(
     given: dict[str, tuple[Fraction, Fraction]], total: Fraction, more: Fraction
 ) -> None:
     demands, weights = {n: d for n, (d, _) in given.items()}, {n: w for n, (_, w) in given.items()}
@@ -95,7 +95,7 @@ def test_more_for_all_is_less_for_nobody(
 
 
 @given(st.dictionaries(st.sampled_from("abcdefgh"), bitrates), bitrates, factors.filter(bool))
-def test_weights_that_are_all_the_same_are_the_paper(
+def test_equal_weights_give_the_papers_allocation(
     demands: dict[str, Fraction], total: Fraction, weight: Fraction
 ) -> None:
     wanted = sum(demands.values())
@@ -156,7 +156,7 @@ def test_floors_come_first_and_the_total_holds(
         (220, ("a", "b"), ("a",)),
     ],
 )
-def test_who_is_given_up(total: int, before: tuple[str, ...], expected: tuple[str, ...]) -> None:
+def test_cameras_given_up(total: int, before: tuple[str, ...], expected: tuple[str, ...]) -> None:
     demands, floors = dict.fromkeys("abc", Fraction(1000)), dict.fromkeys("abc", Fraction(100))
     assert shed(demands, Fraction(total), floors, ("a", "b"), before) == expected
 

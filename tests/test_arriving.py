@@ -1,4 +1,4 @@
-"""Packets gathered into frames as they arrive: what came of each, when, and what is missing."""
+"""Packets grouped into frames as they arrive: bytes, arrival time and missing packets of each frame."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def extension(number: int = 1) -> bytes:
         (header(), 12, 0, None),
     ],
 )
-def test_what_a_header_says(data: bytes, size: int, payload: int, captured: float | None) -> None:
+def test_header_fields_are_parsed(data: bytes, size: int, payload: int, captured: float | None) -> None:
     assert read_packet(data, size) == Packet(0x1234, 0xABCD, last=False, bytes=payload, captured=captured)
 
 
@@ -47,13 +47,13 @@ class Stream:
     def __init__(self) -> None:
         self.frames, self._first = ArrivingFrames(), 65_530  # numbers wrap around soon
 
-    def send(self, frame: int, parts: str = "01", *, after_ms: float = 0, again: bool = False) -> bool:
+    def send(self, frame: int, parts: str = "01", *, after_ms: float = 0, retransmitted: bool = False) -> bool:
         newer = False
         for part in map(int, parts):
             packet = Packet(
                 (self._first + 2 * frame + part) % 65536, 4500 * frame % 2**32, part == 1, 1000, CAPTURED + frame / 20
             )
-            newer = self.frames.add(packet, self.at(frame, 2 * part + after_ms), again=again)
+            newer = self.frames.add(packet, self.at(frame, 2 * part + after_ms), retransmitted=retransmitted)
         return newer
 
     @staticmethod
@@ -61,7 +61,7 @@ class Stream:
         return frame / 20 + ms * MS
 
     def taken(self, frame: int, ms: float = 40) -> list[tuple[float, float, int, bool]]:
-        """Frames taken so long after the begin of one: number, ms from its begin to its arrival, bytes, whole."""
+        """Frames taken `ms` after the start of one: number, ms from its start to its arrival, bytes, whole."""
         found = []
         for arrived, captured, size, whole in self.frames.take(self.at(frame, ms)):
             number = round(20 * (captured - CAPTURED))
@@ -90,7 +90,7 @@ def test_a_missing_first_packet() -> None:
     assert stream.counted == (3, 1)
 
 
-def test_a_missing_last_packet_is_noticed_by_time_and_by_the_next_frame() -> None:
+def test_a_missing_last_packet_is_detected_by_timeout_and_by_the_next_frame() -> None:
     stream = Stream()
     stream.send(0)
     stream.send(1, "0")
@@ -107,7 +107,7 @@ def test_a_missing_last_packet_is_noticed_by_time_and_by_the_next_frame() -> Non
     assert stream.counted == (8, 2)
 
 
-def test_a_packet_that_was_overtaken_is_not_missing() -> None:
+def test_a_reordered_packet_is_not_missing() -> None:
     stream = Stream()
     stream.send(0)
     assert not stream.send(1, "10")
@@ -116,13 +116,13 @@ def test_a_packet_that_was_overtaken_is_not_missing() -> None:
     assert stream.counted == (6, 0)
 
 
-def test_a_packet_that_is_sent_again_was_missing_at_first() -> None:
+def test_a_retransmitted_packet_counts_as_missing() -> None:
     stream = Stream()
     stream.send(0)
     stream.send(1, "1")
-    assert not stream.send(1, "0", after_ms=20, again=True)
+    assert not stream.send(1, "0", after_ms=20, retransmitted=True)
     stream.send(2, "0")
-    assert stream.send(2, "1", after_ms=30, again=True), "the last one of a frame, which was requested by time"
+    assert stream.send(2, "1", after_ms=30, retransmitted=True), "the last one of a frame, requested after a timeout"
     assert [(number, size, whole) for number, _, size, whole in stream.taken(2)] == [
         (0, 2000, True),
         (1, 1000, False),
@@ -130,11 +130,11 @@ def test_a_packet_that_is_sent_again_was_missing_at_first() -> None:
     ]
     assert stream.counted == (4, 2)
     stream.send(3, "0")
-    assert stream.frames.is_late(stream.at(3, 11)), "what it took to send one again says nothing about gaps"
+    assert stream.frames.is_late(stream.at(3, 11)), "the time of a retransmission is no gap between packets"
 
 
 @pytest.mark.parametrize("first", [30_000, 65_000])
-def test_a_stream_that_begins_anew_is_known_by_its_second_packet(first: int) -> None:
+def test_a_restarted_stream_is_recognised_by_its_second_packet(first: int) -> None:
     stream = Stream()
     stream.send(0)
     stream._first = first
@@ -145,7 +145,7 @@ def test_a_stream_that_begins_anew_is_known_by_its_second_packet(first: int) -> 
     assert stream.counted == (9, 0)
 
 
-def test_one_stray_packet_begins_nothing() -> None:
+def test_one_stray_packet_is_no_restart() -> None:
     stream = Stream()
     stream.send(0)
     stream.frames.add(Packet(30_000, 0, last=False, bytes=1000, captured=0.0), 0.01)
@@ -154,7 +154,7 @@ def test_one_stray_packet_begins_nothing() -> None:
     assert stream.counted == (4, 0)
 
 
-def test_a_packet_that_comes_twice_hides_no_loss() -> None:
+def test_a_duplicate_packet_hides_no_loss() -> None:
     stream = Stream()
     stream.send(0)
     stream.send(1, "1")

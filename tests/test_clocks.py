@@ -77,19 +77,19 @@ def test_a_reported_step_smaller_than_the_round_trip_is_followed() -> None:
         t, ahead = number * EVERY_S, 0.0 if number < 50 else 0.058
         clocks.add(t + 0.06, Exchange(t, t + 0.03 + ahead, t + 0.03 + ahead, t + 0.06, (7.0, 9.0 + ahead)))
         known = clocks.difference(t + 0.06)
-        if number != 50:  # then nothing is known
+        if number != 50:  # then the difference is unknown
             assert known
             assert abs(known.ahead_s - ahead) <= known.bound_s
     assert known
     assert known.ahead_s == pytest.approx(0.058, abs=0.001)
 
 
-def test_a_clock_that_linux_slews_stays_within_the_bound() -> None:
+def test_a_slewed_clock_stays_within_the_bound() -> None:
     found = list(compared(60, mobile(4), lambda t: 500e-6 * max(0.0, min(t, 40.0) - 20.0)))
     assert all(abs(known.ahead_s - truth) <= known.bound_s for _, known, truth in found)
 
 
-def test_without_an_exchange_for_10_s_nothing_is_known() -> None:
+def test_without_an_exchange_for_10_s_the_difference_is_unknown() -> None:
     clocks = ClockComparison()
     clocks.add(0.0, Exchange(0.0, 0.01, 0.01, 0.02))
     assert clocks.difference(KEPT_S)

@@ -23,7 +23,7 @@ def test_while_nothing_is_sent_the_other_knobs_stay() -> None:
     assert wanted(replace(FRONT, sending=False, kbps=0)) == {"sending": False}
 
 
-def test_first_everything_then_nothing_then_what_differs() -> None:
+def test_only_differences_are_commanded() -> None:
     first = difference(DECISION, {})
     assert [(c.camera, c.knob) for c in first] == [
         (camera, knob) for camera in ("front", "rear", "mast") for knob in ("sending", "roi", "size", "bitrate")

@@ -67,7 +67,7 @@ def test_the_papers_vehicle_is_table_1_digit_by_digit() -> None:
     assert {c.weight for c in cameras.values()} == {1}
 
 
-def test_the_second_vehicle_is_of_other_shape() -> None:
+def test_the_second_vehicle_has_another_structure() -> None:
     cameras = vehicle("vehicle=delivery_robot").cameras
     assert len(cameras) == 3
     assert len({(c.width, c.height, c.rate_quality.scaling) for c in cameras.values()}) == 3
@@ -90,7 +90,7 @@ def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
 # --- a user's own directory -------------------------------------------------------------------------------------------
 
 
-def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> None:
+def test_a_users_file_shadows_only_the_packaged_file_of_its_name(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"b_full_kbps: 5000": "b_full_kbps: 7000"})
     cameras = configuration(["source=test"], conf.path).vehicle().cameras
     assert cameras["front_center"].rate_quality.b_full == 7000
@@ -98,7 +98,7 @@ def test_a_users_file_shadows_a_packaged_one_and_only_that(conf: UserConf) -> No
     assert vehicle().cameras["front_center"].rate_quality.b_full == 5000
 
 
-def test_a_user_adds_vehicle_camera_graph_modes_and_source(conf: UserConf) -> None:
+def test_a_user_can_add_files_of_every_group(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"1920": "640", "1040": "480"})
     (conf.path / "cameras/front_center.yaml").rename(conf.path / "cameras/tiny.yaml")
     conf.change("graph/h264_rtsp.yaml", {"first_port: 5600": "first_port: 7000"})
@@ -146,7 +146,7 @@ def test_a_mounted_camera_may_have_its_own_graph_and_source(conf: UserConf) -> N
     assert [c.source.elements[0].factory for c in cameras.values()] == ["appsrc", "videotestsrc"]
 
 
-def test_overrides_mount_unmount_and_exchange_cameras() -> None:
+def test_overrides_mount_unmount_and_replace_cameras() -> None:
     cameras = vehicle(
         "+cameras@cameras.extra=top_view", "~cameras.top_rear", "cameras@cameras.top_left=rear_center"
     ).cameras
@@ -154,7 +154,7 @@ def test_overrides_mount_unmount_and_exchange_cameras() -> None:
     assert (cameras["extra"].width, cameras["top_left"].height) == (1280, 1200)
 
 
-def test_the_environment_names_the_directory_too_and_an_argument_wins(
+def test_the_environment_may_name_the_directory_and_an_argument_wins(
     conf: UserConf, tmp_path: Path, tod: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf.write("vehicle/mine.yaml", MINE)
@@ -268,7 +268,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             GRAPH,
             {"name: pay0": "name: pay"},
-            "vehicle: 'pay': the last element must be named pay0, as the RTSP server asks",
+            "vehicle: 'pay': the last element must be named pay0, as the RTSP server requires",
         ),
         (
             GRAPH,
@@ -284,7 +284,7 @@ REAR, GRAPH, PAPER, ROBOT = (
             "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
-        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: this rule needs it"),
+        (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: required by this rule"),
         (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number from 0"),
         (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
         (
@@ -316,7 +316,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
             "@cameras.rear",
             "@cameras.front",
             "defaults: '/cameras@cameras.front': is chosen twice; "
-            "to choose again write override /cameras@cameras.front: FILE",
+            "to replace a choice write override /cameras@cameras.front: FILE",
         ),
         ("  rear:\n", "  front:\n", "line 18: found duplicate key front"),
         ("  rear:\n", "  raer:\n", "cameras.raer: no camera of that name is mounted, did you mean rear?"),
@@ -355,7 +355,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         (
             ": compact_480p",
             ": ${oc.env:HOME}",
-            "defaults: ${oc.env:HOME}: a defaults list may refer to a choice above it only, such as ${vehicle}",
+            "defaults: ${oc.env:HOME}: a defaults list may refer only to a choice above it, such as ${vehicle}",
         ),
     ],
 )
@@ -462,8 +462,8 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             ["cameras.front_left.place.column_span=2"],
             'cameras.front_center.place: {"row": 0, "column": 1}: overlaps the place of camera front_left',
         ),
-        (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already that of view"),
-        (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already that of enlarge"),
+        (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already assigned to view"),
+        (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already assigned to enlarge"),
         (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or null"),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
@@ -474,7 +474,7 @@ def test_a_mistake_on_the_command_line(conf: UserConf, tod: Command, words: list
     assert problem.endswith(expected)
 
 
-def test_every_tile_that_lies_on_another_is_reported(conf: UserConf, tod: Command) -> None:
+def test_every_overlapping_tile_is_reported(conf: UserConf, tod: Command) -> None:
     words = [f"cameras.{name}.place.row=0" for name in ("rear_center", "top_left", "top_right")]
     found = [line.removeprefix("command line: cameras.") for line in problems(tod, conf, *words)]
     assert found == [
@@ -549,7 +549,7 @@ def test_the_same_problem_is_reported_once() -> None:
     assert str(two).splitlines()[1:] == ["a.yaml: must not either", "2 problems, nothing was started"]
 
 
-def test_no_part_of_the_environment_comes_into_the_configuration(conf: UserConf) -> None:
+def test_the_environment_does_not_affect_the_configuration(conf: UserConf) -> None:
     conf.write("vehicle/mine.yaml", MINE.replace("top_view", "${oc.env:KIND}"))
     words = ("print", "vehicle=mine", "source=test", conf.word)
     result = process(*words, env={**os.environ, "KIND": "top_view"})

@@ -33,7 +33,7 @@ def convert(tod, listed, tmp_path):
     return lambda *words: tod("convert", str(listed), f"output={tmp_path / 'out'}", *words)
 
 
-def test_a_list_becomes_a_vehicle_that_is_valid(convert, tod, tmp_path):
+def test_a_list_is_converted_to_a_valid_vehicle(convert, tod, tmp_path):
     out = tmp_path / "out"
     files = [out / "vehicle/van.yaml", *(out / f"cameras/van_{name}.yaml" for name in ("front_left", "rear", "top"))]
     result = convert("vehicle=van", *SIZE)
@@ -155,7 +155,7 @@ def test_all_mistakes_of_a_list_are_reported(convert, listed):
     ]
 
 
-def test_names_that_yaml_would_read_as_something_else(convert, listed, tod, tmp_path):
+def test_names_that_yaml_would_parse_as_another_type(convert, listed, tod, tmp_path):
     listed.write_text(LIST.replace("rear", '"on"'))
     assert convert("vehicle=off", *SIZE).status == 0
     assert tod("print", "vehicle=off", f"conf={tmp_path / 'out'}", "source=test").status == 0

@@ -28,10 +28,10 @@ def stream(text: str, lost: str) -> list[tuple[bytes, bool]]:
     ("text", "lost", "expected"),
     [
         ("k...w...w...", "            ", "------------"),
-        ("k...k...", " x      ", "-DDD----"),  # an IDR picture heals at once
+        ("k...k...", " x      ", "-DDD----"),  # an IDR picture heals immediately
         ("k...w...w...", " x          ", "-DDDDDD-----"),  # a wave heals with its last picture
-        ("k...w...w...", "    x       ", "----DDDDDDD-"),  # one that has lost its beginning does not
-        ("k...w...w...", " x   x      ", "-DDDDDDDDDD-"),  # nor one with a loss in it
+        ("k...w...w...", "    x       ", "----DDDDDDD-"),  # a wave whose beginning is lost does not
+        ("k...w...w...", " x   x      ", "-DDDDDDDDDD-"),  # nor does a wave with a loss
         ("k...w...w...", " x        x ", "-DDDDDD---DD"),
         ("k...", "x   ", "DDDD"),  # packets of the IDR picture itself are missing
     ],
@@ -40,12 +40,12 @@ def test_a_loss_shows_until_the_picture_is_healed(text: str, lost: str, expected
     assert damaged(stream(text, lost)) == expected
 
 
-def test_of_a_codec_that_is_not_understood_only_incomplete_units_are_known_to_be_damaged() -> None:
+def test_for_unsupported_codecs_only_incomplete_units_count_as_damaged() -> None:
     assert damaged([(b"", False), (b"", True), (b"", False)], codec="vp8") == "-D-"
 
 
 def test_a_shorter_wave_that_begins_later_heals_first() -> None:
-    """And one of a negative length, from bytes that are no recovery point, does not count."""
+    """A wave of negative length, parsed from bytes that are no recovery point, does not count."""
     wave_of_100 = AUD + SPS + PPS + SEI + bytes.fromhex("06030191") + b"\x80" + SLICE + b"\x9a"
     wrong = AUD + SPS + PPS + SEI + bytes.fromhex("060100") + SLICE + b"\x9a"
     units = [(DELTA, True), (wave_of_100, False), (DELTA, False), (WAVE_OF_4, False), *[(DELTA, False)] * 4]
@@ -53,25 +53,25 @@ def test_a_shorter_wave_that_begins_later_heals_first() -> None:
     assert damaged([(DELTA, True), (wrong, False), (DELTA, False), (KEY, False)]) == "DDD-"
 
 
-def test_nothing_is_read_while_the_picture_is_whole() -> None:
+def test_units_are_not_parsed_while_the_picture_is_intact() -> None:
     def fail() -> bytes:
         raise AssertionError
 
     assert not Damage("h264").add(False, fail)
 
 
-def test_the_beginning_of_a_unit_is_enough() -> None:
+def test_the_first_bytes_of_a_unit_suffice() -> None:
     noise = bytes(range(1, 256)) * 100
     damage = Damage("h264")
     assert damage.add(True, lambda: b"")
     assert not damage.add(False, lambda: (KEY + noise)[:HEAD_BYTES])
 
 
-def test_what_was_missed_before_the_first_unit_shows_likewise() -> None:
-    damage = Damage("h264", lasts=True)
+def test_units_missed_before_the_first_one_cause_damage() -> None:
+    damage = Damage("h264", is_damaged=True)
     assert [damage.add(False, lambda: DELTA), damage.add(False, lambda: KEY), damage.add(False, lambda: DELTA)] == [
         True,
         False,
         False,
     ]
-    assert not Damage("vp8", lasts=True).lasts
+    assert not Damage("vp8", is_damaged=True).is_damaged

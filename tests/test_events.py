@@ -42,7 +42,7 @@ KNOWN = ", ".join([*event_names()[:13], "..."])
 
 
 @pytest.mark.parametrize("document", EXAMPLES)
-def test_there_and_back(document: dict[str, Any]) -> None:
+def test_events_survive_a_round_trip_through_json(document: dict[str, Any]) -> None:
     assert event_problem(document) is None
     assert to_json(parse(document)) == document
     assert parse(json.loads(json.dumps(to_json(parse(document))))) == parse(document)
@@ -52,7 +52,7 @@ def test_there_is_an_example_of_every_event() -> None:
     assert {document["event"] for document in EXAMPLES} == set(EVENTS) == set(event_names())
 
 
-def test_numbers_are_what_was_written() -> None:
+def test_numbers_are_exact() -> None:
     predicted = parse({"t": 0, "event": "bitrate_predicted", "kbps": 0.1})
     assert isinstance(predicted, BitratePredicted) and predicted.kbps == Fraction(1, 10)
     configured = parse({"t": 0, "event": "camera_configured", "camera": "a", "scaling": 0.3})

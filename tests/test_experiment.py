@@ -42,7 +42,7 @@ def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str)
 PAUSE = "{at_s: 9, request: {event: camera_switched, camera: rear_center, on: false}}"
 
 
-def test_requests_are_in_the_order_of_their_times() -> None:
+def test_requests_are_sorted_by_time() -> None:
     early = "{at_s: 2.5, request: {event: mode_selected, mode: collective}}"
     requests = configuration(
         ["experiment=driving_test", f"+experiment.requests=[{PAUSE}, {early}]"], runnable=False
@@ -154,14 +154,14 @@ def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> Non
     assert "did you mean paper?" in tod("validate", conf.word, *NARROW).err
 
 
-def test_a_relay_joins_rtsp_only(tod: Command) -> None:
+def test_a_relay_supports_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2
     rule = "supports RTSP only; the graph of front_left has its own transport; choose link=netns"
     assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
 
 
-def test_the_way_back_has_one_rate(tmp_path: Path) -> None:
+def test_the_reverse_direction_has_one_rate(tmp_path: Path) -> None:
     trace = tmp_path / "downlink.csv"
     trace.write_text("t_s,kbps\n0,500\n1,50\n")
     back = "link.reverse={{{}, queue_ms: 100, delay_ms: 5}}"
@@ -186,7 +186,7 @@ def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:
     assert result.err == f"command line: link: relay: {rule}\n"
 
 
-def test_the_demo_does_not_write_among_other_files(tod: Command, tmp_path: Path) -> None:
+def test_the_demo_does_not_write_into_a_directory_with_other_files(tod: Command, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     result = tod("demo", "source=test", f"output={tmp_path}")
     rule = "must be a new or empty directory, but contains thesis.tex"

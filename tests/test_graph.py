@@ -260,7 +260,7 @@ def test_the_url_of_a_camera() -> None:
     [
         (
             {"vehicle": (Element("pay", "rtph264pay", {}),)},
-            "vehicle: 'pay': the last element must be named pay0, as the RTSP server asks",
+            "vehicle: 'pay': the last element must be named pay0, as the RTSP server requires",
         ),
         (
             {"vehicle": (Element("pay0", "a", {}), Element("pay0", "b", {}))},

@@ -79,12 +79,12 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
         (("graph.effort=most",), "'most': must be one of low, medium, high"),
         (
             ("graph.effort=high", "~graph.efforts.high"),
-            "high: must be low or medium, which the encoder of this graph has",
+            "high: must be low or medium, which this graph's encoder supports",
         ),
-        (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which the encoder of this graph has"),
+        (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],
 )
-def test_an_effort_that_the_encoder_has_not_is_refused(tod: Command, words: tuple[str, ...], problem: str) -> None:
+def test_an_effort_that_the_encoder_lacks_is_rejected(tod: Command, words: tuple[str, ...], problem: str) -> None:
     assert tod("print", "source=test", *words).problems == [f"command line: graph.effort: {problem}"]
 
 
@@ -121,7 +121,7 @@ def test_the_composed_graph_is_whole_lists() -> None:
         ),
         (
             "defaults: [h264_rtsp, _self_]\nsender:\n  - {name: sent, element: identity}\n",
-            "vehicle: 'sent': the last element must be named pay0, as the RTSP server asks",
+            "vehicle: 'sent': the last element must be named pay0, as the RTSP server requires",
         ),
     ],
 )
@@ -148,7 +148,7 @@ def test_a_path_is_the_one_in_the_file(conf: UserConf, tod: Command, old: str, n
     assert found == {(f"{conf.path}/graph/h264_rtsp.yaml", path)}
 
 
-def test_a_part_that_no_list_takes_in_is_refused(conf: UserConf, tod: Command) -> None:
+def test_a_part_that_no_list_includes_is_rejected(conf: UserConf, tod: Command) -> None:
     conf.change("graph/h264_rtsp.yaml", {"  - ${..encoder}\n": ENCODER})
     # The packaged graph defines an encoder that the user's list would silently ignore.
     assert tod("print", "source=test", "graph=openh264_rtsp", conf.word).problems == [

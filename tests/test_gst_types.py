@@ -19,6 +19,6 @@ print("SDPMessage" in vars(GstSdp), "RTSPContext" in vars(GstRtspServer))
 
 
 def test_the_classes_of_all_types_are_made_before_threads_use_them() -> None:
-    """PyGObject makes a class at its first use; two threads at once would make two, which refuse each other."""
+    """PyGObject creates a class on first use; two racing threads would create two, which reject each other."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60, check=False)
     assert (done.stdout, done.stderr) == ("True True\n", "")

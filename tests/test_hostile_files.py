@@ -11,7 +11,7 @@ import pytest
 from helpers import CONF, Command, UserConf
 
 from runner.configuration import yaml_file
-from runner.configuration.interpolation import written_out
+from runner.configuration.interpolation import expands_within
 
 LONGEST_S = 2.0
 
@@ -34,15 +34,15 @@ def _interpolations(path: Path) -> None:
 @pytest.mark.parametrize(
     "make, expected",
     [
-        (_aliases, "line 5: must hold at most 10000 values, aliases written out"),
-        (_merges, "line 5: must hold at most 10000 values, aliases written out"),
+        (_aliases, "line 5: must contain at most 10000 values, with aliases expanded"),
+        (_merges, "line 5: must contain at most 10000 values, with aliases expanded"),
         (_interpolations, "interpolations, ${...}, are nested too deeply or expand to more than 50000 values"),
         (
             lambda path: path.write_text("a: " + "[" * 3000 + "]" * 3000),
             "line 1: must be nested at most 32 levels deep",
         ),
         (lambda path: path.write_text("- " * 3000), "line 1: must be nested at most 32 levels deep"),
-        (lambda path: path.write_text("a: [" + "1," * 10_001 + "]"), "line 1: must hold at most 10000 values, "),
+        (lambda path: path.write_text("a: [" + "1," * 10_001 + "]"), "line 1: must contain at most 10000 values, "),
         (lambda path: path.write_text("a: " + "x" * 100_000), "must be at most 100 kB long"),
         (lambda path: path.write_text("a: 0x" + "F" * 30_000), "line 1: must have at most 300 digits"),
         (lambda path: path.write_text("a: " + "1" * 6000), "Exceeds the limit (4300 digits)"),
@@ -55,9 +55,7 @@ def _interpolations(path: Path) -> None:
         (Path.mkdir, "must be a file"),
     ],
 )
-def test_a_file_is_refused_before_it_does_harm(
-    conf: UserConf, tod: Command, make: Callable[[Path], None], expected: str
-) -> None:
+def test_a_harmful_file_is_rejected(conf: UserConf, tod: Command, make: Callable[[Path], None], expected: str) -> None:
     path = conf.write("modes/paper.yaml", "").path / "modes" / "mine.yaml"
     path.with_name("paper.yaml").unlink()
     make(path)
@@ -69,13 +67,13 @@ def test_a_file_is_refused_before_it_does_harm(
             assert problems[0].startswith(f"{path}: {expected}")
 
 
-def test_files_that_build_on_each_other_in_a_circle(conf: UserConf, tod: Command) -> None:
+def test_files_that_include_each_other_in_a_cycle(conf: UserConf, tod: Command) -> None:
     conf.write("modes/a.yaml", "defaults: [b, _self_]\n").write("modes/b.yaml", "defaults: [a, _self_]\n")
     (problem,) = tod("print", "source=test", "modes=a", conf.word).problems
-    assert problem == "command line: source=test modes=a: files build on each other in a circle"
+    assert problem == "command line: source=test modes=a: files include each other in a cycle"
 
 
-def test_a_misspelt_kind_beside_a_broken_file(conf: UserConf, tod: Command) -> None:
+def test_a_misspelt_kind_next_to_a_broken_file(conf: UserConf, tod: Command) -> None:
     conf.write("modes/broken.yaml", "a: [\n")
     conf.change("vehicle/delivery_robot.yaml", {"wide_720p": "wide_72p"})
     (problem,) = tod("print", "source=test", "vehicle=delivery_robot", conf.word).problems
@@ -105,7 +103,7 @@ def test_the_package_may_stand_in_any_comment_at_the_top(conf: UserConf, tod: Co
         ("fps_max=" + "9" * 400, "must have at most 300 digits"),
     ],
 )
-def test_words_have_limits_too(tod: Command, word: str, expected: str) -> None:
+def test_overrides_are_limited(tod: Command, word: str, expected: str) -> None:
     (problem,) = tod("print", "source=test", word).problems
     assert problem.startswith("command line: ") and problem.endswith(expected) and len(problem) < 200
 
@@ -122,7 +120,7 @@ def test_words_have_limits_too(tod: Command, word: str, expected: str) -> None:
     ],
 )
 def test_the_size_of_interpolations_is_limited(document: object, most: int, fits: bool) -> None:
-    assert written_out(document, most) is fits
+    assert expands_within(document, most) is fits
 
 
 # --- blame ------------------------------------------------------------------------------------------------------------
@@ -137,7 +135,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
     conf.write("modes/mine.yaml", f"{head}  - fade_when_stale: {{}}\n{RULES}")
     problems = tod("print", "source=test", "modes=mine", conf.word).problems
     assert {problem.partition(": ")[0] for problem in problems} == {str(conf.path / "modes/mine.yaml")}
-    assert "automatic[2].fade_when_stale.after_s: missing: this rule needs it" in problems[0]
+    assert "automatic[2].fade_when_stale.after_s: missing: required by this rule" in problems[0]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +143,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
     [
         (
             "modes.automatic=[{total_from_prediction: {}}]",
-            "modes.automatic[0].total_from_prediction.start_kbps: missing: this rule needs it",
+            "modes.automatic[0].total_from_prediction.start_kbps: missing: required by this rule",
         ),
         (
             "cameras.front_left.rate_quality.scaling=[0.5]",
@@ -156,11 +154,11 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
         ("~cameras.front_left.fps", "cameras.front_left.fps: missing: must be given"),
     ],
 )
-def test_a_mistake_of_the_command_line_is_blamed_on_it(tod: Command, word: str, expected: str) -> None:
+def test_a_mistake_on_the_command_line_is_attributed_to_it(tod: Command, word: str, expected: str) -> None:
     assert tod("print", "source=test", word).problems == [f"command line: {expected}"]
 
 
-def test_a_file_that_breaks_what_it_builds_on_is_blamed(conf: UserConf, tod: Command) -> None:
+def test_a_file_that_breaks_its_base_is_blamed(conf: UserConf, tod: Command) -> None:
     conf.write("graph/mine.yaml", "defaults: [h264_rtsp, _self_]\nvehicle: [{name: pay0, element: rtph264pay}]\n")
     conf.write(
         "vehicle/mine.yaml",
@@ -227,7 +225,7 @@ def test_the_content_of_another_file_is_not_shown(tod: Command, tmp_path: Path, 
     assert "boss" not in result.err
 
 
-def test_a_pipe_is_no_map(tod: Command, tmp_path: Path) -> None:
+def test_a_pipe_is_rejected_as_a_map(tod: Command, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (problem,) = tod("validate", f"pqos.file={tmp_path / 'pipe'}").problems
     assert problem == f"command line: pqos.file: {tmp_path / 'pipe'}: must be a file"
@@ -237,7 +235,7 @@ def test_a_pipe_is_no_map(tod: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["robot\\n", "\\n", "a\\nb"])
-def test_a_name_with_a_line_feed_is_none(conf: UserConf, tod: Command, name: str) -> None:
+def test_a_name_with_a_line_feed_is_rejected(conf: UserConf, tod: Command, name: str) -> None:
     conf.change("vehicle/delivery_robot.yaml", {"name: delivery_robot": f'name: "{name}"'})
     (problem,) = tod("print", "source=test", "vehicle=delivery_robot", conf.word).problems
     assert problem.endswith(": must be letters, digits, _ and - only")

@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.vehicle.inbox import MEASUREMENTS, ROUND_S, SENDERS, TAKEN, WAITING, Inbox, Request
+from runner.vehicle.inbox import MAX_PER_ROUND, MAX_QUEUED, MAX_SENDERS, MEASUREMENTS, ROUND_S, Inbox, Request
 
 
 def make_request(sender: str, event: str, **keys: Any) -> Request:
@@ -22,7 +22,7 @@ def all_of(inbox: Inbox, rounds: int = 1) -> list[Request]:
     return taken
 
 
-def test_one_request_of_each_sender_in_turn() -> None:
+def test_senders_are_served_round_robin() -> None:
     inbox = Inbox()
     for number in range(3):
         inbox.put(make_request("a", "total_set", kbps=number))
@@ -30,7 +30,7 @@ def test_one_request_of_each_sender_in_turn() -> None:
     assert [(r.sender, r.document["kbps"]) for r in all_of(inbox)] == [("a", 0), ("b", 9), ("a", 1), ("a", 2)]
 
 
-def test_the_senders_of_what_waits() -> None:
+def test_senders_with_queued_items_are_listed() -> None:
     inbox = Inbox()
     assert inbox.senders() == frozenset()
     for sender in ("a", "b", "a"):
@@ -39,7 +39,7 @@ def test_the_senders_of_what_waits() -> None:
     assert inbox.senders() == {"a", "b"}
 
 
-def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_of_the_mode() -> None:
+def test_a_measurement_supersedes_an_older_one_but_not_across_a_change_of_the_mode() -> None:
     inbox = Inbox()
     first = make_request("a", "bitrate_predicted", kbps=1)
     assert inbox.put(first) is None
@@ -63,19 +63,19 @@ def test_a_measurement_takes_the_place_of_an_older_one_but_not_across_a_change_o
 
 def test_excess_requests_are_refused_and_others_are_not_affected() -> None:
     inbox = Inbox()
-    requests = [make_request("flood", "total_set", kbps=n) for n in range(WAITING + 5)]
-    assert [inbox.put(r) is r for r in requests] == [False] * WAITING + [True] * 5
+    requests = [make_request("flood", "total_set", kbps=n) for n in range(MAX_QUEUED + 5)]
+    assert [inbox.put(r) is r for r in requests] == [False] * MAX_QUEUED + [True] * 5
     assert inbox.put(make_request("a", "total_set", kbps=1)) is None
-    for number in range(2 * SENDERS):
+    for number in range(2 * MAX_SENDERS):
         inbox.put(make_request(f"stranger{number}", "total_set", kbps=1))
-    assert len(all_of(inbox, rounds=2)) == WAITING + SENDERS - 1
+    assert len(all_of(inbox, rounds=2)) == MAX_QUEUED + MAX_SENDERS - 1
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from([*MEASUREMENTS, "total_set", "mode_selected"]))))
 def test_requests_are_never_merged_or_reordered(puts: list[tuple[str, str]]) -> None:
     inbox = Inbox()
     kept = [r for n, (sender, event) in enumerate(puts) if inbox.put(r := make_request(sender, event, n=n)) is not r]
-    taken = all_of(inbox, rounds=2 if len(puts) > TAKEN else 1)
+    taken = all_of(inbox, rounds=2 if len(puts) > MAX_PER_ROUND else 1)
     for sender in "abc":
         numbers = [r.document["n"] for r in taken if r.sender == sender]
         assert numbers == sorted(numbers)
@@ -83,14 +83,14 @@ def test_requests_are_never_merged_or_reordered(puts: list[tuple[str, str]]) -> 
         assert [r.document["n"] for r in taken if r.sender == sender and r.measures is None] == wanted
 
 
-def test_a_flood_is_taken_a_few_at_a_time_and_others_go_between() -> None:
+def test_a_flood_is_throttled_and_others_are_served_in_between() -> None:
     inbox = Inbox()
-    for number in range(WAITING):
+    for number in range(MAX_QUEUED):
         inbox.put(make_request("flood", "total_set", kbps=number))
-    assert len(all_of(inbox)) == TAKEN
+    assert len(all_of(inbox)) == MAX_PER_ROUND
     inbox.put(make_request("a", "total_set", kbps=1))
     assert [request.sender for request in all_of(inbox)] == ["a"]
-    assert len(all_of(inbox, rounds=2)) == WAITING - TAKEN
+    assert len(all_of(inbox, rounds=2)) == MAX_QUEUED - MAX_PER_ROUND
 
 
 def test_waking_ends_the_wait() -> None:

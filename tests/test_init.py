@@ -119,7 +119,7 @@ def test_validate_warns_of_schemas_of_another_version(tod: Command, fleet: Path)
         err == f"{fleet}/{FOLDER}: version 0.0.1, this is tod-runner {own}; your editor may know other keys: {again}\n"
     )
     subprocess.run(["rm", "-r", fleet / FOLDER], check=True)
-    assert tod("validate", f"conf={fleet}").err == ""  # no copies, nothing to be wrong
+    assert tod("validate", f"conf={fleet}").err == ""  # no copies, nothing to report
     assert tod("init", str(fleet), "files=schemas").status == 0
     assert tod("validate", f"conf={fleet}").err == ""
 

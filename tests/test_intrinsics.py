@@ -43,7 +43,7 @@ def projected(lens, point):
     ],
 )
 @pytest.mark.parametrize(("lens", "focal"), [("pinhole", 640.0), ("fisheye", 814.873)])
-def test_a_known_point_lands_where_it_is(lens, focal, roi, width, height):
+def test_a_known_point_is_projected_correctly(lens, focal, roi, width, height):
     known = delivered_intrinsics(replace(FRONT, lens=lens), roi, width, height)
     assert known.model == {"pinhole": "plumb_bob", "fisheye": "equidistant"}[lens]
     for point in POINTS:

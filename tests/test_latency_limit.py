@@ -15,7 +15,7 @@ def test_the_limit_over_the_total_latency(measured_ms: float | None, factor: flo
     assert LatencyLimit(limit_ms=200, fixed_ms=60).speed_factor(measured_ms) == pytest.approx(factor)
 
 
-def test_nothing_is_advised_while_a_part_is_unknown() -> None:
+def test_no_speed_is_advised_while_a_part_is_unknown() -> None:
     assert LatencyLimit().speed_factor(10) is None
 
 

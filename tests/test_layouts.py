@@ -31,7 +31,7 @@ def robot() -> Vehicle:
     return vehicle("vehicle=delivery_robot")
 
 
-def test_what_is_saved_is_text_for_people_and_is_read_again(tmp_path: Path, robot: Vehicle) -> None:
+def test_a_saved_layout_is_readable_and_can_be_loaded(tmp_path: Path, robot: Vehicle) -> None:
     layouts = Layouts(tmp_path, "alice")
     assert layouts.places(robot) == own_places(robot)
     layouts.save(robot, SAVED)
@@ -57,7 +57,7 @@ def test_other_vehicles_stay_as_they_are_and_a_vehicle_can_be_forgotten(tmp_path
     assert Layouts(tmp_path).places(car) == own_places(car)
 
 
-def test_what_a_user_has_written_meanwhile_is_kept_or_named(tmp_path: Path, robot: Vehicle) -> None:
+def test_changes_made_by_the_user_meanwhile_are_kept_or_reported(tmp_path: Path, robot: Vehicle) -> None:
     layouts = Layouts(tmp_path, "alice")
     assert layouts.path
     layouts.save(robot, SAVED)
@@ -72,7 +72,7 @@ def test_what_a_user_has_written_meanwhile_is_kept_or_named(tmp_path: Path, robo
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../alice", "/etc/passwd", "a/b", "a\\b", "a\n", "ä", "a" * 65, "a\0"])
-def test_only_a_name_is_a_name(tmp_path: Path, name: str) -> None:
+def test_invalid_operator_names_are_rejected(tmp_path: Path, name: str) -> None:
     (tmp_path / "conf").mkdir()
     with pytest.raises(UserError, match="an operator's id must be 1 to 64 letters, digits, _ and -"):
         Layouts(tmp_path / "conf", name)
@@ -86,7 +86,7 @@ def test_without_a_directory_nothing_is_saved(robot: Vehicle) -> None:
         layouts.save(robot, SAVED)
 
 
-def test_what_cannot_be_written_is_named(tmp_path: Path, robot: Vehicle) -> None:
+def test_write_errors_are_reported(tmp_path: Path, robot: Vehicle) -> None:
     (tmp_path / "layout").touch()
     layouts = Layouts(tmp_path, "alice")
     with pytest.raises(RunError, match=r"layout/alice\.yaml: cannot be written: "):
@@ -125,7 +125,7 @@ def test_places_from_a_page_are_checked(robot: Vehicle, tmp_path: Path, document
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_camera_that_the_vehicle_has_no_longer_is_noted(tmp_path: Path, robot: Vehicle) -> None:
+def test_a_saved_place_of_a_removed_camera_is_reported(tmp_path: Path, robot: Vehicle) -> None:
     (tmp_path / "layout").mkdir()
     (tmp_path / "layout" / "alice.yaml").write_text("vehicles: {delivery_robot: {fornt: {row: 0, column: 0}}}\n")
     (note,) = Layouts(tmp_path, "alice").notes(robot)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.link.bucket import Bucket
-from runner.link.direction import Lottery
+from runner.link.direction import LossModel
 from runner.link.limit import burst_bytes, queue_bytes
-from runner.link.rtsp import Units, ports, with_ports
+from runner.link.rtsp import Splitter, ports, with_ports
 
 KBPS, QUEUE_MS = 800, 100  # 100 bytes in a ms
 arrivals = st.lists(st.tuples(st.floats(0, 0.05), st.integers(28, 1500)), min_size=1, max_size=60)  # gap s, bytes
@@ -38,7 +38,7 @@ def timed(gaps):
 
 
 @given(arrivals)
-def test_no_stretch_of_time_sees_more_than_the_rate_and_one_bucket(gaps):
+def test_no_period_passes_more_than_the_rate_and_one_bucket(gaps):
     packets = timed(gaps)
     left, _ = passed(packets)
     for first, (begin, _) in enumerate(left):
@@ -69,7 +69,7 @@ def test_a_full_queue_drops_and_reports_its_length():
     for index in range(20):
         bucket.put(1000, index, 0.0)
     counters = bucket.counters(0.0)
-    assert (counters.packets, counters.dropped) == (3, 7)  # 3000 bytes at once, 10 000 wait
+    assert (counters.packets, counters.dropped) == (3, 7)  # 3000 bytes pass immediately, 10 000 wait
     assert counters.queue_ms == pytest.approx(100)
     bucket.put(1000, 20, 0.0, keep=True)
     assert bucket.counters(0.0).dropped == 7
@@ -86,7 +86,7 @@ def test_a_new_rate_applies_to_queued_packets():
     assert bucket.due() == pytest.approx(0.002 + (1000 - 110) / 100_000)
 
 
-def test_without_a_rate_packets_stay_until_there_is_one():
+def test_at_a_rate_of_0_packets_stay_queued():
     bucket = Bucket(0, QUEUE_MS, 0.0)
     for index in range(5):
         bucket.put(1500, index, 0.0)
@@ -117,14 +117,14 @@ PACKET = b"$\x00\x00\x06\r\n\r\nab"
 
 @given(st.lists(st.sampled_from([SETUP, REPLY, SDP, PACKET]), max_size=6), st.integers(1, 90))
 def test_rtsp_is_cut_into_the_same_units_however_it_arrives(sent, chunk):
-    data, units = b"".join(sent), Units()
+    data, units = b"".join(sent), Splitter()
     pieces = (data[start : start + chunk] for start in range(0, len(data), chunk))
     assert [unit for piece in pieces for unit in units.feed(piece)] == sent
 
 
 def test_a_header_that_never_ends_is_not_rtsp():
     with pytest.raises(ValueError, match="no end of an RTSP header"):
-        list(Units().feed(b"x" * 70_000))
+        list(Splitter().feed(b"x" * 70_000))
 
 
 def test_ports_are_read_and_replaced_in_the_transport_header_alone():
@@ -139,15 +139,15 @@ def test_ports_are_read_and_replaced_in_the_transport_header_alone():
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.002, 1), (0.01, 1), (0.03, 10), (0.2, 3)])
-def test_losses_have_their_share_and_length(loss, burst):
-    lottery = Lottery(loss, burst)
-    drawn = [lottery.draw() for _ in range(400_000)]
+def test_losses_have_the_configured_share_and_burst_length(loss, burst):
+    losses = LossModel(loss, burst)
+    drawn = [losses.draw() for _ in range(400_000)]
     runs = sum(lost and not before for before, lost in pairwise([False, *drawn]))
     assert sum(drawn) / len(drawn) == pytest.approx(loss, rel=0.1)
     assert sum(drawn) / runs == pytest.approx(max(burst, 1 / (1 - loss)), rel=0.1)
 
 
 @pytest.mark.parametrize(("loss", "drawn"), [(0, {False}), (1, {True})])
-def test_all_or_nothing_is_lost(loss, drawn):
-    lottery = Lottery(loss, 1)
-    assert {lottery.draw() for _ in range(1000)} == drawn
+def test_a_loss_of_0_or_1_is_exact(loss, drawn):
+    losses = LossModel(loss, 1)
+    assert {losses.draw() for _ in range(1000)} == drawn

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow  # seconds of real time
 
 
 class Watched:
-    """A loop, and what it published and reported. `publishes` is its answer."""
+    """A loop with its published records and reports. `publishes` is the result of `publish`."""
 
     def __init__(self, *words: str) -> None:
         config = configuration(["vehicle=delivery_robot", "pqos=constant", *words], runnable=False)
@@ -57,7 +57,7 @@ class Watched:
             thread.join(10)
 
     def breathe(self, seconds: float, name: str = "driver") -> float:
-        """Signs of life of an operator. Returns the longest time between two, s: it is longer on a busy machine."""
+        """Send heartbeats of an operator. Returns the longest time between two, s, which grows on a busy machine."""
         longest, last = 0.0, time.monotonic()
         end = last + seconds
         while time.monotonic() < end:
@@ -104,7 +104,7 @@ def test_an_operator_returns_though_control_cannot_be_given(monkeypatch: pytest.
     assert "control: OSError: broken pipe" in watched.reports
 
 
-def test_a_reason_that_counts_up_is_published_seldom_while_nobody_is_there() -> None:
+def test_a_changing_reason_is_published_less_often_without_an_operator() -> None:
     """`operator gone for 2.3 s` of eight cameras is some kB, five times a second over the link."""
     watched = Watched("modes=safe")
     with watched.running():
@@ -130,14 +130,14 @@ def test_a_state_that_has_to_wait_is_published_later() -> None:
         assert watched.of(VehicleState)[-1].asked_kbps == 800
 
 
-def test_operators_are_present_after_the_loop_itself_stood_still(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their messages of that time were waiting."""
-    while (silent_s := _stand_still(monkeypatch)) > SILENT_S / 2:  # this process did: the operator was silent indeed
+def test_operators_stay_present_after_the_loop_itself_has_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their messages were queued meanwhile."""
+    while (silent_s := _stand_still(monkeypatch)) > SILENT_S / 2:  # this process stalled: it really was silent
         assert silent_s < 20
 
 
 def _stand_still(monkeypatch: pytest.MonkeyPatch) -> float:
-    """Returns for how long the operator was silent, s."""
+    """Returns how long the operator was silent, s."""
     watched = Watched()
     turn, stood = watched.side.turn, threading.Event()
 
@@ -158,7 +158,7 @@ def _stand_still(monkeypatch: pytest.MonkeyPatch) -> float:
     return silent_s
 
 
-def test_a_steering_angle_is_published_at_once_with_its_time_and_at_most_every_50_ms() -> None:
+def test_a_steering_angle_is_published_immediately_with_its_time_and_at_most_every_50_ms() -> None:
     watched = Watched()
     with watched.running():
         before = time.time()
@@ -176,7 +176,7 @@ def test_a_steering_angle_is_published_at_once_with_its_time_and_at_most_every_5
     assert {angle.rad for angle in published[1:]} == {0.5}
 
 
-def test_what_the_operator_in_control_states_of_its_attention_is_in_the_state_until_another_is_in_control() -> None:
+def test_attention_of_the_operator_in_control_is_published_until_control_passes() -> None:
     watched = Watched()
 
     def states(sender: str, **attention: str) -> None:
@@ -199,6 +199,6 @@ def test_what_the_operator_in_control_states_of_its_attention_is_in_the_state_un
         until(lambda: attention() is UNSET)
         states("other", attention="watching")
         until(lambda: attention() == "watching")
-    told = [report for report in watched.reports if report.startswith("operator driver is ")]
+    reported = [report for report in watched.reports if report.startswith("operator driver is ")]
     expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
-    assert told == [f"operator driver is {what}" for what in expected]
+    assert reported == [f"operator driver is {what}" for what in expected]

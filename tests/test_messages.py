@@ -13,7 +13,7 @@ from runner.mqtt.messages import MAX_REQUEST_BYTES, read_message
 
 
 def padded(size: int) -> bytes:
-    """A request of that many bytes."""
+    """A request of `size` bytes."""
     bare = json.dumps({"id": "1", "event": ""}).encode()
     return bare.replace(b'""', b'"' + b"x" * (size - len(bare)) + b'"')
 
@@ -32,7 +32,7 @@ def test_an_invalid_message_is_refused(payload: bytes, problem: str) -> None:
         read_message(payload)
 
 
-def test_records_are_read_by_several_threads_from_their_first_use_on() -> None:
+def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:
     """In a process of its own, which would crash."""
     program = dedent(
         """\

@@ -57,14 +57,14 @@ def test_windows_count_once_the_decision_is_settled() -> None:
     assert (meter.short, meter.sizes, meter.latencies_ms) == (0, {(480, 260): 4}, [12.0] * 4)
 
 
-def test_what_falls_short_of_the_decision_is_counted() -> None:
+def test_windows_that_fall_short_of_the_decision_are_counted() -> None:
     meter = ReceptionMeter(fps=40)
     feed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
     assert meter.followed == [pytest.approx(0.5)] * 4
     assert (meter.short, meter.sizes) == (4, {})
 
 
-def test_nothing_is_compared_while_nothing_is_to_be_sent() -> None:
+def test_windows_are_not_compared_while_nothing_is_sent() -> None:
     meter = ReceptionMeter(fps=20)
     feed(meter, 5, decided=Decided(sending=False))
     assert meter.windows == 0

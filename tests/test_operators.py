@@ -5,26 +5,26 @@ from __future__ import annotations
 import pytest
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
-from runner.vehicle.operators import DELAYS, MOST, SILENT_S, Operators
+from runner.vehicle.operators import DELAYS, MAX_OPERATORS, SILENT_S, Operators
 
 
-def test_an_operator_leaves_by_its_own_silence_or_goodbye_only() -> None:
+def test_an_operator_leaves_only_by_its_own_silence_or_sign_off() -> None:
     operators = Operators(1.0)
     assert operators.connected("a", 0.0)
     assert operators.connected("b", 0.0)
     assert not operators.disconnected("stranger", 0.0)
     assert operators.disconnected("b", 0.0)
     assert operators.present == {"a"}
-    assert operators.silent(SILENT_S) == []
-    assert operators.silent(SILENT_S + 0.1) == ["a"]
-    assert operators.silent(100) == []  # gone already
+    assert operators.expire_silent(SILENT_S) == []
+    assert operators.expire_silent(SILENT_S + 0.1) == ["a"]
+    assert operators.expire_silent(100) == []  # already offline
     assert operators.present == frozenset()
 
 
 def test_any_message_of_its_own_brings_an_operator_back() -> None:
     operators = Operators(1.0)
     operators.connected("a", 0.0)
-    operators.silent(5.0)
+    operators.expire_silent(5.0)
     assert not operators.message_received("b", 6.0)
     assert operators.present == frozenset()
     assert operators.message_received("a", 6.0)
@@ -32,7 +32,7 @@ def test_any_message_of_its_own_brings_an_operator_back() -> None:
     assert operators.present == {"a"}
 
 
-def test_a_sender_that_never_announced_itself_is_no_operator() -> None:
+def test_a_sender_without_announcement_is_no_operator() -> None:
     operators = Operators(1.0)
     assert not operators.message_received("predictor", 0.0)
     assert operators.present == frozenset()
@@ -45,19 +45,19 @@ def test_the_operator_who_has_been_present_longest_is_in_control() -> None:
     operators.connected("a", 0.5)
     operators.message_received("b", 1.2)
     assert operators.in_control == "b"
-    operators.silent(2.0)  # a
+    operators.expire_silent(2.0)  # a
     operators.message_received("a", 2.1)
     operators.disconnected("b", 2.1)
     operators.message_received("b", 2.2)
     assert operators.in_control == "a"
 
 
-def test_control_outlasts_an_outage_in_which_nobody_was_heard() -> None:
-    """Whoever is heard first after it must not get the streams of the one that drives."""
+def test_control_outlasts_an_outage_of_all_operators() -> None:
+    """The first to return must not get the streams of the one that drives."""
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     operators.connected("onlooker", 0.0)
-    operators.silent(3.0)
+    operators.expire_silent(3.0)
     assert (operators.present, operators.in_control) == (frozenset(), "")
     operators.message_received("onlooker", 5.0)
     assert operators.in_control == ""
@@ -65,40 +65,40 @@ def test_control_outlasts_an_outage_in_which_nobody_was_heard() -> None:
     assert operators.in_control == "driver"
 
 
-def test_control_passes_on_when_only_its_holder_is_silent() -> None:
+def test_control_passes_when_only_its_holder_is_silent() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     for quarter in range(1, 6):
         operators.connected("onlooker", quarter / 4)
-    operators.silent(1.26)
+    operators.expire_silent(1.26)
     assert operators.in_control == "onlooker"
     operators.message_received("driver", 1.3)
     assert operators.in_control == "onlooker"
 
 
-def test_control_passes_on_a_while_after_an_outage_from_which_its_holder_does_not_return() -> None:
+def test_control_passes_after_an_outage_if_its_holder_does_not_return() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
     operators.connected("onlooker", 0.0)
-    operators.silent(3.0)
+    operators.expire_silent(3.0)
     operators.message_received("onlooker", 5.0)
     operators.message_received("onlooker", 5.9)
     assert operators.in_control == ""
-    operators.silent(5.0 + SILENT_S)
+    operators.expire_silent(5.0 + SILENT_S)
     assert operators.in_control == "onlooker"
 
 
-def test_an_operator_whose_messages_wait_is_not_silent() -> None:
+def test_an_operator_with_queued_messages_is_not_silent() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
-    assert operators.silent(5.0, {"driver"}) == []
-    assert operators.silent(5.0, {"onlooker"}) == ["driver"]
+    assert operators.expire_silent(5.0, {"driver"}) == []
+    assert operators.expire_silent(5.0, {"onlooker"}) == ["driver"]
 
 
 def test_the_longest_absent_is_forgotten_first() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)
-    for number in range(10 * MOST):
+    for number in range(10 * MAX_OPERATORS):
         operators.message_received(f"stranger{number}", float(number))
     assert operators.present == {"driver"}
 

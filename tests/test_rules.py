@@ -75,7 +75,7 @@ def test_at_3000_only_front_center_keeps_one_half() -> None:
 
 
 @pytest.mark.parametrize("total", [0, 1, 2.5, 32.999])
-def test_a_tiny_total_stops_cameras_instead_of_opening_them(total: float) -> None:
+def test_a_tiny_total_pauses_cameras(total: float) -> None:
     for name, setting in decided(str(total)).settings.items():
         assert setting.on
         assert setting.scaling == TUM.cameras[name].rate_quality.scaling[0]
@@ -324,7 +324,7 @@ def test_settings_survive_the_operators_absence() -> None:
 # --- steady -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_greater_factor_is_held_back_and_a_smaller_one_taken_at_once() -> None:
+def test_a_larger_factor_is_held_back_and_a_smaller_one_applied_immediately() -> None:
     drive = Drive("modes=steady")
 
     def factor(t: float, kbps: int) -> float | None:
@@ -397,7 +397,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 @pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
 @settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))
-def test_stating_what_is_read_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
+def test_declaring_reads_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
     stated = vehicle(f"modes={modes}")
     everything = reading_everything(stated)
     run, other, t = start(stated), start(everything), 0.0
@@ -414,7 +414,7 @@ def reasons(run: Run) -> list[str]:
     return [setting.reason for setting in run.decision.settings.values()]
 
 
-def test_a_rule_that_states_no_reads_runs_on_every_change(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rule_without_declared_reads_runs_on_every_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
 
     @rules.rule(needs=["total"], gives=["total"])
@@ -467,7 +467,7 @@ def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: 
         ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?"),
         ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter; share_by_demand takes none"),
         ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
-        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: this rule needs it"),
+        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: required by this rule"),
         ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number from 0"),
         ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number from 0"),
         ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number from 0"),
@@ -485,7 +485,7 @@ def test_parameters_are_exact() -> None:
     assert call_rule("hold_upscaling", {"for_s": 0.1}).parameters == {"for_s": Fraction(1, 10)}
 
 
-def test_a_rule_of_the_users_own_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_users_rule_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(_: EntryPoint) -> None:
         @rules.rule(needs=["total"], gives=["total"])
         def keep_below(vehicle: Vehicle, state: State, draft: Any, memory: Any, *, most_kbps: Fraction) -> Any:

@@ -39,7 +39,7 @@ factors = st.fractions(Fraction(1, 100), 1, max_denominator=1000)
         ("99999", "0.5"),  # the last range has no upper end
     ],
 )
-def test_a_bound_takes_the_upper_factor(bitrate: str, factor: str) -> None:
+def test_a_bound_belongs_to_the_upper_range(bitrate: str, factor: str) -> None:
     assert select_scaling(SIDE, Fraction(bitrate))[0] == Fraction(factor)
 
 
@@ -49,7 +49,7 @@ def test_more_bitrate_never_lowers_the_factor(a: Fraction, b: Fraction) -> None:
 
 
 @given(bitrates)
-def test_the_range_holds_the_bitrate(bitrate: Fraction) -> None:
+def test_the_range_contains_the_bitrate(bitrate: Fraction) -> None:
     r = SIDE.scaling.index(select_scaling(SIDE, bitrate)[0])
     bounds = (*SIDE.b_min, Fraction(10**9))
     assert bounds[r] <= bitrate < bounds[r + 1]
@@ -61,7 +61,7 @@ def test_ranges_as_people_read_them() -> None:
 
 
 @given(bitrates, st.builds(Roi, st.just(0), st.just(0), st.integers(16, 1920), st.integers(16, 1040)))
-def test_an_roi_is_judged_by_the_same_bits_per_pixel(bitrate: Fraction, roi: Roi) -> None:
+def test_an_roi_is_compared_at_equal_bits_per_pixel(bitrate: Fraction, roi: Roi) -> None:
     same_density = bitrate * roi.pixels / FULL.pixels
     assert as_full_image(same_density, roi, FULL) == bitrate
     assert as_full_image(bitrate, roi, FULL) >= bitrate

@@ -52,7 +52,7 @@ def test_only_one_sender_is_received_and_the_others_are_counted(family, everywhe
         assert senders.dropped() == 5
 
 
-def test_packets_of_the_vehicle_that_find_no_room_are_not_counted():
+def test_packets_of_the_vehicle_dropped_at_a_full_buffer_are_not_counted():
     with bound(socket.AF_INET, "0.0.0.0") as ours, bound(socket.AF_INET, "127.0.0.1") as vehicle:
         senders = SenderFilter("127.0.0.1")
         senders.attach(ours.fileno())

@@ -88,5 +88,5 @@ def test_what_cannot_be_asked(override: str, problem: str) -> None:
 def test_an_address_with_a_password_is_refused_and_not_shown(address: str) -> None:
     with pytest.raises(ConfigError) as raised:
         plans("source=rtsp", f'source.address="{address}"')
-    assert "must not hold user or password: write user:password into a file, and name that" in str(raised.value)
+    assert "must not contain user or password: write user:password to a file, and name that" in str(raised.value)
     assert "secret" not in str(raised.value)

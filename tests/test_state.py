@@ -107,7 +107,7 @@ def test_refused(mode: str, event: str, keys: dict[str, Any], reason: str) -> No
     assert after.refused == reason
     assert after.commands == ()
     assert after.decision == before.decision
-    assert after.state.t == 2  # time passes for a refused event as well
+    assert after.state.t == 2  # a refused event advances the time, too
     drive.accept("clock_advanced", t=2)
     assert drive.run.state == after.state
 
@@ -122,7 +122,7 @@ def test_refused(mode: str, event: str, keys: dict[str, Any], reason: str) -> No
         ({"kbps": 99.9}, (99, 0.25)),
     ],
 )
-def test_mode_single_takes_either_or_both(keys: dict[str, float], expected: tuple[int, float]) -> None:
+def test_mode_single_accepts_either_setting_or_both(keys: dict[str, float], expected: tuple[int, float]) -> None:
     drive = Drive("modes=paper", "mode=single")
     drive.accept("camera_configured", **LEFT, **keys)
     assert drive.sent("front_left") == expected
@@ -144,7 +144,7 @@ def test_rois_stay_in_automatic_and_collective() -> None:
         assert drive["front_left"].demand == 1500
 
 
-def test_changes_while_off_count_when_on_again() -> None:
+def test_changes_while_off_apply_when_switched_on_again() -> None:
     drive = Drive("modes=paper", "mode=single")
     drive.accept("camera_switched", **LEFT, on=False)
     drive.accept("roi_set", **LEFT, **ROI)

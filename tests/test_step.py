@@ -49,7 +49,7 @@ def test_entering_collective_keeps_the_total_in_force() -> None:
     assert (drive.total, drive.run.commands) == (8000, ())
 
 
-def test_entering_collective_takes_the_last_total_set() -> None:
+def test_entering_collective_uses_the_last_total_set() -> None:
     drive = Drive(*PAPER, "mode=collective")
     drive.accept("total_set", kbps=4000)
     drive.accept("mode_selected", mode="automatic")
@@ -67,7 +67,7 @@ def test_entering_collective_from_single_keeps_the_sum() -> None:
 
 
 @pytest.mark.parametrize("mode", ["single", "collective"])
-def test_entering_automatic_takes_the_last_prediction(mode: str) -> None:
+def test_entering_automatic_uses_the_last_prediction(mode: str) -> None:
     drive = Drive(*PAPER, f"mode={mode}")
     drive.accept("bitrate_predicted", kbps=7000)  # accepted and remembered in every mode
     assert drive.total != 7000
@@ -82,7 +82,7 @@ def test_before_any_event_a_run_has_start_kbps(mode: str, total: int) -> None:
     assert drive.sent("front_center") == (454, 0.5)
 
 
-def test_entering_automatic_without_a_prediction_takes_start_kbps() -> None:
+def test_entering_automatic_without_a_prediction_uses_start_kbps() -> None:
     drive = Drive(*PAPER, "mode=collective")
     drive.accept("total_set", kbps=9000)
     drive.accept("mode_selected", mode="automatic")
@@ -100,7 +100,7 @@ def test_selecting_the_mode_in_force_changes_nothing() -> None:
     assert drive.sent("front_left")[0] == 1000
 
 
-def test_single_settings_are_taken_anew_with_each_entering() -> None:
+def test_settings_of_single_are_reset_on_each_entering() -> None:
     drive = Drive(*PAPER, "mode=single")
     drive.accept("camera_configured", camera="front_left", kbps=1000, scaling=1)
     drive.accept("mode_selected", mode="automatic")
@@ -235,13 +235,13 @@ def test_only_what_changes_is_commanded() -> None:
     assert [(c.knob, c.value) for c in drive.run.commands if c.camera == "top_left"] == [("sending", False)]
 
 
-def test_off_before_anything_else_is_a_command_for_one_knob() -> None:
+def test_switching_off_first_commands_only_one_knob() -> None:
     drive = Drive(*PAPER)
     drive.accept("camera_switched", camera="top_left", on=False)
     assert [c.knob for c in drive.run.commands if c.camera == "top_left"] == ["sending"]
 
 
-def test_what_changed_while_off_is_commanded_with_on() -> None:
+def test_changes_while_off_are_commanded_on_switching_on() -> None:
     drive = predicted(3000)
     drive.accept("camera_switched", camera="top_left", on=False)
     drive.accept("bitrate_predicted", kbps=8000)
@@ -383,10 +383,10 @@ def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
 
 
 def test_rules_may_read_the_attention_of_the_person_who_drives() -> None:
-    """It is that of one operator, and unknown once another is in control, or none."""
+    """It belongs to one operator, and is unknown once control passes or nobody is in control."""
     drive = predicted(3000)
     drive.accept("operator_connected", attention="watching")
-    assert drive.run.state.attention is None  # the vehicle states it by an event of its own
+    assert drive.run.state.attention is None  # the vehicle sends a separate event for it
     for event, keys in (
         ("control_passed", {"operator": "bob"}),
         ("operator_disconnected", {}),

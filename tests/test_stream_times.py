@@ -45,7 +45,7 @@ def restored(stated: list[int], demuxed: list[int]) -> list[int]:
     return [times.next(ms * MS) // MS for ms in demuxed]
 
 
-def test_a_gap_has_its_length_again() -> None:
+def test_the_length_of_a_gap_is_restored() -> None:
     assert restored([0, 100, 200, 5200, 5300], [0, 100, 200, 700, 800]) == [0, 100, 200, 5200, 5300]
 
 

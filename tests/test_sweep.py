@@ -11,7 +11,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from runner.configuration.overrides import MOST_RUNS, sweep
+from runner.configuration.overrides import MAX_RUNS, sweep
 from runner.drive.log import FILES
 from runner.verbs import HYDRA_FLAGS, VERBS
 
@@ -41,7 +41,7 @@ def test_the_runs_are_those_of_hydras_own_sweeper(words: list[str]) -> None:
         (["fps_max=interval(1,2)"], ["fps_max=interval(1,2): cannot be enumerated; a sweep is "]),
         (["vehicle=glob(*)", "mode=1,"], ["vehicle=glob(*): cannot be enumerated", "mode=1,: "]),
         (["hydra.run.dir=a,b"], ["hydra.run.dir=a,b: no such key"]),
-        (["total_kbps=range(0,1e9)"], [f"-m: {MOST_RUNS + 1} runs or more: must be at most {MOST_RUNS}"]),
+        (["total_kbps=range(0,1e9)"], [f"-m: {MAX_RUNS + 1} runs or more: must be at most {MAX_RUNS}"]),
         (["fps_max=range(1,41)", "total_kbps=range(0,30)"], ["-m: 1200 runs or more: must be at most 1000"]),
         (["fps_max=0,-1,10"], ["fps_max: 0: must be above 0", "fps_max: -1: must be above 0"]),  # of all runs
     ],

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.h264.access_unit import AccessUnit, Recent, read_unit
+from runner.h264.access_unit import AccessUnit, RecentUnits, read_unit
 
 AUD, SPS, PPS, SEI, IDR, SLICE = (bytes([0, 0, 0, 1, kind]) for kind in (0x09, 0x67, 0x68, 0x06, 0x65, 0x41))
 
@@ -21,26 +21,24 @@ AUD, SPS, PPS, SEI, IDR, SLICE = (bytes([0, 0, 0, 1, kind]) for kind in (0x09, 0
         (b"\0\0\0\1\x25\x88", True),  # nal_ref_idc 1
     ],
 )
-def test_only_an_idr_starts_anew(data, anew):
+def test_only_an_idr_restarts_the_stored_units(data, anew):
     assert read_unit(data, None, 0).key is anew
 
 
 @pytest.mark.parametrize("data", [AUD + SPS, AUD, b"", b"\0\0\1"])
-def test_a_unit_without_a_picture_is_of_no_use(data):
+def test_a_unit_without_a_picture_is_useless(data):
     assert read_unit(data, None, 0) is None
 
 
-def test_half_a_picture_is_left_out_and_half_an_idr_picture_becomes_a_grey_one():
+def test_an_incomplete_picture_is_dropped_and_an_incomplete_idr_becomes_grey():
     sps = b"\0\0\0\1" + bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     assert read_unit(AUD + SLICE + b"\x9a", None, 0, damaged=True) is None
-    assert (
-        read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None
-    )  # without a parameter set no grey picture can be made
+    assert read_unit(AUD + IDR + b"\x88", None, 0, damaged=True) is None  # a grey picture needs a parameter set
     grey = read_unit(AUD + sps + PPS + IDR + b"\x88", 1.5, 2.5, damaged=True)
     assert (grey.captured, grey.arrived, grey.key, grey.exact) == (1.5, 2.5, True, False)
     assert read_unit(grey.data, None, 0).key
     assert PPS in grey.data  # those of the stream: later units may lack them
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     shown = [recent.add(grey), *(recent.add(unit(2.5 + tenth / 10)) for tenth in range(1, 30))]
     assert [u.arrived for u in shown if u.exact] == [2.5 + tenth / 10 for tenth in range(20, 30)]
 
@@ -64,7 +62,7 @@ def unit(arrived, key=False, recovery=None):
 
 
 def test_a_late_decoder_gets_the_idr_and_two_refresh_periods():
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(-1))  # nothing before the first IDR can be decoded
     assert recent.burst() == []
     recent.add(unit(0, key=True))
@@ -77,20 +75,20 @@ def test_a_late_decoder_gets_the_idr_and_two_refresh_periods():
 
 def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods():
     sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")  # x264, 480x260
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     shown = [recent.add(unit(0))]  # no parameter sets yet
     shown.append(recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, 0.1, 0.1, key=False)))
     shown += [recent.add(unit(tenth / 10)) for tenth in range(2, 30)]
     assert [u.arrived for u in shown if u.exact] == [tenth / 10 for tenth in range(21, 30)]
     first, second, *_ = recent.burst()
     assert (first.key, first.exact, read_unit(first.data, None, 0).key) == (True, False, True)
-    assert second.arrived == 0.9  # the burst holds only what the newest needs
+    assert second.arrived == 0.9  # the burst has only the units that the newest needs
     assert recent.add(unit(3, key=True)).exact
     assert recent.add(unit(3.1)).exact
 
 
-def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
-    recent = Recent(refresh_s=1.0)
+def test_a_burst_begins_with_the_last_completed_wave():
+    recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))
     for tenth in range(1, 58):
         recent.add(unit(tenth / 10, recovery=9 if tenth % 10 == 0 else None))
@@ -101,8 +99,8 @@ def test_a_burst_begins_with_the_last_wave_that_has_run_to_its_end():
     assert recent.burst()[1].arrived == 5.0
 
 
-def test_a_grey_start_is_exact_when_the_first_whole_wave_has_run():
-    recent = Recent(refresh_s=1.0)
+def test_a_grey_start_is_exact_after_the_first_whole_wave():
+    recent = RecentUnits(refresh_s=1.0)
     sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False))]
     shown += [recent.add(unit(tenth / 10, recovery=4 if tenth == 3 else None)) for tenth in range(1, 12)]
@@ -110,7 +108,7 @@ def test_a_grey_start_is_exact_when_the_first_whole_wave_has_run():
 
 
 def test_a_grey_start_may_itself_be_the_beginning_of_the_wave():
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
     shown = [recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False, recovery=4))]
     shown += [recent.add(unit(tenth / 10)) for tenth in range(1, 8)]
@@ -118,7 +116,7 @@ def test_a_grey_start_may_itself_be_the_beginning_of_the_wave():
 
 
 def test_a_wave_that_takes_longer_than_stated_is_kept_whole():
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))
     for number in range(1, 59):  # a wave of ten frames takes three seconds, not one
         recent.add(unit(number * 0.3, recovery=9 if number % 10 == 0 else None))
@@ -128,7 +126,7 @@ def test_a_wave_that_takes_longer_than_stated_is_kept_whole():
 
 
 def test_waves_that_never_end_are_forgotten():
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))
     for number in range(1, 1000):
         recent.add(unit(number / 10, recovery=5000))
@@ -136,7 +134,7 @@ def test_waves_that_never_end_are_forgotten():
 
 
 def test_a_new_idr_makes_everything_before_it_needless():
-    recent = Recent(refresh_s=1.0)
+    recent = RecentUnits(refresh_s=1.0)
     for arrived, key in ((0, True), (0.1, False), (0.2, True), (0.3, False)):
         recent.add(unit(arrived, key))
     assert [u.arrived for u in recent.burst()] == [0.2, 0.3]
@@ -144,7 +142,7 @@ def test_a_new_idr_makes_everything_before_it_needless():
 
 @given(st.lists(st.tuples(st.floats(0.01, 0.5), st.booleans()), max_size=200), st.floats(0.1, 2))
 def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, refresh_s):
-    recent, now, everything = Recent(refresh_s), 0.0, []
+    recent, now, everything = RecentUnits(refresh_s), 0.0, []
     for step, key in steps:
         now += step
         everything.append(recent.add(unit(now, key)))
@@ -155,7 +153,7 @@ def test_a_burst_begins_with_an_idr_ends_with_the_newest_and_is_bounded(steps, r
         assert burst[-1] is everything[-1]
         assert not any(u.key for u in burst[1:])
         assert all(u.arrived >= now - 2 * refresh_s for u in burst[1:])
-        # Only what lies between the IDR and the last two periods is missing.
+        # Only the units between the IDR and the last two periods are missing.
         since = everything[everything.index(burst[0]) + 1 :]
         assert burst[1:] == [u for u in since if u.arrived >= now - 2 * refresh_s]
 
@@ -178,13 +176,13 @@ def test_a_unit_of_h265_is_key_by_its_picture_and_not_by_its_parameter_sets(kind
     assert (unit.key, unit.exact, unit.data) == (key, True, h265(*kinds))
 
 
-def test_damaged_units_of_h265_and_those_without_a_picture_are_of_no_use():
+def test_damaged_h265_units_and_those_without_a_picture_are_useless():
     assert read_unit(h265(19), 1.0, 2.0, damaged=True, codec="h265") is None
     assert read_unit(h265(32, 33, 34), 1.0, 2.0, codec="h265") is None
 
 
 def test_a_stream_of_h265_begins_with_its_next_key_picture():
-    recent = Recent(1.0, "h265")
+    recent = RecentUnits(1.0, "h265")
     assert recent.add(read_unit(h265(33, 1), 1.0, 1.0, codec="h265")).exact is False
     assert recent.burst() == []
     key = read_unit(h265(33, 19), 2.0, 2.0, codec="h265")

@@ -15,8 +15,17 @@ from simulated_link import Link, busy, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, LinkCap, Overuse, advanced
-from runner.core.trust import KNOWN_S, METRES_PER_DEGREE, REMEMBERED_S, DoubtedPlace, Trust, doubted, is_near, updated
+from runner.core.link_cap import LEAST, LinkCap, Overuse, update_cap
+from runner.core.trust import (
+    KNOWN_S,
+    METRES_PER_DEGREE,
+    REMEMBERED_S,
+    DoubtedPlace,
+    Trust,
+    add_doubt,
+    is_near,
+    update_trust,
+)
 from runner.core.uplink import LinkReport, LinkState, ReceivedUnit, UplinkMemory, estimate
 
 pytestmark = pytest.mark.slow  # simulates drives
@@ -25,7 +34,7 @@ RIGHT, HIGH = 3600.0, 6000.0  # kbit/s predicted over a link of 4000
 HALF = Fraction(1, 2)
 
 
-def test_a_right_prediction_costs_nothing() -> None:
+def test_a_correct_prediction_is_used_fully() -> None:
     link, limit = Link(steps((0, 4000))), steps((0, RIGHT))
     done = drive(link, limit, 30)
     assert {cap for _, cap, _ in done.caps} == {RIGHT}
@@ -41,7 +50,7 @@ def test_a_prediction_that_is_too_high_fills_no_queue() -> None:
 
 @pytest.mark.parametrize("fps", [15, 30])
 def test_a_queue_that_was_full_before_the_first_picture_is_seen_by_its_losses(fps: float) -> None:
-    """As where all cameras begin with a key frame: its delay is taken for the path's."""
+    """As if all cameras start with a key frame: its delay is mistaken for the path's."""
     link = Link(steps((0, 2300)), queue_s=0.2)
     done = drive(link, steps((0, 3100)), 20, fps=fps, queued_s=0.2)
     assert done.wait_ms(0.95, since=4) <= 100
@@ -63,7 +72,7 @@ def test_a_start_at_half_of_a_right_prediction_is_over_within_a_second(fps: floa
 
 
 def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
-    """The first pictures come 220 ms late, of one camera until others show that the path is shorter."""
+    """The first pictures are 220 ms late; other cameras then show that the path is shorter."""
     uplink, shown = UplinkMemory(), []
     for number in range(40):
         captured = number / 15
@@ -79,8 +88,8 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
     assert min(shown[19:25]) > 90
 
 
-def test_the_rest_of_a_frame_in_a_later_report_shows_no_clock_that_was_set() -> None:
-    """Rounded times make it seem older than its first part."""
+def test_the_rest_of_a_frame_in_a_later_report_is_no_clock_step() -> None:
+    """With rounded times it seems older than its first part."""
     uplink = UplinkMemory()
     for number in range(30):
         captured, queue = number / 15, 0.0 if number < 20 else 0.1
@@ -93,7 +102,7 @@ def test_the_rest_of_a_frame_in_a_later_report_shows_no_clock_that_was_set() -> 
     assert uplink.intervals == {"front": pytest.approx(1 / 15, abs=0.001)}
 
 
-def test_a_link_that_halves_is_answered_at_once() -> None:
+def test_a_link_that_halves_causes_an_immediate_cut() -> None:
     done = drive(Link(steps((0, 4000), (5, 2000))), steps((0, RIGHT)), 10)
     assert done.first(5, lambda cap: cap <= 2000) <= 0.03 + 0.25
     assert done.wait_ms(0.99, since=6) <= 100
@@ -122,8 +131,8 @@ def test_random_loss_does_not_cut() -> None:
     assert done.lowest(1, 20) == RIGHT
 
 
-def test_a_longer_path_is_no_queue() -> None:
-    """A handover adds 60 ms for good."""
+def test_a_longer_path_is_not_mistaken_for_a_queue() -> None:
+    """A handover adds 60 ms permanently."""
     done = drive(Link(steps((0, 4000)), lambda t: 0.06 if t >= 5 else 0.0), steps((0, RIGHT)), 15)
     assert done.lowest(5, 15) >= 0.4 * RIGHT
     assert done.lowest(9, 15) >= 0.9 * RIGHT
@@ -131,7 +140,7 @@ def test_a_longer_path_is_no_queue() -> None:
 
 @pytest.mark.parametrize("limit", [RIGHT, HIGH])
 @pytest.mark.parametrize("fps", [15, 30])
-def test_jitter_is_no_reason_to_send_less(limit: float, fps: float) -> None:
+def test_jitter_does_not_reduce_the_rate(limit: float, fps: float) -> None:
     """Twice a second 0.1 s in which everything is late by some 15 ms, as on many radio links and busy machines."""
     link, total = Link(steps((0, 4000)), jitter(0.5, 0.1, 15)), steps((0, limit))
     done = drive(link, total, 40, fps=fps)
@@ -140,7 +149,7 @@ def test_jitter_is_no_reason_to_send_less(limit: float, fps: float) -> None:
 
 
 @pytest.mark.parametrize("limit", [RIGHT, HIGH])
-def test_the_jitter_of_a_recorded_5g_link_is_no_reason_to_send_less(limit: float) -> None:
+def test_the_jitter_of_a_recorded_5g_link_does_not_reduce_the_rate(limit: float) -> None:
     with shared("traces/tidy/cicv5g_urban_n8_v30_rtt.csv").open() as file:
         rows = [(float(row["t_s"]), float(row["rtt_ms"]) / 1000) for row in csv.DictReader(file)]
     times, least = [t - rows[0][0] for t, _ in rows], min(rtt for _, rtt in rows)
@@ -154,7 +163,7 @@ def test_the_jitter_of_a_recorded_5g_link_is_no_reason_to_send_less(limit: float
 def test_frames_that_a_busy_machine_sends_late_do_not_starve_the_video(
     share: float, ms: float, least: float, limit: float
 ) -> None:
-    """Each is late on its own; the queue of a link would delay all that follow. It once left 2 % of the link."""
+    """Each is late independently; a queue would delay all following ones. This once left 2 % of the link."""
     link, total = Link(steps((0, 4000))), steps((0, limit))
     done = drive(link, total, 30, cameras=3, fps=15, late=busy(share, 0.5, ms))
     assert utilisation(done, link, total, 5, 29) >= least
@@ -177,14 +186,14 @@ def test_case_5_1_of_rfc_8867_without_a_prediction() -> None:
 
 
 @pytest.mark.parametrize("kbps", [300, 600, 1000, 1200, 1250, 1300])
-def test_a_link_that_falls_far_is_not_taken_for_one_that_others_fill(kbps: float) -> None:
+def test_a_large_drop_of_the_link_is_not_mistaken_for_competing_traffic(kbps: float) -> None:
     done = drive(Link(steps((0, 5000), (20, kbps)), one_way_s=0.05), steps((0, HIGH)), 60, fps=15)
     assert done.wait_ms(0.95, since=20) <= 100
     assert done.kbps(25, 60) >= 0.9 * kbps
 
 
-def test_after_a_stall_no_more_is_restored_than_the_link_carries_since() -> None:
-    """As in another cell: half of what arrived before would fill the queue again."""
+def test_after_a_stall_the_rate_is_restored_only_up_to_the_new_capacity() -> None:
+    """As in another cell: half of the earlier rate would fill the queue again."""
     link = Link(steps((0, 8000), (20, 800)), delay_s=stalls((20, 22.4)), one_way_s=0.02, queue_s=0.5)
     done = drive(link, steps((0, 8000)), 34, fps=15)
     assert max(cap for t, cap, _ in done.caps if t > 23) <= 1200
@@ -198,7 +207,7 @@ def test_a_prediction_that_falls_and_is_still_too_high_fills_no_queue() -> None:
 
 
 @pytest.mark.parametrize("fps", [15, 40])
-def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
+def test_cameras_and_a_tcp_flow_share_the_link(fps: float) -> None:
     """Case 5.6 of RFC 8867, rates times two: a quarter of the fair share at least. TCP itself fills the queue."""
     link, limit = Link(steps((0, 4000)), one_way_s=0.05), steps((0, 4000))
     done = drive(link, limit, 80, fps=fps, tcp_s=(5, 60))
@@ -209,7 +218,7 @@ def test_a_tcp_flow_leaves_the_cameras_a_part_and_gets_one(fps: float) -> None:
 
 
 def laps(t: float) -> PositionReported:
-    """500 m northwards at 10 m/s, again and again."""
+    """500 m northwards at 10 m/s, repeatedly."""
     return PositionReported(t=t, lat=48 + 10 * t % 500 / METRES_PER_DEGREE, lon=11)
 
 
@@ -226,32 +235,34 @@ def test_a_place_where_predictions_proved_too_high_is_remembered() -> None:
 DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),))
 
 
-def test_a_place_is_forgotten_little_by_little() -> None:
-    shares = {t: updated(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
+def test_a_place_is_forgotten_gradually() -> None:
+    shares = {t: update_trust(DOUBTED, t, HALF, replace(laps(0), t=t)).share for t in (1, 300, 480, REMEMBERED_S, 601)}
     assert list(map(float, shares.values())) == [0.5, 0.75, 0.9, 1, 1]
-    assert updated(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
+    assert update_trust(DOUBTED, 601, HALF, replace(laps(0), t=601)) == Trust()
 
 
-def test_belief_falls_when_the_vehicle_comes_to_a_place_and_returns_while_it_stays() -> None:
-    trust = updated(DOUBTED, 10, HALF, laps(30))
+def test_trust_falls_when_the_vehicle_reaches_a_place_and_recovers_while_it_stays() -> None:
+    trust = update_trust(DOUBTED, 10, HALF, laps(30))
     assert (trust.share, trust.places[0].near) == (1, False)
-    trust = updated(trust, 51, HALF, laps(51))
+    trust = update_trust(trust, 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
     for t in range(52, 120):
-        trust = updated(trust, t, HALF, replace(laps(50), t=t))
+        trust = update_trust(trust, t, HALF, replace(laps(50), t=t))
     assert trust.share == 1
-    assert updated(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(83, 100)
+    assert update_trust(replace(trust, share=Fraction(4, 5)), 120, HALF, replace(laps(50), t=120)).share == Fraction(
+        83, 100
+    )
 
 
-def test_belief_falls_at_a_place_also_when_it_would_have_returned() -> None:
-    """After time in which nothing was measured."""
-    trust = updated(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
+def test_trust_falls_at_a_place_even_while_recovering() -> None:
+    """After a period without measurements."""
+    trust = update_trust(replace(DOUBTED, share=Fraction(4, 5), changed=0.0), 51, HALF, laps(51))
     assert trust.share == Fraction(542, 1000)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1, 0.3])
 def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_s: float) -> None:
-    """As where a prediction steps with the link, and arrives with the measurement of the step or just after the cut."""
+    """A prediction that steps with the link arrives with the measurement of the step or just after the cut."""
     falls = [(8 * i + 5.0, 8 * i + 7.0) for i in range(6)]
     link = Link(lambda t: 400 if any(a <= t < b for a, b in falls) else 4000)
     done = drive(link, lambda t: 0.9 * link.kbps(t - late_s), 50, fps=15)
@@ -259,21 +270,21 @@ def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_
         assert done.first(end, lambda cap: cap >= 0.8 * RIGHT) <= 2.5
 
 
-def test_an_old_position_says_nothing() -> None:
-    assert updated(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
+def test_a_stale_position_is_ignored() -> None:
+    assert update_trust(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
     doubts = tuple((float(t), Fraction(1, 2)) for t in (0, 2))
-    trust = updated(doubted(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
+    trust = update_trust(add_doubt(Trust(doubts=doubts), 4.0, HALF), 4.5, HALF, laps(0))
     assert (trust.share, trust.places) == (Fraction(1, 2), ())
 
 
-def test_a_place_that_is_doubted_again_is_kept_longest() -> None:
+def test_a_place_that_is_doubted_again_is_remembered_longest() -> None:
     near = DoubtedPlace(laps(0), 0.0, Fraction(1, 2))
     far = tuple(
         DoubtedPlace(PositionReported(t=0, lat=50 + i, lon=11), 0.0, Fraction(1, 2), near=False) for i in range(3)
     )
     doubts = tuple((float(t), Fraction(3, 5)) for t in (96, 98))
-    trust = doubted(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5))
-    trust = updated(trust, 100.5, HALF, laps(100))
+    trust = add_doubt(Trust(doubts=doubts, places=(near, *far)), 100.0, Fraction(3, 5))
+    trust = update_trust(trust, 100.5, HALF, laps(100))
     assert trust.places == (*far, DoubtedPlace(laps(0), 100.5, Fraction(3, 5)))
 
 
@@ -303,19 +314,19 @@ def test_any_measurements_leave_a_cap_that_recovers(measured: list[tuple]) -> No
         link = LinkMeasured(
             t=t, kbps=None if kbps is None else Fraction(kbps), queue_ms=queue_ms, loss=loss, state=state, rtt_ms=30
         )
-        cap = advanced(cap, link, t, Fraction(limit))
+        cap = update_cap(cap, link, t, Fraction(limit))
         assert cap.kbps is None or cap.kbps >= LEAST
-        for _ in range(3):  # and time in which no report arrives
+        for _ in range(3):  # periods without a report
             t += passed / 3
-            cap = advanced(cap, link, t, Fraction(limit))
+            cap = update_cap(cap, link, t, Fraction(limit))
     for _ in range(500):
         t += 0.1
-        cap = advanced(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
+        cap = update_cap(cap, LinkMeasured(t=t, queue_ms=0, state=LinkState.CLEAR), t, Fraction(5000))
     assert cap.kbps is None or cap.kbps >= 5000
 
 
 @pytest.mark.parametrize("after, known", [(1870, 1870), (2520, 1900), (1300, 1300)])
-def test_a_low_rate_amid_the_burst_after_a_stall_counts_no_more_once_more_has_arrived(after: int, known: int) -> None:
+def test_a_low_rate_during_the_burst_after_a_stall_is_corrected_by_later_arrivals(after: int, known: int) -> None:
     """As measured on a busy machine; the cap then stayed at 1200 kbit/s for seconds."""
     overuse = Overuse(0.0, Fraction(1900), Fraction(4200))
     cap = LinkCap(kbps=Fraction(1760), overuse=overuse, before=Fraction(1400), began=-9.0, changed=0.6, measured=0.6)
@@ -323,7 +334,7 @@ def test_a_low_rate_amid_the_burst_after_a_stall_counts_no_more_once_more_has_ar
     for number, (state, kbps, queue_ms) in enumerate(burst):
         t = 0.7 + 0.06 * number
         link = LinkMeasured(t=t, kbps=Fraction(kbps), queue_ms=queue_ms, loss=0, state=LinkState(state), rtt_ms=4)
-        cap = advanced(cap, link, t, Fraction(4200))
+        cap = update_cap(cap, link, t, Fraction(4200))
     assert cap.overuse
     assert cap.overuse.carried == known
 

@@ -56,7 +56,7 @@ def test_only_loopback_costs_no_uplink(address, leaves):
         ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, "anna", [ANYONE._replace(since=1)]),
     ],
 )
-def test_which_viewers_are_let_in_and_which_leave(viewers, newcomer, limit, controller, leaving):
+def test_which_viewers_are_admitted_and_which_are_disconnected(viewers, newcomer, limit, controller, leaving):
     assert admit(viewers, newcomer, limit, controller) == leaving
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from runner.schema import Path, dotted, shown
 
 SECTIONS = ("name", "fps_max", "cameras", "graph")
-# Camera keys that concern one side only: the source of its frames, the place of its picture.
+# Camera keys that concern only one side: the source of its frames, the place of its picture.
 OWN = (
     "source",
     "device",
@@ -25,7 +25,7 @@ OWN = (
     "lens",
     "calibrated",
 )
-NAMED = 3  # differences that a message names
+MAX_NAMED = 3  # differences in a message
 
 SettingsByPath = Mapping[str, Any]
 
@@ -39,9 +39,9 @@ def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str | None:
     """The differences between the operator's configuration and the vehicle's, in one line; None if they agree."""
     paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
     parts = [
-        f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:NAMED]
+        f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:MAX_NAMED]
     ]
-    more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
+    more = [f"{len(paths) - MAX_NAMED} more"] if len(paths) > MAX_NAMED else []
     return "; ".join([*parts, *more]) or None
 
 

@@ -1,4 +1,4 @@
-"""From plain data to a `Vehicle`: parts that the schemas accept are built, and all problems are collected."""
+"""Builds a `Vehicle` from plain data: builds the parts that the schemas accept, and collects all problems."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
 BAG_KEYS = ("bag", "topic")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
-CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, given by the kind
+CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
 GRAPH_STRUCTURE = (
     *("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
     *("effort", "efforts"),
@@ -74,9 +74,9 @@ PlanCheck = Callable[[Plan], Iterable[ModelError]]
 
 @dataclass
 class Builder:
-    """Builds model objects from plain data and collects its problems; None stands for an object that was not built.
+    """Builds model objects from plain data and collects problems; an object that cannot be built is None.
 
-    Parts that the schema rejects are not built, so that one mistake is reported once.
+    Parts that the schema rejects are not built, so that a mistake is reported only once.
     """
 
     composed: Composed
@@ -89,7 +89,7 @@ class Builder:
     broken: dict[schema.Path, Problem] = field(default_factory=dict)  # broken rules of the model, by path
     built: set[str] = field(default_factory=set)  # names of the cameras
     vehicle: Vehicle | None = None
-    others: dict[int, Builder | None] = field(default_factory=dict)  # by id of the part that they lack
+    others: dict[int, Builder | None] = field(default_factory=dict)  # builders without one part, by its id
 
     @classmethod
     def of(
@@ -108,11 +108,11 @@ class Builder:
         wrong = list(self._without_repeats([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
-        modes = {mode: self._rule_list(mode) for mode in Mode if self.fine("modes", mode)}
+        modes = {mode: self._rule_list(mode) for mode in Mode if self.is_valid("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros")
-        if not all(map(self.fine, sections)):
+        if not all(map(self.is_valid, sections)):
             return None
         media = self.part(("media",), _media)
         if media is None:
@@ -164,20 +164,20 @@ class Builder:
             inputs=inputs or Inputs(),
         )
 
-    def finished(self, built: T | None) -> T:
-        """The built object, if there were no problems."""
+    def checked(self, built: T | None) -> T:
+        """The built object; raises ConfigError if there were problems."""
         if built is None or self.problems:
             raise ConfigError(self.problems)
         return built
 
     # --- problems -----------------------------------------------------------------------------------------------------
 
-    def fine(self, *path: str | int) -> bool:
+    def is_valid(self, *path: str | int) -> bool:
         """Whether the schema found no problem at, below or above a path."""
         return not any(bad[: len(path)] == path or bad == path[: len(bad)] for bad in self.bad)
 
     def _without_repeats(self, wrong: Sequence[schema.Finding]) -> Iterator[schema.Finding]:
-        """A name below cameras without a mounted kind is one mistake, not many missing keys."""
+        """Report a name below cameras without a mounted kind as one mistake, not as many missing keys."""
         missing = Counter(f.path[:2] for f in wrong if f.found == "missing" and f.path[0] == "cameras")
         unmounted = {path for path, count in missing.items() if count == len(CAMERA_NEEDS)}
         for path in sorted(unmounted, key=str):
@@ -202,19 +202,19 @@ class Builder:
         self.problems.append(self.broken[where])
 
     def _attribute_problems(self) -> None:
-        """Attribute a broken rule that joins several values to the file or override that broke it.
+        """Attribute a broken rule that involves several values to the file or override that broke it.
 
-        The value that the rule names may be in a file that is correct by itself: leave out the later parts one by one
-        and see without which one the rule holds.
+        The value that the rule names may be in a file that is correct by itself: omit the later parts one by one, to
+        find the one without which the rule holds.
         """
         for where, problem in list(self.broken.items()):
             for part in self.composed.later_parts(where):
                 other = self._without(part)
-                if other and where not in other.broken and other.fine(*where[:-1]) and other.built >= self.built:
+                if other and where not in other.broken and other.is_valid(*where[:-1]) and other.built >= self.built:
                     path = self.composed.written(where)
                     path = path[len(part.package) :] if path[: len(part.package)] == part.package else path
-                    blamed = replace(problem, file=part.file, path=schema.dotted(path))
-                    self.problems = [blamed if one == problem else one for one in self.problems]
+                    attributed = replace(problem, file=part.file, path=schema.dotted(path))
+                    self.problems = [attributed if one == problem else one for one in self.problems]
                     break
 
     @cached_property
@@ -248,11 +248,11 @@ class Builder:
     def _camera(self, name: str) -> Camera | None:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
-        # Parts that the schema accepts are checked further, whatever is wrong elsewhere.
+        # Parts that the schema accepts are checked further, whatever the problems elsewhere.
         graph = self.part(self._of(name, "graph"), _graph)
         source = self.part(self._of(name, "source"), _source)
         model = self.part((*path, "rate_quality"), _rate_quality)
-        if graph is None or source is None or model is None or not (self.fine(*path) and self.fine("fps_max")):
+        if graph is None or source is None or model is None or not (self.is_valid(*path) and self.is_valid("fps_max")):
             return None
         fps, limit = exact(data["fps"]), document.get("fps_max")
         native = data.get("native")
@@ -282,7 +282,7 @@ class Builder:
 
     def part(self, path: schema.Path, make: Callable[[Any], T]) -> T | None:
         """The object that a part of the document describes, if the schema accepts it."""
-        if not self.fine(*path):
+        if not self.is_valid(*path):
             return None
         data: Any = self.composed.document
         for key in path:
@@ -290,7 +290,7 @@ class Builder:
         return self.attempt(path, lambda: make(data))
 
     def check_link(self, link: LinkSettings) -> None:
-        """Check that all cameras can use a limited link, and that its kind can do what is asked for."""
+        """Check that all cameras can use a limited link, and that its kind supports the settings."""
         cameras = tuple(self.vehicle.cameras.values()) if self.vehicle else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling and link.kind == "relay":
@@ -315,7 +315,7 @@ class Builder:
                     self.problems.append(self.composed.problem(path, name, f"unknown camera{suggest(name, known)}"))
 
     def _check_inputs(self, camera: Camera) -> None:
-        """Check that the clip, device or address that a camera's source needs is named, and that a clip exists."""
+        """Check that the clip, device or address that a camera's source needs is configured, and that a clip exists."""
         source = camera.source
         needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
         needs |= {"topic"} if source.subscribes else set()
@@ -325,7 +325,7 @@ class Builder:
             if given is None:
                 self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
             elif key == "address" and has_password(str(given)):
-                rule = "must not hold user or password: write user:password into a file, and name that as credentials"
+                rule = "must not contain user or password: write user:password to a file, and name that as credentials"
                 self._report(where, ModelError(key, repr(redacted(given)), rule))
             elif key == "topic" and not TOPIC.fullmatch(str(given)):
                 self._report(where, ModelError(key, repr(given), TOPIC_RULE))
@@ -333,7 +333,7 @@ class Builder:
                 self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
     def _check_bag(self, camera: Camera) -> None:
-        """Check that the bag that a camera's source plays has its topic, with pictures of a kind that is known."""
+        """Check that the bag that a camera's source plays has its topic, with pictures of a supported kind."""
         given = {key: camera.mount.get(key, camera.source.settings.get(key)) for key in BAG_KEYS}
         if not camera.source.plays_bags or given["bag"] is None:
             return
@@ -349,7 +349,7 @@ class Builder:
         """Check that everything that source, graph and recording refer to exists."""
         anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
         try:
-            # One name for all: plans that differ in nothing else need not be checked against the registry again.
+            # One name for all: identical plans need not be checked against the registry again.
             plan = compile_graph(replace(camera, name="camera", mount=anything), media, index, recording=recording)
             for knob, value in SAMPLE_KNOBS.items():
                 assignments(camera, knob, value)
@@ -363,19 +363,19 @@ class Builder:
             self._report(self._of(camera.name, section), ModelError(key, error.found, error.rule))
 
     def _of(self, camera: str, section: str) -> schema.Path:
-        """Path of a camera's graph or source: its own one, otherwise the common one."""
+        """Path of a camera's graph or source: its own, otherwise the common one."""
         data = self.composed.document["cameras"][camera]
         return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
 
     def _check_places(self, cameras: Mapping[str, Camera]) -> None:
-        """No tile of the page covers another one."""
+        """Check that no tile of the page overlaps another one."""
         places = {name: camera.place for name, camera in cameras.items() if camera.place}
         for name, rule in overlapping(places):
             found = self.composed.document["cameras"][name]["place"]
             self._report(("cameras", name), ModelError("place", found, rule))
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
-        """No two listeners on one port. Cameras count up from the first port of their graph."""
+        """Check that no two servers use the same port. Cameras count up from the first port of their graph."""
         taken: dict[int, str] = {}
         for path, port in servers.items():
             if port in taken:
@@ -391,7 +391,7 @@ class Builder:
 
 
 def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """Those keys that the configuration states; the model has a default for each of the others."""
+    """The given keys among `keys`; the model has defaults for the others."""
     return {key: data[key] for key in keys if key in data}
 
 
@@ -407,15 +407,15 @@ def _ros(data: Mapping[str, Any]) -> RosSettings:
 
 
 def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
-    """What a source asks of its cameras, with the camera's own wishes in their place."""
+    """The capture format of a source, overridden by the camera's own settings."""
     own = data.get("capture") or {}
-    asked = {**source.capture, **own}
+    requested = {**source.capture, **own}
     controls = {**source.capture.get("controls", {}), **own.get("controls", {})}
     for key in ("width", "height", "fps"):
-        if key in asked and "format" not in asked:
+        if key in requested and "format" not in requested:
             raise ModelError("capture.format", "null", f"must be given where {key} is")
-    fps = asked.get("fps")
-    size = _given(asked, ("format", "width", "height"))
+    fps = requested.get("fps")
+    size = _given(requested, ("format", "width", "height"))
     return Capture(**size, fps=None if fps is None else exact(fps), controls=controls)
 
 
@@ -436,14 +436,14 @@ def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
 
 
 def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
-    """What a graph's `effort` means: values by key, None for an element's own default."""
+    """Settings for a graph's `effort`, by key; None for an element's own default."""
     efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts", {})
     elements = str(data["vehicle"])
     is_used = any(f"{{{key}}}" in elements for values in efforts.values() for key in values)
     known = list(efforts) if is_used else [ONLY_EFFORT]
     effort = data.get("effort", ONLY_EFFORT)
     if effort not in known:
-        raise ModelError("effort", effort, f"must be {' or '.join(known)}, which the encoder of this graph has")
+        raise ModelError("effort", effort, f"must be {' or '.join(known)}, which this graph's encoder supports")
     return dict(efforts.get(effort, {}))
 
 

@@ -1,4 +1,4 @@
-"""The camera list of the paper's own implementation in ROS, converted to files for `conf/`."""
+"""Converts the camera list of the paper's own implementation in ROS to files for `conf/`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from runner.errors import ConfigError, Problem
 
 ENTRY = re.compile(r"camera(\d+)")
 NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a vehicle
-PARAMETERS = "ros__parameters"  # what ROS 2 puts above the parameters of a node
+PARAMETERS = "ros__parameters"  # key above the parameters of a ROS 2 node
 NOT_CONVERTED = ("host", "ip_offset", "stream_on_connect", "is_jpeg")
 # By key of a model, the key of the list that it comes from.
 FROM = {"scaling": "scalings", "b_min_kbps": "transition_bitrates", "b_full_kbps": "transition_bitrates"}
@@ -39,7 +39,7 @@ class ListedCamera:
 
     entry        its key in the list
     name         as a camera of the vehicle
-    shown        its name at the operator
+    shown        its name on the operator's side
     model        the transition bitrates as ranges: the last one is b_full, the others are the bounds above 0
     topic        of its pictures in ROS
     """
@@ -53,7 +53,7 @@ class ListedCamera:
 
 
 def read_camera_list(path: Path) -> tuple[list[ListedCamera], list[str]]:
-    """The cameras of the list in its order, and a note on each kind of key that has no counterpart.
+    """The cameras of the list in order, and a note on each kind of key without a counterpart.
 
     raises  ConfigError with all problems
     """
@@ -162,7 +162,7 @@ def _camera(key: str, entry: Mapping[str, Any], document: Mapping[str, Any]) -> 
 
 
 def _rule(error: ModelError, entry: Mapping[str, Any]) -> str:
-    """The rule in the terms of the list."""
+    """The rule in terms of the list."""
     factors, rates = len(entry["scalings"]), len(entry["transition_bitrates"])
     if factors != rates:
         return f"must have {factors} entries, one per scaling factor"
@@ -170,7 +170,7 @@ def _rule(error: ModelError, entry: Mapping[str, Any]) -> str:
 
 
 def _misnamed(file: str, cameras: list[ListedCamera]) -> Iterator[Problem]:
-    """Names that no camera of a vehicle can have, or that two have."""
+    """Names that are invalid for a camera of a vehicle, or duplicate."""
     taken: dict[str, str] = {}
     for camera in cameras:
         if not choosable(camera.name):
@@ -191,6 +191,6 @@ def _notes(used: Mapping[str, Mapping[str, Any]], unused: int) -> Iterator[str]:
 
 
 def _quoted(text: str) -> str:
-    """A text in YAML: in quotes if it would be something else without, as `on` or `1`."""
+    """A text in YAML: quoted if it would otherwise be parsed as another type, such as `on` or `1`."""
     plain_text = re.fullmatch(r"[\w/.-]+", text) and yaml.safe_load(text) == text
     return text if plain_text else "'" + text.replace("'", "''") + "'"

@@ -1,8 +1,9 @@
-"""Configurations that differ in the files they choose, with each file composed only once if possible.
+"""Composes configurations that differ in the files they choose, each file only once if possible.
 
 Hydra merges key by key: a file limited to the section of its group composes to the same section whatever else is
-chosen. All such files are composed in one go, each in its own package; a configuration that chooses some of them is
-made of their sections. Files that reach further, by a package, a choice or an interpolation, are composed each time.
+chosen. All such files are composed together, each in its own package; a configuration that chooses some of them is
+assembled from their sections. Files that reach further, by a package, a choice or an interpolation, are composed each
+time.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def words_of(choices: Choices) -> tuple[str, ...]:
 
 
 def reaches(path: Path) -> set[str]:
-    """Groups other than its own whose choice may affect a file: it refers to them, chooses from them or fills them.
+    """Groups other than its own whose choice may affect a file: it refers to, chooses from or fills them.
 
     raises  ConfigError if it cannot be read
     """
@@ -60,15 +61,15 @@ class Combinations:
     def __init__(self, overrides: Sequence[str], user: Path | None, choices: Iterable[tuple[str, str]]) -> None:
         self.overrides, self._user = tuple(overrides), user
         self._root = find_file(conf_directories(user), "", "config")
-        named = any(word.lstrip("+~").startswith("name") for word in overrides)  # as the vehicle's file does, too
+        named = any(word.lstrip("+~").startswith("name") for word in overrides)  # set by the vehicle's file, too
         groups = (*SECTIONS, "cameras", *(() if named else ("vehicle",)))
         self._picks = [choice for choice in choices if choice[0] in groups]
         self._sections: dict[tuple[str, str], Any] = {}
 
     def assembled(self, choices: Choices) -> Composed | None:
-        """The same document, assembled from sections already composed; None if it has to be composed.
+        """The configuration assembled from composed sections; None if it has to be composed.
 
-        It does not record where its values come from: compose an invalid one to find out.
+        It does not record the origin of values: compose an invalid configuration to find out.
         """
         base = self._base
         own = {group: self._sections.get((group, option)) for group, option in choices.items()}
@@ -86,7 +87,7 @@ class Combinations:
         """The configuration of the overrides alone; also composes the sections of all files."""
         try:
             return self._picked(self._picks)
-        except ConfigError:  # in one of them; the others are composed one by one
+        except ConfigError:  # in one file; the others are composed one by one
             pass
         try:
             base = self._picked([])
@@ -114,7 +115,7 @@ class Combinations:
         """Whether a file fills the section of its group only, and does not depend on other choices."""
         if not stays_inside(part.content):
             return False
-        if part.path is None:  # an override, which is part of everything
+        if part.path is None:  # an override applies to all configurations
             return True
         group, package = part.path.parent.name, read(part.path).package
         chosen = [key for key, _ in chosen_by(part.path)]

@@ -1,4 +1,4 @@
-"""Compose the YAML tree with Hydra, and remember which file or override each value came from."""
+"""Composes the YAML tree with Hydra, and records the file or override that each value comes from."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from runner.resources import directory
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-# keys of a mount
-OF_THE_PLACE = (
+# keys of a mount that stay when its kind of camera is replaced
+KEPT_KEYS = (
     *("place", "pose", "weight", "floor_kbps", "shed", "graph", "source"),
     *("device", "address", "clip", "bag", "topic", "capture", "credentials"),
 )
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
-# Groups that Hydra composes only for applications that it starts itself: a tenth of the time.
+# Groups that Hydra needs only for applications that it launches itself: a tenth of the time.
 HYDRAS_OWN = ("output", "launcher", "sweeper", "help", "hydra_help", "hydra_logging", "job_logging", "env")
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
 
@@ -55,7 +55,7 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
 
 
 def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
-    """Check that files for the whole document say so; Hydra would silently put them elsewhere."""
+    """Check that files for the whole document declare it; Hydra would silently put them elsewhere."""
     for file in (find_file(directories, group, choices[group]) for group in WHOLE if group in choices):
         if file.exists() and read(file).package != "_global_":
             rule = f"must begin with the line {PACKAGE_HEADER}"
@@ -63,12 +63,12 @@ def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> N
 
 
 def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: Path | None = None) -> Composed:
-    """A configuration composed before, with the user's overrides on top; a group's file replaces that part.
+    """Apply the user's overrides to a configuration composed before; a group's file replaces that part.
 
     base    the document, as stored with a drive; name: its location, for messages
     raises  ConfigError
 
-    Keys that an earlier version did not state are taken from the packaged config.yaml.
+    Keys that an earlier version did not have are taken from the packaged config.yaml.
     """
     base = _completed(base)
     if not overrides:
@@ -105,11 +105,11 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str, Any]:
-    """Another kind of camera in place of a mounted one: keys that belong to the place stay."""
+    """Replace the kind of a mounted camera: keys that belong to the mount stay."""
     from omegaconf import OmegaConf
 
     before = OmegaConf.select(config, package) or {}
-    return {**{key: before[key] for key in OF_THE_PLACE if key in before}, **kind}
+    return {**{key: before[key] for key in KEPT_KEYS if key in before}, **kind}
 
 
 def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iterator[tuple[str, Any]]:
@@ -121,7 +121,7 @@ def _replaced(override: Override, config: DictConfig, user: Path | None) -> Iter
         return
     group, _, package = override.key.lstrip("/").partition("@")
     if group == "experiment":
-        raise ValueError("an experiment is a whole configuration: override single keys instead")
+        raise ValueError("an experiment is a whole configuration: override individual keys instead")
     if group == "vehicle":
         document = compose([f"{group}={override.value}"], user).document
         yield from ((key, document[key]) for key in ("name", "cameras"))
@@ -148,7 +148,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
 
     from runner.configuration.hydra_files import search
 
-    # OmegaConf's resolver for environment variables is not supported: a file alone defines its values.
+    # OmegaConf's resolver for environment variables is not supported: only files define values.
     OmegaConf.clear_resolver("oc.env")
     search(directories)
     root = find_file(directories, "", "config")
@@ -161,7 +161,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None
     except RecursionError:
-        rule = "files build on each other in a circle"
+        rule = "files include each other in a cycle"
         raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
     choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
     return config, choices
@@ -183,7 +183,7 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
     rule = "; ".join(lines)
     twice = re.search(r"Multiple values for ([\w/@.-]+?)\. ", text)
     if twice:
-        rule = f"is chosen twice; to choose again write override /{twice[1]}: FILE"
+        rule = f"is chosen twice; to replace a choice write override /{twice[1]}: FILE"
         return Problem(_chooser(twice[1], directories), "defaults", repr(f"/{twice[1]}"), rule)
     inside = re.search(r"In '([\w/.-]+)': (?:\w+ raised while composing config:; )?(.*)", rule)
     if inside:
@@ -191,7 +191,7 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         return Problem(label(find_file(directories, *_place(inside[1]))), "", None, rule)
     interpolation = re.search(r"Error resolving interpolation '(.+?)'", text)
     if interpolation:
-        rule = "a defaults list may refer to a choice above it only, such as ${vehicle}"
+        rule = "a defaults list may refer only to a choice above it, such as ${vehicle}"
         for path, entries in defaults(directories):
             if any(interpolation[1] in value for _, value in entries):
                 return Problem(label(path), "defaults", interpolation[1], rule)
@@ -214,7 +214,7 @@ def _chooser(key: str, directories: Sequence[Path]) -> str:
 
 
 def _overriding(group: str, name: str, directories: Sequence[Path]) -> str:
-    """The file whose defaults list overrides the choice of a group's file, or ""; Hydra names its reader."""
+    """The file whose defaults list overrides the choice of a group's file, or ""; Hydra names another one."""
     for path, entries in defaults(directories):
         if any(key.replace(" /", " ") == f"override {group}" and value == name for key, value in entries):
             return label(path)
@@ -228,7 +228,7 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
     """The files behind a composition, in the order in which Hydra merged them."""
     root = find_file(directories, "", "config")
     yield Part(label(root), (), load_file(root), root)
-    # Mounted files first: a vehicle file comes last for values of the place. An experiment overrides all others.
+    # Mounted files first: a vehicle file overrides values of the mount. An experiment overrides all others.
     for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
         group, _, package = key.partition("@")
         if group.startswith("hydra") or group not in GROUPS or name == "None":
@@ -238,7 +238,7 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
 
 
 def _with_bases(path: Path, group: str, package: schema.Path, directories: Sequence[Path]) -> Iterator[Part]:
-    """A group's file after those of its own group that its defaults list builds on."""
+    """A group's file, after those of its own group that it builds on."""
     for base in bases_of(path):
         yield from _with_bases(find_file(directories, group, base), group, package, directories)
     yield Part(label(path), package, load_file(path), path)

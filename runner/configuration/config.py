@@ -1,4 +1,4 @@
-"""One configuration: composed once, its parts checked and built on demand."""
+"""A configuration, composed once; its parts are checked and built on demand."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Configuration:
 
     composed  with the origin of each value
     user      directory whose files shadow the packaged ones and may add others
-    runnable  also check what only a run needs: clips, devices and addresses are named, and files exist
-    bags      also check that bags which are named have pictures of each camera; None: if runnable
+    runnable  also check what only a run needs: clips, devices and addresses are configured, and files exist
+    bags      also check that configured bags have pictures of each camera; None: if runnable
     check     further check of a compiled plan, against the GStreamer registry
     fits      sections already known to satisfy the schemas
 
@@ -51,7 +51,7 @@ class Configuration:
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
 
     def drivable(self, check: PlanCheck) -> Configuration:
-        """The same, also checked for what a run needs."""
+        """The same, with the checks that a run needs."""
         return Configuration(self._composed, self._user, check=check)
 
     @property
@@ -66,7 +66,7 @@ class Configuration:
         return listing(self._composed)
 
     def vehicle(self) -> Vehicle:
-        return self._builder.finished(self._builder.vehicle)
+        return self._builder.checked(self._builder.vehicle)
 
     def pqos(self) -> tuple[Pqos, Track | None]:
         """The source of predictions, and the drive that gives positions if no GPS does."""
@@ -76,16 +76,16 @@ class Configuration:
         pqos = part(("pqos",), lambda settings: build_pqos(settings, self._bases))
         # A map that cannot be read is reported once, although the drive also uses its points.
         track = part(("pqos",), lambda settings: build_track(settings, self._bases)) if pqos else None
-        return self._builder.finished(pqos), track
+        return self._builder.checked(pqos), track
 
     def study(self) -> Study:
         """How rate-quality models of the cameras are measured."""
         from runner.rate_quality.study import read_study
 
-        return self._builder.finished(self._builder.part(("study",), read_study))
+        return self._builder.checked(self._builder.part(("study",), read_study))
 
     def experiment(self) -> Experiment:
-        """What the demo drives, and what its operator asks for."""
+        """The drive of the demo, and the requests of its operator."""
         from runner.configuration.experiment import Experiment, read_experiment
 
         builder = self._builder
@@ -93,20 +93,20 @@ class Configuration:
         experiment = builder.part(("experiment",), read_experiment) if given else Experiment()
         if experiment:
             builder.check_requests(experiment.requests)
-        return builder.finished(experiment)
+        return builder.checked(experiment)
 
     def link(self) -> LinkSettings | None:
-        """The limited link between the demo's sides, if there is one."""
-        from runner.configuration.experiment import read_link, truth
+        """The limited link between the demo's sides, if any."""
+        from runner.configuration.experiment import read_link, true_rates
 
         builder = self._builder
         if "link" not in self.document:
             return None
-        rates = builder.part(("pqos",), lambda settings: truth(settings, self._bases))
+        rates = builder.part(("pqos",), lambda settings: true_rates(settings, self._bases))
         link = builder.part(("link",), lambda settings: read_link(settings, rates, self._bases)) if rates else None
         if link:
             builder.check_link(link)
-        return builder.finished(link)
+        return builder.checked(link)
 
     @cached_property
     def _builder(self) -> Builder:
@@ -124,7 +124,7 @@ def configuration(
     """Compose files and overrides.
 
     overrides  Hydra overrides, as on the command line
-    base       configuration that the overrides change; None: the packaged and the user's files
+    base       configuration to which the overrides apply; None: the packaged and the user's files
     raises     ConfigError if they cannot be composed
     """
     composed = recompose(*base, overrides, user) if base else compose(overrides, user)

@@ -22,7 +22,7 @@ STEP_S = 0.1  # interval at which the rate of a link follows a map
 
 
 class TimedRequest(NamedTuple):
-    """What the operator asks for, s after the vehicle came online to it: an event in JSON without its time."""
+    """A request of the operator, `at_s` after it sees the vehicle online: an event in JSON without its time."""
 
     at_s: float
     event: Mapping[str, Any]
@@ -30,11 +30,11 @@ class TimedRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class Experiment:
-    """What the demo drives.
+    """The drive of the demo.
 
-    about       what it shows, in a sentence, or ""
+    about       its purpose, in a sentence, or ""
     duration_s  length of each drive, s
-    claims      name of the claims that a publication makes about such a drive, or ""
+    claims      name of a publication's claims about such a drive, or ""
     runs        by name, the overrides that each of several drives adds; empty: one drive
     requests    in the order of their times
     """
@@ -74,7 +74,7 @@ def _request(index: int, data: Mapping[str, Any]) -> TimedRequest:
 def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> LinkSettings:
     """The link that the `link` section describes.
 
-    predicted  the rates that it follows if it names no file, see `truth`
+    predicted  rates to follow if it names no file, see `true_rates`
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
@@ -95,7 +95,7 @@ def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Rat
 
 
 def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reverse:
-    """The way back: its rate is a file's, or constant."""
+    """The reverse direction: its rate is a file's, or constant."""
     kbps, file = data.get("kbps"), data.get("file")
     if (kbps is None) == (file is None):
         raise ModelError("reverse", dict(data), "must give either kbps or file")
@@ -115,20 +115,20 @@ def _tcp(data: Mapping[str, Any]) -> TcpFlows:
 
 
 def _path(data: Mapping[str, Any]) -> dict[str, float]:
-    """What one direction of the link does, beside its rate."""
+    """Parameters of one direction of the link other than its rate."""
     lost = {"loss": float(data.get("loss", 0)), "burst": float(data.get("loss_burst", 1))}
     return {"queue_ms": float(data["queue_ms"]), "delay_ms": float(data["delay_ms"])} | lost
 
 
-def truth(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
+def true_rates(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
     """The rate that the source of the `pqos` section states for each time and place, without look-ahead or `wrong`.
 
     raises  ModelError with the key, the value found and the rule
     """
-    return _known(build_pqos({**pqos, "look_ahead_s": 0, "wrong": None}, bases), build_track(pqos, bases))
+    return _recorded_rates(build_pqos({**pqos, "look_ahead_s": 0, "wrong": None}, bases), build_track(pqos, bases))
 
 
-def _known(source: Pqos, track: Track | None) -> RateAtTime:
+def _recorded_rates(source: Pqos, track: Track | None) -> RateAtTime:
     """The rate that a prediction source states for each time of a drive; 0 if it states none."""
     rates: list[Kbps] = []
 

@@ -10,7 +10,7 @@ from runner.configuration.yaml_file import load_file
 from runner.errors import ConfigError
 from runner.resources import directory
 
-LAYOUT = "layout"  # folder of the user's directory in which the operator's page keeps layouts; it is no group
+LAYOUT = "layout"  # folder in the user's directory where the operator's page saves layouts; not a group
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
 
 
@@ -31,7 +31,7 @@ def files(directories: Sequence[Path]) -> Iterator[Path]:
 
 
 def find_file(directories: Sequence[Path], group: str, name: str) -> Path:
-    """The first file of that name; if there is none, the path where it would be."""
+    """The first file of that name; if none exists, its path in the first directory."""
     candidates = [d / group / f"{name}.yaml" for d in directories]
     return next((path for path in candidates if path.exists()), candidates[0])
 
@@ -45,16 +45,16 @@ def defaults(directories: Sequence[Path]) -> Iterator[tuple[Path, list[tuple[str
 
 def built_on(path: Path, directories: Sequence[Path]) -> set[Path]:
     """A file and, recursively, those that its defaults list names; one that cannot be read names none."""
-    found, open_ends = set[Path](), [path]
-    while open_ends:
-        path = open_ends.pop()
+    found, pending = set[Path](), [path]
+    while pending:
+        path = pending.pop()
         if path not in found and path.exists():
             found.add(path)
             with suppress(ConfigError):
                 group = path.parent.name
                 named = [(key.split()[-1].lstrip("/").partition("@")[0], name) for key, name in chosen_by(path)]
                 named += [(group, name) for name in bases_of(path)]
-                open_ends += [find_file(directories, *one) for one in named]
+                pending += [find_file(directories, *one) for one in named]
     return found
 
 

@@ -1,4 +1,4 @@
-"""How Hydra finds and reads configuration files: the user's before the packaged ones, all through `yaml_file`."""
+"""Makes Hydra find and read configuration files: the user's before the packaged ones, all through `yaml_file`."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class CheckedFiles(FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """raises ConfigError"""
         path = Path(self.path) / self._normalize_file_name(config_path)
-        # A copy, since Hydra takes the defaults list out of it and merges other files into it.
+        # A copy, since Hydra removes the defaults list and merges other files into it.
         return ConfigResult(self.provider, self.full_path(), deepcopy(load_node(path)), {"package": read(path).package})
 
 
 class Directories(SearchPathPlugin):
-    """Hydra's own --config-dir only appends, so that a user's file could not shadow a packaged one."""
+    """Prepends directories; Hydra's own --config-dir appends, so that a user's file could not shadow a packaged one."""
 
     directories: Sequence[Path] = ()
 
@@ -46,7 +46,7 @@ class Directories(SearchPathPlugin):
 
 
 def search(directories: Sequence[Path]) -> None:
-    """Let Hydra search these directories, the first one first."""
+    """Make Hydra search these directories in order."""
     Directories.directories = directories
     for plugin in (CheckedFiles, Directories):
         Plugins.instance().register(plugin)

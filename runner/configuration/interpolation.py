@@ -1,4 +1,4 @@
-"""The targets of interpolations, ${a.b}, and the size of a configuration when they are expanded."""
+"""Targets of interpolations, ${a.b}, and the size of a configuration with interpolations expanded."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ def spliced(written: Any, resolved: Any) -> tuple[Any, dict[Path, Path]]:
 
     written   the document before its interpolations were resolved
     resolved  the same afterwards
-    returns   the document, and by path in it, where the entries of such lists are written
+    returns   the document, and by path in it, the original paths of entries of such lists
     """
     moved: dict[Path, Path] = {}
 
     def followed(path: Path, kind: type) -> Path:
-        """Where the value of a kind to which a path leads is written."""
+        """The original path of the value of a type to which a path leads."""
         text = value_at(written, path)
         target = next(references(text, path), path) if isinstance(text, str) else path
         return followed(target, kind) if target != path and isinstance(value_at(resolved, target), kind) else path
 
     def entries(path: Path) -> Iterator[tuple[Path, Any]]:
-        """Entries of a resolved list, each with the path at which it is written."""
+        """Entries of a resolved list, each with its original path."""
         for index, entry in enumerate(value_at(resolved, path)):
             here = (*path, index)
             there = followed(here, list) if isinstance(entry, list) else here
@@ -84,11 +84,11 @@ def spliced(written: Any, resolved: Any) -> tuple[Any, dict[Path, Path]]:
     return copy(resolved, (), ()), moved
 
 
-def written_out(document: Any, most: int) -> bool:
-    """Whether a document holds at most `most` values with its interpolations expanded.
+def expands_within(document: Any, most: int) -> bool:
+    """Whether a document has at most `most` values with its interpolations expanded.
 
-    Each value counts once for every place that refers to it, directly or indirectly: a dozen short lines that double
-    each other make millions.
+    Each value counts once per direct or indirect reference: a dozen short lines that double each other expand to
+    millions.
     """
     try:
         return _Sizes(document).of(()) <= most

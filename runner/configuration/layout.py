@@ -1,4 +1,4 @@
-"""Layouts that operators save on the page: in the user's directory a file for each operator, by vehicle the places."""
+"""Layouts that operators save on the page: one file per operator in the user's directory, with places by vehicle."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from runner.configuration.yaml_file import label, load_file
 from runner.core.model import Place, Vehicle, overlapping, suggest
 from runner.errors import ConfigError, Problem, UserError
 
-WITHOUT_KEYS = "operator"  # name of an operator who has no keys to be known by
-MOST_NAMED = 5  # unknown cameras in an answer
-NOWHERE = "layouts are saved in a directory of yours: start this side with conf=DIR"
+WITHOUT_KEYS = "operator"  # name of an operator without keys
+MAX_NAMED = 5  # unknown cameras in an answer
+NOWHERE = "layouts are saved in your own directory: start this side with conf=DIR"
 HEADER = """\
 # yaml-language-server: $schema=../.schemas/layout.schema.json
-# By vehicle and camera, where this operator has put the pictures. Saving a layout on the page writes this file anew.
+# By vehicle and camera, where this operator has placed the pictures. Saving a layout on the page overwrites this file.
 """
 
 Places = Mapping[str, Place | None]  # by camera; None: none
 
 
 def layout_problems(path: Path) -> Iterator[Problem]:
-    """What is wrong with a file of layouts.
+    """The problems of a file of layouts.
 
     raises  ConfigError if it cannot be read
     """
@@ -40,11 +40,11 @@ def layout_problems(path: Path) -> Iterator[Problem]:
 
 
 class Layouts:
-    """What one operator has saved, and saves.
+    """The saved layouts of one operator.
 
-    user      directory of the user; None: there is none, and nothing can be saved
+    user      directory of the user; None: nothing can be saved
     operator  name of the operator, and of the file
-    raises    UserError for a name that is none; ConfigError with all problems of the file
+    raises    UserError for an invalid name; ConfigError with all problems of the file
     """
 
     def __init__(self, user: Path | None = None, operator: str = WITHOUT_KEYS) -> None:
@@ -56,7 +56,7 @@ class Layouts:
         self._vehicles = self._read()
 
     def places(self, vehicle: Vehicle) -> Places:
-        """The places of a vehicle's cameras: those saved for it, else its own."""
+        """The places of a vehicle's cameras: those saved for it, otherwise its own."""
         saved = self._vehicles.get(vehicle.name)
         return own_places(vehicle) if saved is None else {name: saved.get(name) for name in vehicle.cameras}
 
@@ -64,16 +64,16 @@ class Layouts:
         return vehicle.name in self._vehicles
 
     def notes(self, vehicle: Vehicle) -> Iterator[str]:
-        """What of the places saved for a vehicle has no effect."""
+        """Notes about saved places of a vehicle that have no effect."""
         for name in self._vehicles.get(vehicle.name, {}):
             if name not in vehicle.cameras:
                 hint = suggest(name, vehicle.cameras)
                 yield f"{self.path}: vehicles.{vehicle.name}.{name}: is ignored: no such camera{hint}"
 
     def save(self, vehicle: Vehicle, document: Any) -> None:
-        """Write the places of a vehicle's cameras into the file; what it holds of other vehicles stays.
+        """Write the places of a vehicle's cameras to the file; those of other vehicles stay.
 
-        document  by camera, as in the file; None: forget the vehicle, whose own places then count
+        document  by camera, as in the file; None: remove the vehicle, so that its own places apply
         raises    UserError if there is no directory, or the document or the present file is wrong; RunError if it
                   cannot be written
         """
@@ -109,7 +109,7 @@ def places_problem(vehicle: Vehicle, document: Any) -> str | None:
     """The problems of places for a vehicle's cameras, in one line; None if they are valid."""
     if problem := schema.places_problem(document):
         return problem
-    if unknown := [name for name in document if name not in vehicle.cameras][:MOST_NAMED]:
+    if unknown := [name for name in document if name not in vehicle.cameras][:MAX_NAMED]:
         return "; ".join(f"{schema.shown(name)}: unknown camera{suggest(name, vehicle.cameras)}" for name in unknown)
     return "; ".join(f"{name}: {rule}" for name, rule in overlapping(_places(document))) or None
 
@@ -128,6 +128,6 @@ def _text(vehicles: Mapping[str, Mapping[str, Place]]) -> str:
 
 
 def _stated(place: Place) -> dict[str, int]:
-    """A place as it is written: without the spans that it need not state."""
+    """A place as written to the file, without default spans."""
     spans = {"row_span": place.row_span, "column_span": place.column_span}
     return {"row": place.row, "column": place.column, **{key: span for key, span in spans.items() if span != 1}}

@@ -11,14 +11,14 @@ import yaml
 from runner import schema
 from runner.configuration.origin import Composed
 
-WIDEST = 100  # characters of a line before its comment, where its value can be written over several
+WIDEST = 100  # characters of a line before its comment, if its value can be split over several lines
 UNSTATED = "in none of the files and overrides"
 
 
 def listing(composed: Composed) -> str:
     """YAML that loads as the composed document.
 
-    A list or mapping whose values have one origin is written in one line if that is not too long, or a list of numbers.
+    A list or mapping whose values have a single origin is written in one line if short enough or a list of numbers.
     """
     return "\n".join(_entries(composed, composed.document, (), ""))
 
@@ -51,7 +51,7 @@ def _is_filled(value: Any) -> bool:
 
 
 def _origins(composed: Composed, value: Any, path: schema.Path) -> Iterator[str]:
-    """Where the values below a path come from, in their order."""
+    """Origins of the values below a path, in order."""
     if _is_filled(value):
         for key, inner in enumerate(value) if isinstance(value, list) else value.items():
             yield from _origins(composed, inner, (*path, key))

@@ -1,4 +1,4 @@
-"""Which file or override each value of a composed configuration comes from. Pure."""
+"""Tracks the file or override that each value of a composed configuration comes from. Pure."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Part:
 class Composed:
     """The whole configuration as plain data, and its parts, the one with the highest precedence first.
 
-    moved  by path in the document, where the entries that a list includes from another one are written
+    moved  by path in the document, the original paths of entries that a list includes from another list
     """
 
     document: dict[str, Any]
@@ -46,7 +46,7 @@ class Composed:
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
 
     def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
-        """A problem of the whole, attributed to its file or override, with the path inside it."""
+        """A problem, attributed to its file or override, with the path inside that."""
         path = self.written(path)
         part = self._origin(path)
         return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
@@ -61,15 +61,15 @@ class Composed:
         return next((part for part in self._visible(path) if _states(part, path, value)), None)
 
     def written(self, path: schema.Path) -> schema.Path:
-        """Where a value of the document is written."""
+        """The original path of a value of the document."""
         lengths = (length for length in range(len(path), 0, -1) if path[:length] in self.moved)
         length = next(lengths, 0)
         return (*self.moved[path[:length]], *path[length:]) if length else path
 
     def without_graph_parts(self) -> Composed:
-        """Without the parts of graphs that a list includes, or that a later list omits.
+        """Remove the parts of graphs that a list includes, or that a later list omits.
 
-        One that remains is a mistake: the file that sets it last meant it to be used.
+        A remaining one is a mistake: the file that sets it last expects it to be used.
         """
         used = {(path[:-2], origin[-2]) for path, origin in self.moved.items()}
         mounts = self.document.get("cameras")
@@ -84,18 +84,18 @@ class Composed:
         return self
 
     def _age(self, path: schema.Path) -> int:
-        """How many parts take precedence over the one that a value comes from."""
+        """Number of parts that take precedence over the one that a value comes from."""
         return self.parts.index(self._origin(path))
 
     def _origin(self, path: schema.Path) -> Part:
-        """The part that has the value; for a missing one, the part that states most of its surroundings."""
+        """The part that has the value; for a missing value, the part that defines most of its surroundings."""
         inside = [part for part in self._visible(path) if path[: len(part.package)] == part.package]
         for length in range(len(path), 0, -1):
             makers = [part for part in inside if len(part.package) == length]
             above = (part for part in inside if len(part.package) < length)
             holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
-            if length < len(path):  # the key is missing: the part that wrote its surroundings, the most local first
-                writers = [part for part in holders if isinstance(_held(part, path[:length]), dict | list)]
+            if length < len(path):  # the key is missing: the part that defines its surroundings, the most local first
+                writers = [part for part in holders if isinstance(_value_in(part, path[:length]), dict | list)]
                 holders = sorted(writers or holders, key=_locality)
             candidates = [*holders, *makers] if length == len(path) else [*makers, *holders]
             if candidates:
@@ -104,10 +104,10 @@ class Composed:
         return next(vehicle, self.parts[-1]) if path[:1] in (("name",), ("cameras",)) else self.parts[-1]
 
     def _visible(self, path: schema.Path) -> list[Part]:
-        """The parts down to the one whose list the path leads through: a list replaces those of all earlier files."""
+        """The parts down to the one whose list contains the path: a list replaces those of all earlier files."""
         lists = [path[:depth] for depth, key in enumerate(path) if isinstance(key, int)]
         for index, part in enumerate(self.parts):
-            if any(isinstance(_held(part, place), list) for place in lists):
+            if any(isinstance(_value_in(part, place), list) for place in lists):
                 return self.parts[: index + 1]
         return self.parts
 
@@ -132,12 +132,12 @@ def _merge(document: dict[str, Any], added: Mapping[str, Any]) -> None:
 
 
 def _states(part: Part, path: schema.Path, value: Any) -> bool:
-    """Whether a part holds this value at a path of the whole document, or an interpolation in its place."""
+    """Whether a part has this value, or an interpolation instead, at a path of the whole document."""
     if path[: len(part.package)] != part.package:
         return False
     inner = path[len(part.package) :]
     above = (value_at(part.content, inner[:length]) for length in range(len(inner) + 1))
-    if any(isinstance(held, str) and "${" in held for held in above):
+    if any(isinstance(each, str) and "${" in each for each in above):
         return True
     return _holds(part.content, inner) and value_at(part.content, inner) == value
 
@@ -146,14 +146,14 @@ def _locality(part: Part) -> int:
     return -len(part.package)
 
 
-def _held(part: Part, path: schema.Path) -> Any:
-    """The value of a part at a path of the whole document; None: it has none."""
+def _value_in(part: Part, path: schema.Path) -> Any:
+    """The value of a part at a path of the whole document; None if missing."""
     inside = path[: len(part.package)] == part.package
     return value_at(part.content, path[len(part.package) :]) if inside else None
 
 
 def _holds(content: Any, path: schema.Path) -> bool:
-    return value_at(content, path, _NOTHING) is not _NOTHING
+    return value_at(content, path, _MISSING) is not _MISSING
 
 
 def nested(key: str, value: Any) -> Any:
@@ -163,4 +163,4 @@ def nested(key: str, value: Any) -> Any:
     return value
 
 
-_NOTHING = object()
+_MISSING = object()

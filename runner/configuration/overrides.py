@@ -1,4 +1,4 @@
-"""Overrides: words of the command line as Hydra parses them; each chooses a group's file or sets a value."""
+"""Overrides: command-line words as parsed by Hydra; each chooses a group's file or sets a value."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override as HydraOverride
 
 COMMAND_LINE = "command line"
-OPTIONAL = ("link", "experiment")  # groups that need no chosen file
+OPTIONAL = ("link", "experiment")  # groups that need no choice
 LONGEST_WORD = 4096  # characters of an override, as for a path
 DEEPEST = 32  # brackets of one kind in an override
-MOST_RUNS = 1000  # of a sweep
+MAX_RUNS = 1000  # of a sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Override:
         return self.choice and self.key in OPTIONAL and self.value == "null"
 
     def hydra(self, chosen: Collection[str]) -> str:
-        """Its form for Hydra: a plus is never needed and never wrong. The schema defines the valid keys.
+        """Its form for Hydra, in which a plus is optional. The schema defines the valid keys.
 
         chosen  groups for which conf/config.yaml chooses a file
         """
@@ -84,7 +84,7 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
 def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
     """The overrides of each run that sweeps stand for: a=1,2 or a=choice(1,2), a=range(1,5), in Hydra's grammar.
 
-    returns  one word for each given one, in the order of Hydra's own sweeper: the last word changes fastest
+    returns  one word per given word, in the order of Hydra's own sweeper: the last word varies fastest
     raises   ConfigError
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -94,18 +94,18 @@ def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
     for text in words:
         try:
             override, _ = _parsed(parser, text)
-            swept.append(list(islice(_values(override), MOST_RUNS + 1)))
+            swept.append(list(islice(_values(override), MAX_RUNS + 1)))
         except HydraException as error:
             problems.append(_problem(text, error))
     if problems:
         raise ConfigError(problems)
-    if (count := prod(map(len, swept))) > MOST_RUNS:
-        raise ConfigError([Problem(COMMAND_LINE, "-m", None, f"{count} runs or more: must be at most {MOST_RUNS}")])
+    if (count := prod(map(len, swept))) > MAX_RUNS:
+        raise ConfigError([Problem(COMMAND_LINE, "-m", None, f"{count} runs or more: must be at most {MAX_RUNS}")])
     return list(product(*swept))
 
 
 def _values(override: HydraOverride) -> Iterator[str]:
-    """An override for each value of a sweep; one that is no sweep as it is."""
+    """An override for each value of a sweep; any other override unchanged."""
     from hydra.errors import HydraException
 
     if not override.is_sweep_override():
@@ -140,7 +140,7 @@ def _problem(text: str, error: Exception) -> Problem:
 
 
 def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator[Problem]:
-    """A choice of a missing file, or a value for a key that belongs to the whole document."""
+    """The problem of choosing a missing file."""
     if not override.choice or override.value is None or override.is_none:
         return
     group = override.key.split("@")[0].lstrip("/")

@@ -6,14 +6,14 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from runner.configuration.interpolation import spliced, written_out
+from runner.configuration.interpolation import expands_within, spliced
 from runner.configuration.origin import Composed, Part, merged
 from runner.errors import ConfigError, Problem
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-MOST_RESOLVED = 50_000  # values of a configuration, with its interpolations expanded
+MAX_RESOLVED = 50_000  # values of a configuration with its interpolations expanded
 
 
 def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
@@ -25,9 +25,9 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
     from omegaconf.errors import OmegaConfBaseException
 
     written = OmegaConf.to_container(config)
-    if not written_out(written, MOST_RESOLVED):
+    if not expands_within(written, MAX_RESOLVED):
         file = next(part.file for part in parts if "${" in str(part.content))
-        rule = f"interpolations, ${{...}}, are nested too deeply or expand to more than {MOST_RESOLVED} values"
+        rule = f"interpolations, ${{...}}, are nested too deeply or expand to more than {MAX_RESOLVED} values"
         raise ConfigError([Problem(file, "", None, rule)])
     try:
         document = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -40,7 +40,7 @@ def resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
 
 
 def is_determined(composed: Composed) -> bool:
-    """Whether its parts, merged one after the other, give the configuration."""
+    """Whether merging its parts in order results in the configuration."""
     whole = _merged(composed.parts)
     return whole is not None and whole.document == composed.document
 

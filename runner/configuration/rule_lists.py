@@ -1,4 +1,4 @@
-"""From a modes file to rule lists: rules are found, their parameters and their order checked, once.
+"""Builds rule lists from a modes file: finds rules, and checks their parameters and order, once.
 
 Rules of other packages are found by the entry point group `tod_runner.rules`.
 """
@@ -25,7 +25,7 @@ def find_rule(name: str) -> Rule:
         for entry in entry_points(group="tod_runner.rules", name=name):
             try:
                 entry.load()
-            except Exception as error:  # whatever the user's package raises when it is imported
+            except Exception as error:  # a user's package may raise anything on import
                 rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
                 raise ModelError("", repr(name), rule) from None
     if name not in rules.RULES:
@@ -51,7 +51,7 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
             raise ModelError(f"{name}.{key}", value, "must be above 0")
     for key, parameter in known.items():
         if key not in parameters and parameter.default is inspect.Parameter.empty:
-            raise ModelError(f"{name}.{key}", "missing", "this rule needs it")
+            raise ModelError(f"{name}.{key}", "missing", "required by this rule")
     return RuleCall(found, {key: exact(value) for key, value in parameters.items()})
 
 

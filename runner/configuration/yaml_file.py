@@ -20,8 +20,8 @@ from runner.system.files import read_file
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-MOST_BYTES = 100_000  # about twenty times the longest packaged file
-MOST_VALUES = 10_000  # with every alias (*NAME) expanded
+MAX_BYTES = 100_000  # about twenty times the longest packaged file
+MAX_VALUES = 10_000  # with every alias (*NAME) expanded
 DEEPEST = 32  # levels of lists and mappings
 _NAME = re.compile(r"[\w /@:.,${}?-]+")  # of a file or a group, in a defaults list
 _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
@@ -58,7 +58,7 @@ def label(path: Path) -> str:
 
 
 def load_node(path: Path) -> DictConfig:
-    """Content of a configuration file as Hydra merges it; not to be changed.
+    """Content of a configuration file as Hydra merges it; must not be modified.
 
     raises  ConfigError as `load_file`, and if it is not a configuration
     """
@@ -117,20 +117,20 @@ def _is_choice(entry: Any) -> bool:
 
 @lru_cache(maxsize=1024)
 def _read(path: Path, _modified_ns: int, _bytes: int) -> YamlFile:
-    """Read once while time and size stay the same: a run composes the same files more than once."""
+    """Cached while time and size stay the same: a run composes the same files repeatedly."""
     try:
-        text = read_file(path, MOST_BYTES).decode()
+        text = read_file(path, MAX_BYTES).decode()
         return YamlFile(_content(text), _package(text))
     except yaml.YAMLError as error:
         raise ConfigError([_yaml_problem(error, label(path))]) from None
     except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
-        # Also what PyYAML's own constructors let through: !!int x, 0x, numbers of ten thousand digits.
+        # Also errors in PyYAML's own constructors: !!int x, 0x, numbers of ten thousand digits.
         raise ConfigError([Problem(label(path), "", None, str(error))]) from None
 
 
 def _content(text: str) -> Any:
     in_python, in_c = _loaders()
-    with suppress(yaml.YAMLError):  # the messages of the parser in Python are more detailed
+    with suppress(yaml.YAMLError):  # the parser in Python has more detailed messages
         return yaml.load(text, Loader=in_c)
     return yaml.load(text, Loader=in_python)
 
@@ -153,7 +153,7 @@ def _loaders() -> tuple[Any, Any]:
     from omegaconf._utils import get_yaml_loader
 
     class Limited(get_yaml_loader()):  # type: ignore[misc]
-        """Counts while the tree of nodes grows, so that nothing too large is built."""
+        """Counts nodes while composing, so that nothing too large is built."""
 
         def __init__(self, stream: Any) -> None:
             super().__init__(stream)
@@ -164,24 +164,24 @@ def _loaders() -> tuple[Any, Any]:
             event, before = self.peek_event(), self._values
             self._depth += 1
             if self._depth > DEEPEST:
-                raise _beyond(event, f"must be nested at most {DEEPEST} levels deep")
+                raise _limit_error(event, f"must be nested at most {DEEPEST} levels deep")
             node = super().compose_node(parent, index)
             self._depth -= 1
             if isinstance(event, yaml.AliasEvent):
                 if id(node) not in self._sizes:
-                    raise _beyond(event, f"an alias, *{event.anchor}, is part of the value it refers to")
+                    raise _limit_error(event, f"an alias, *{event.anchor}, is part of the value it refers to")
                 self._values += self._sizes[id(node)]
             else:
                 self._values += 1
                 self._sizes[id(node)] = self._values - before
-            if self._values > MOST_VALUES:
-                raise _beyond(event, f"must hold at most {MOST_VALUES} values, aliases written out")
+            if self._values > MAX_VALUES:
+                raise _limit_error(event, f"must contain at most {MAX_VALUES} values, with aliases expanded")
             return node
 
         def construct_yaml_int(self, node: Any) -> int:
             number: int = super().construct_yaml_int(node)
             if abs(number) >= 10**schema.LONGEST_WHOLE:
-                raise _beyond(node, f"must have at most {schema.LONGEST_WHOLE} digits")
+                raise _limit_error(node, f"must have at most {schema.LONGEST_WHOLE} digits")
             return number
 
     Limited.add_constructor("tag:yaml.org,2002:int", Limited.construct_yaml_int)
@@ -199,6 +199,6 @@ def _loaders() -> tuple[Any, Any]:
     return Limited, Quick
 
 
-def _beyond(place: Any, rule: str) -> yaml.MarkedYAMLError:
+def _limit_error(place: Any, rule: str) -> yaml.MarkedYAMLError:
     """An error at an event or a node."""
     return yaml.MarkedYAMLError(problem=rule, problem_mark=place.start_mark)

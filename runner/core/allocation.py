@@ -1,4 +1,4 @@
-"""Bitrate demand and allocation (paper, section II-A). Exact: no bitrate on a bound is decided by float noise."""
+"""Bitrate demand and allocation (paper, section II-A). Exact: float noise never decides a bitrate on a bound."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from math import lcm
 from runner.core.model import Kbps, Roi
 
 ZERO = Fraction(0)
-RETURN = Fraction(11, 10)  # times the floors: below, a total that varies would switch a camera on and off
+RETURN = Fraction(11, 10)  # hysteresis on the floors, so that a varying total does not switch a camera on and off
 
 
 def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
@@ -20,7 +20,7 @@ def demand(b_full: Kbps, roi: Roi, full: Roi) -> Kbps:
     b_full   kbit/s for the full image
     roi      px, what the operator has set
     full     px, the full image
-    returns  kbit/s; not called for a camera that is off, whose p_set is 0
+    returns  kbit/s; not to be called for a camera that is off, whose p_set is 0
     """
     return Fraction(roi.pixels * b_full, full.pixels) if roi is not full and roi != full else b_full
 
@@ -41,21 +41,21 @@ def allocate(demands: Mapping[str, Kbps], total: Kbps, weights: Mapping[str, Fra
 
     The paper leaves two cases open. All cameras off: each gets 0. More than demanded: the surplus stays unused.
     """
-    waiting = {name: own for name, own in demands.items() if own and weights[name]}
-    wanted = _sum(waiting.values())
-    if total >= wanted:
-        return {name: waiting.get(name, ZERO) for name in demands}
+    open_demands = {name: own for name, own in demands.items() if own and weights[name]}
+    demanded = _sum(open_demands.values())
+    if total >= demanded:
+        return {name: open_demands.get(name, ZERO) for name in demands}
     allocated = dict.fromkeys(demands, ZERO)
-    if _all_equal([weights[name] for name in waiting]):
-        share = total / wanted
-        return allocated | {name: own * share for name, own in waiting.items()}
+    if _all_equal([weights[name] for name in open_demands]):
+        share = total / demanded
+        return allocated | {name: own * share for name, own in open_demands.items()}
     left = total
     # Heaviest first: once lambda does not fill a camera, it fills no lighter one, and the rest share the remainder.
-    for name in sorted(waiting, key=weights.__getitem__, reverse=True):
-        share = left / sum(weights[other] * own for other, own in waiting.items())
+    for name in sorted(open_demands, key=weights.__getitem__, reverse=True):
+        share = left / sum(weights[other] * own for other, own in open_demands.items())
         if share * weights[name] < 1:
-            return allocated | {other: own * share * weights[other] for other, own in waiting.items()}
-        allocated[name] = waiting.pop(name)
+            return allocated | {other: own * share * weights[other] for other, own in open_demands.items()}
+        allocated[name] = open_demands.pop(name)
         left -= allocated[name]
     return allocated
 
@@ -71,7 +71,7 @@ def allocate_above_floors(
     together, it is shared in proportion to them.
 
     demands  kbit/s per camera, 0 for a camera that is off
-    floors   kbit/s per camera, 0 or not given: none; a floor above the demand counts as the demand
+    floors   kbit/s per camera, 0 or missing: none; a floor above the demand counts as the demand
     returns  kbit/s per camera; without floors the same as `allocate`
     """
     lowest = {name: min(floor, demands[name]) for name, floor in floors.items() if floor and demands.get(name)}
@@ -79,14 +79,14 @@ def allocate_above_floors(
         return allocate(demands, total, weights)
     if total <= _sum(lowest.values()):
         return dict.fromkeys(demands, ZERO) | allocate(lowest, total, dict.fromkeys(lowest, Fraction(1)))
-    held: dict[str, Kbps] = {}
+    at_floor: dict[str, Kbps] = {}
     while True:
-        others = {name: own for name, own in demands.items() if name not in held}
-        shares = allocate(others, total - _sum(held.values()), weights)
-        below = {name: floor for name, floor in lowest.items() if name not in held and shares[name] < floor}
+        others = {name: own for name, own in demands.items() if name not in at_floor}
+        shares = allocate(others, total - _sum(at_floor.values()), weights)
+        below = {name: floor for name, floor in lowest.items() if name not in at_floor and shares[name] < floor}
         if not below:
-            return {name: held[name] if name in held else shares[name] for name in demands}
-        held |= below
+            return {name: at_floor[name] if name in at_floor else shares[name] for name in demands}
+        at_floor |= below
 
 
 def shed(
@@ -96,10 +96,10 @@ def shed(
     order: Sequence[str],
     before: Iterable[str] = (),
 ) -> tuple[str, ...]:
-    """Cameras to give up, first ones first, until the total covers the floors of all others.
+    """Cameras to give up, in order, until the total covers the floors of all others.
 
     order    cameras that may be given up, in this order
-    before   those that are given up now; each returns only once the total exceeds the floors by a margin
+    before   those given up so far; each returns only once the total exceeds the floors by a margin
     returns  the first part of `order`, without cameras that are off
     """
     given_up: list[str] = []

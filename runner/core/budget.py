@@ -1,4 +1,4 @@
-"""Video and headers share the uplink: kbit/s of encoded video, and what they occupy on the wire. Pure."""
+"""Converts between kbit/s of encoded video and on the wire, where headers share the uplink. Pure."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ def on_the_wire(graph: Graph, size: int) -> int:
 
 
 def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:
-    """kbit/s on the wire, at most, of so much video: the last packet of an access unit is hardly ever full.
+    """Upper bound of kbit/s on the wire for this much video: the last packet of an access unit is rarely full.
 
-    cameras  a camera of which several copies are sent occurs as often
+    cameras  with repetitions for a camera that is sent in several copies
     """
     fixed, factor = _overhead(tuple(cameras))
     return video * factor + fixed
 
 
 def video_kbps(cameras: Iterable[Camera], wire: Kbps) -> Kbps:
-    """kbit/s of video that so much on the wire carries, 0 if headers alone exceed it."""
+    """kbit/s of video that fit into this much on the wire, 0 if headers alone exceed it."""
     fixed, factor = _overhead(tuple(cameras))
     return max(Fraction(0), (wire - fixed) / factor)
 
 
-@lru_cache(maxsize=64)  # of a few sets of cameras that are on
+@lru_cache(maxsize=64)  # for a few sets of cameras that are on
 def _overhead(cameras: tuple[Camera, ...]) -> tuple[Kbps, Fraction]:
     """kbit/s of one more packet per access unit, and bytes on the wire per byte of full packets."""
     fixed = sum((_header(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))

@@ -51,9 +51,9 @@ def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[
     for name, setting in decision.settings.items():
         now = commanded.get(name, {})
         for knob, value in wanted(setting).items():
-            held = now.get(knob)
-            # Most values are the same object that was commanded; comparing regions one by one is slow.
-            if held is not value and held != value:
+            last = now.get(knob)
+            # Most values are the same object as commanded; comparing regions field by field is slow.
+            if last is not value and last != value:
                 commands.append(Command(name, knob, value))
     return commands
 

@@ -21,10 +21,10 @@ class Setting:
     sending        False: nothing is encoded (off, or allocated below 1 kbit/s), the stream stays connectable
     demand         kbit/s, Eq. (1), 0 when off
     kbps           whole kbit/s, rounded down; 0 while nothing is sent
-    given          the same, also while a rule stops all sending: the value with which the camera resumes
+    given          the same, but kept while a rule stops all sending: the value with which the camera resumes
     scaling        selected factor; None when off
     width, height  px of the encoded picture, 0 when off
-    reason         why, for the operator; ignored in comparisons
+    reason         for the operator; ignored in comparisons
     """
 
     on: bool
@@ -43,7 +43,7 @@ class Setting:
 class Decision:
     """What is in force: the mode, its total before the cap at demand, and a setting for each camera.
 
-    asked     kbit/s that the prediction or the operator gives, before later rules lowered it; ignored in comparisons
+    asked     kbit/s of the prediction or the operator, before later rules lowered it; ignored in comparisons
     uncapped  kbit/s, the total without the limit of the measured link; ignored in comparisons
     """
 
@@ -65,9 +65,9 @@ class Draft(NamedTuple):
     demand     kbit/s by camera, 0 when off
     bitrate    exact kbit/s by camera
     scaling    factor by camera that is on
-    measured   True: the total is what the link is measured to carry, whatever the age of the prediction
-    uncapped   kbit/s, the total before the measured link lowered it; None: it does not
-    sized_for  kbit/s of all cameras for which picture sizes are chosen; None: the total
+    measured   True: the total is the measured capacity of the link, whatever the age of the prediction
+    uncapped   kbit/s, the total before the measured link lowered it; None: not lowered
+    sized_for  total for which picture sizes are chosen, kbit/s; None: the actual total
     sending    False stops all cameras, whatever their bitrate
     notes      reasons that concern all cameras
     reasons    reason by camera

@@ -95,8 +95,8 @@ class WeightsSet(Event):
 class LinkMeasured(Event):
     """The uplink, estimated from what the operator's side received of all cameras, see `runner.core.uplink`.
 
-    kbps      kbit/s that arrive; while a queue lasts, what the link carries; None: too little has arrived
-    queue_ms  wait in front of the link
+    kbps      received kbit/s; while a queue lasts, the capacity of the link; None: too little has arrived
+    queue_ms  queueing delay in front of the link
     loss      share of packets lost, 0 to 1
     rtt_ms    round trip of the control link
     camera    set in older logs, which measured each camera; no rule reads these
@@ -113,38 +113,38 @@ class LinkMeasured(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CopiesCounted(Event):
-    """How many copies of each camera's stream leave the vehicle, one for each viewer; cameras not named: one."""
+    """Number of copies of each camera's stream that leave the vehicle, one per viewer; 1 for cameras not named."""
 
     copies: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlPassed(Event):
-    """Another operator is in control, "" for none; what the one before has measured no longer holds."""
+    """Another operator is in control, "" for none; measurements of the previous one are no longer valid."""
 
     operator: str
 
 
 class Attention(StrEnum):
-    """Whether the person who drives can see the pictures, by the page in control."""
+    """Whether the driver can see the pictures, as detected by the page in control."""
 
     WATCHING = "watching"
-    UNFOCUSED = "unfocused"  # seen, but keys do not reach the page
+    UNFOCUSED = "unfocused"  # visible, but the page has no keyboard focus
     SLOW = "slow"  # fewer than 10 pictures a second are drawn
     HIDDEN = "hidden"
-    ABSENT = "absent"  # the page is closed, or does not answer
+    ABSENT = "absent"  # the page is closed or does not respond
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttentionChanged(Event):
-    """The operator in control states another attention; None: none, as without a page."""
+    """The attention stated by the operator in control has changed; None: none stated, for example without a page."""
 
     attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(Event):
-    """attention  what the operator's page states with its sign of life; the vehicle makes `AttentionChanged` of it"""
+    """attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it"""
 
     attention: Attention | None = None
 

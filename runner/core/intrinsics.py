@@ -1,4 +1,4 @@
-"""Intrinsics of the pictures that the operator's side gets: after the crop, the region of interest and the factor."""
+"""Intrinsics of the pictures on the operator's side, after crop, region of interest and scaling."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from runner.core.model import Camera, Roi
 
-PINHOLE_DEG = 180.0  # a pinhole sees less
+PINHOLE_DEG = 180.0  # upper bound of a pinhole's field of view
 
 
 class Intrinsics(NamedTuple):
-    """Where a point in the camera's axes (x right, y down, z forward) appears in a picture, px.
+    """Projection of a point in the camera's axes (x right, y down, z forward) into a picture, px.
 
     plumb_bob    u = fx * x / z + cx, v = fy * y / z + cy
     equidistant  the same with x / z and y / z times theta / tan(theta), where theta is the angle to the optical axis
@@ -36,9 +36,9 @@ def focal_px(lens: str, fov_deg: float, width: int) -> float:
 
 
 def delivered_intrinsics(camera: Camera, roi: Roi, width: int, height: int) -> Intrinsics | None:
-    """Intrinsics of a picture that was delivered, if its camera has the lens and the field of view that it states.
+    """Intrinsics of a delivered picture, assuming its camera's configured lens and field of view.
 
-    roi            that was cut out of the full image
+    roi            cut out of the full image
     width, height  of the picture, px
     returns        None for a pinhole of 180 degrees and more
 

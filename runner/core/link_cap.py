@@ -1,9 +1,9 @@
 """The total that the measured link allows. Pure.
 
-Overuse cuts it at once below what the link carries, low enough to drain the queue. It recovers in factors up to the
-limit, which is the prediction or the operator's total, and never beyond: the prediction saves the probing. Where the
-link proved narrower than the limit, recovery is fast up to what it carried, in proportion to the limit of that time,
-and careful from there on. When an operator connects, the cap begins at a share of the limit.
+On overuse it is cut immediately below the link's capacity, low enough to drain the queue. It recovers in steps up to
+the limit, which is the prediction or the operator's total, and never beyond: the prediction saves probing. Where the
+link proved narrower than the limit, recovery is fast up to that capacity, scaled with the limit, and careful beyond.
+When an operator connects, the cap starts at a share of the limit.
 """
 
 from __future__ import annotations
@@ -14,48 +14,48 @@ from typing import NamedTuple
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.model import Kbps, exact
-from runner.core.trust import LATE_S, UNDOUBTED, Trust, doubted, relieved, thousandths, updated
+from runner.core.trust import LATE_S, UNDOUBTED, Trust, add_doubt, relieve, thousandths, update_trust
 from runner.core.uplink import LinkState
 
-DRAIN_MS = 400  # a queue is to be drained within about this time ...
+DRAIN_MS = 400  # a queue should drain within about this time ...
 DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
-LOSSY = 0.03  # share of packets; with a queue that grows, from here on the queue is full
-LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they say nothing about a cut
-TOO_LOSSY = 0.1  # share of packets; random loss on the radio link stays below
-LOSING_S = 0.3  # a share of losses that has only fallen for longer is of packets before: none are lost any more
+LOSSY = 0.03  # share of packets lost above which a growing queue is full
+LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they do not reflect a cut
+TOO_LOSSY = 0.1  # share of packets lost; random loss on the radio link stays below
+LOSING_S = 0.3  # a loss share that has only fallen for longer reflects earlier packets: losses have stopped
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
-TESTED = 3  # times what arrives, up to which a cap grows
-BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # before, what the link carried is too uncertain: the cap is tied to what arrives
+TESTED = 3  # a cap grows up to this multiple of what arrives
+BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # until then the capacity is too uncertain: the cap is tied to what arrives
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
 REPORT_S = 0.04  # between two reports
 STEP_S = 0.1  # of recovery, on top of the round trip
 START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
-UNMEASURED_S = 2.0  # an operator that is present and reports nothing for longer does not measure the link
-FRESH_S = 1.0  # a measurement that is older does not stand in for a prediction
+UNMEASURED_S = 2.0  # a present operator that reports nothing for longer does not measure the link
+FRESH_S = 1.0  # an older measurement does not replace a prediction
 BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
-LONGEST_RTT_S = 1.0  # a round trip that is measured longer does not delay the recovery further
-LEAST = Fraction(50)  # kbit/s; from nothing no factor would recover
-# To others that fill the link the cameras yield, down to a share of the most that arrived lately ...
+LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
+LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
+# To competing traffic the cameras yield down to this share of the most that arrived recently ...
 YIELDED = Fraction(1, 3)
-# ... unless a cap was held for so long, s, and less than a share of it arrives, or never more than TRIED of it: the
-# link itself is narrower.
+# ... unless a cap was held for this long, s, and less than this share of it arrives, or never more than TRIED of it:
+# then the link itself is narrower.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
-# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: where more is sent
+# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent
 # than the link carries, it soon grows longer.
 JITTER_MS = 40
-# A longer one is certain once it has lasted this long, s: frames that are late on a busy machine come and go.
+# A longer one is real once it has lasted this long, s: delays on a busy machine are shorter.
 LASTED_S = 0.3
-SEEN_S = 0.4  # beyond the round trip, until a measured rate holds nothing of the time before a change of cap or limit
-PROVEN = 2  # times what it then carries, as the most that arrived
-FADED = Fraction(997, 1000)  # is left of that most after each second
-SILENCE_S = 0.3  # without a report, or with reports of nothing, for this long: half
+SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
+PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
+FADED = Fraction(997, 1000)  # factor by which that most decays each second
+SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
 
 
 class Overuse(NamedTuple):
-    """When the link was last overused (t), and what it then carried under which limit, kbit/s."""
+    """The last overuse of the link: its time (t), and the capacity and the limit then, kbit/s."""
 
     t: float
     carried: Kbps
@@ -63,35 +63,35 @@ class Overuse(NamedTuple):
 
 
 class Lowering(NamedTuple):
-    """When the link proved to carry less while no cut was due (t), and what it was known to carry before, kbit/s."""
+    """When the capacity proved lower while no cut was due (t), and the capacity known before, kbit/s."""
 
     t: float
     known: Kbps
 
 
 class Stall(NamedTuple):
-    """Time in which nothing arrives: since when (t), and how often the cap was halved in it."""
+    """A period in which nothing arrives: its start (t), and how often the cap was halved in it."""
 
     t: float
     halved: int
 
 
 class Losses(NamedTuple):
-    """Share of packets lost at the last measurement, and when it rose last (t)."""
+    """Share of packets lost at the last measurement, and when it last rose (t)."""
 
     share: float
     t: float
 
 
 class Most(NamedTuple):
-    """kbit/s that arrived at most, lately, and when that faded last (t)."""
+    """The most that arrived recently, kbit/s, and when it last decayed (t)."""
 
     kbps: Kbps
     t: float
 
 
 class LastLimit(NamedTuple):
-    """The last limit, believed or not, kbit/s; when it rose last (t), and from which one."""
+    """The last limit, before doubts, kbit/s; when it last rose (t), and the limit before that."""
 
     kbps: Kbps
     t: float
@@ -107,7 +107,7 @@ NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 class LinkCap:
     """Memory between measurements.
 
-    kbps        cap in force; None: nothing speaks against the limit
+    kbps        cap in force; None: no cap below the limit
     overuse     the last one
     queue_ms    wait at the last cut
     steps       careful increases since then
@@ -115,18 +115,18 @@ class LinkCap:
     stall       None: something arrives
     changed     t of the last change
     measured    t of the last measurement
-    idle        t at which nothing was to be sent, last
+    idle        t at which there was last nothing to send
     alone       whether nothing else limits the total
     trust       how far the limit is trusted
-    most        what arrived at most
+    most        the most that arrived
     began       t of the first measurement
-    passed      t of a change, and the kbit/s that have arrived at most since it took effect
-    connected   t of the operator's connection for which the cap last began
-    provisional whether it began at a share of the limit, and no measurement has spoken against the limit since
+    passed      t of a change, and the most that has arrived since it took effect, kbit/s
+    connected   t of the operator's connection for which the cap last started
+    provisional whether it started at a share of the limit, and no measurement has contradicted the limit since
     losses      of packets
     limit       the last one
-    short       t at which the queue was shorter than JITTER_MS, last
-    lowering    of what the overused link is known to carry, the last one
+    short       t at which the queue was last shorter than JITTER_MS
+    lowering    the last lowering of the known capacity
     """
 
     kbps: Kbps | None = None
@@ -154,7 +154,7 @@ class LinkCap:
 UNCAPPED = LinkCap()
 
 
-def advanced(
+def update_cap(
     cap: LinkCap,
     link: LinkMeasured | None,
     t: float,
@@ -162,40 +162,40 @@ def advanced(
     least_trust: Fraction = Fraction(1),
     position: PositionReported | None = None,
 ) -> LinkCap:
-    """The cap at time t under a limit, with the newest measurement. The limit that holds is the one `believed`.
+    """The cap at time t under a limit, with the newest measurement. The effective limit is `believed_limit`.
 
-    least_trust  share of the limit that is believed at least, however often it proved too high; 1: it is not doubted
+    least_trust  minimum share of the limit that is believed, however often it proved too high; 1: it is not doubted
     position     of the vehicle, if known
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         return _reset(cap) if unmeasured > (START_S if cap.provisional else UNMEASURED_S) else cap
-    cap, full = _adapted(cap, t, limit), limit
-    cap = replace(cap, trust=updated(cap.trust, t, least_trust, position))
-    limit = believed(cap, limit, least_trust)
+    cap, full = _adapt_overuse(cap, t, limit), limit
+    cap = replace(cap, trust=update_trust(cap.trust, t, least_trust, position))
+    limit = believed_limit(cap, limit, least_trust)
     if link.t <= cap.measured:
-        return _silent(cap, link, t, limit)
-    cap = _noted(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
+        return _handle_silence(cap, link, t, limit)
+    cap = _record(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
-        return _stalled(cap, link, t, limit)
+        return _handle_stall(cap, link, t, limit)
     lossy = cap.losses.share > TOO_LOSSY and t - cap.losses.t <= LOSING_S
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
-        if cap.stall and cap.before:  # after the stall the link carries less than before
+        if cap.stall and cap.before:  # after a stall the link carries less than before
             cap = replace(cap, before=min(cap.before, link.kbps))
         if _may_be_jitter(cap, link):
             cap = _cut_by_jitter(cap, link, t, limit, full)
             carried = cap.overuse.carried if cap.overuse else None
         else:
             cap, carried = _cut(cap, link, t, limit, full), link.kbps
-        return _doubting(cap, carried, t, full, least_trust)
-    if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start on looks empty
-        return _recovered(_resumed(cap, limit), link, t, limit, full)
-    return _learned(cap, link, t)
+        return _doubt_limit(cap, carried, t, full, least_trust)
+    if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start looks empty
+        return _recover(_resume(cap, limit), link, t, limit, full)
+    return _raise_known(cap, link, t)
 
 
-def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
-    """The cap where the limit has followed the link after an overuse: it was late, and less wrong than it looked."""
+def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+    """Correct the last overuse if the limit has followed the link since: it was late, and less wrong than it seemed."""
     known = cap.limit
     rose = limit > known.kbps > 0
     cap = replace(cap, limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
@@ -203,15 +203,15 @@ def _adapted(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
-    trust = relieved(cap.trust, last.t, followed / last.limit)
+    trust = relieve(cap.trust, last.t, followed / last.limit)
     return replace(cap, overuse=last._replace(limit=followed), trust=trust)
 
 
-def started(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
+def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
     """The cap after an operator connected at `since`: a share of the limit, unless the link is known to carry less.
 
-    Every camera then begins with a key frame. At the full limit, a link that is narrower would lose packets before
-    the first measurement.
+    All cameras then start with a key frame. At the full limit, a narrower link would lose packets before the first
+    measurement.
     """
     if since is None or since <= cap.connected or share == 1:
         return cap
@@ -222,48 +222,48 @@ def started(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit:
 
 
 def _reset(cap: LinkCap) -> LinkCap:
-    """A new cap, which keeps only the places where limits proved too high."""
+    """A new cap that keeps only the places where limits proved too high."""
     return LinkCap(trust=Trust(places=cap.trust.places), connected=cap.connected)
 
 
-def believed(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
-    """The share of a limit that is believed, after limits that proved too high; see `advanced`."""
+def believed_limit(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
+    """The limit, lowered after limits that proved too high; see `update_cap`."""
     return limit if cap.trust.share == 1 or least_trust == 1 or cap.alone else limit * cap.trust.share
 
 
-def _doubting(cap: LinkCap, carried: Kbps | None, t: float, limit: Kbps, least: Fraction) -> LinkCap:
-    """After a cut: believe less of a limit that has been too high for some time."""
+def _doubt_limit(cap: LinkCap, carried: Kbps | None, t: float, limit: Kbps, least: Fraction) -> LinkCap:
+    """Doubt the limit after a cut, if it has been too high for some time."""
     if cap.changed != t or carried is None or cap.alone or least == 1:
         return cap
     share = min(Fraction(1), thousandths(BELIEVED * carried / limit))
-    return replace(cap, trust=doubted(cap.trust, t, share))
+    return replace(cap, trust=add_doubt(cap.trust, t, share))
 
 
-def raised(cap: LinkCap, least: Kbps) -> LinkCap:
-    """The cap, but not below what it takes to measure the link at all."""
+def raise_cap(cap: LinkCap, least: Kbps) -> LinkCap:
+    """The cap, but at least the minimum needed to measure the link."""
     return replace(cap, kbps=least) if cap.kbps is not None and cap.kbps < least else cap
 
 
 def is_fresh(link: LinkMeasured | None, t: float) -> bool:
-    """Whether the link has been measured lately."""
+    """Whether the link has been measured recently."""
     return link is not None and t - link.t <= FRESH_S
 
 
-def probing(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
-    """The cap when nothing but the measurement limits the total any more: it grows from what was asked for last."""
+def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
+    """The cap once only the measurement limits the total: it grows from the last total requested."""
     if cap.alone:
         return cap
     kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
     return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, _short(asked), limit), steps=0, provisional=False)
 
 
-def idle(cap: LinkCap, t: float) -> LinkCap:
-    """The cap at time t, when nothing is to be sent: that nothing arrives then, or soon after, says nothing."""
+def mark_idle(cap: LinkCap, t: float) -> LinkCap:
+    """The cap at time t when there is nothing to send: silence then, or soon after, is no stall."""
     return replace(cap, idle=t)
 
 
-def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The most that arrived lately, and since the last change took effect; whether packets are being lost."""
+def _record(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
+    """Record the most that arrived recently and since the last change took effect, and the losses."""
     most = cap.most if t - cap.most.t < 1 else Most(_short(cap.most.kbps * FADED), t)
     kbps = link.kbps or Fraction(0)
     since, passed = cap.passed
@@ -278,7 +278,7 @@ def _noted(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
 
 
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
-    """Whether less arrives than is sent: the link itself is full, not its queue of what others send."""
+    """Whether less arrives than is sent, so that the link itself is narrow, not filled by competing traffic."""
     assert link.kbps is not None
     held_s, sent = t - cap.changed, _in_force(cap, limit)
     if held_s >= TRIED_S and cap.passed[1] < TRIED * sent:
@@ -291,22 +291,21 @@ def _is_short(link: LinkMeasured) -> bool:
 
 
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
-    """Whether a queue may be frames that are late for another reason: it is short, or has not lasted yet."""
+    """Whether a queue may be jitter: it is short, or has not lasted long enough."""
     if link.state is not LinkState.FILLING or cap.losses.share > LOSSY:
         return False
     return _is_short(link) or (cap.stall is None and link.t - cap.short < LASTED_S)
 
 
 def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    """A cut for a queue that may be jitter; none for a short one where the link is known to carry more than is sent.
+    """A cut for a queue that may be jitter; none for a short queue if the link is known to carry more than is sent.
 
-    In jitter only as much arrives as is sent, or less at times. Taken for what the link carries, it would lower the cap
-    again and again.
+    With jitter, at most as much arrives as is sent. Mistaken for the capacity, it would lower the cap repeatedly.
     """
     sent = _in_force(cap, limit)
     known = cap.overuse.carried if cap.overuse else sent
     if cap.overuse and sent <= RESERVE * known and _is_short(link):
-        return _learned(cap, link, t)
+        return _raise_known(cap, link, t)
     cap = _cut(cap, link, t, limit, full)
     if cap.overuse is None:
         return cap
@@ -314,21 +313,21 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    """full  the limit, whether it is believed or not"""
+    """full  the limit before doubts"""
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
-    lossy = (link.loss or 0) > LOSSY  # the queue drops what would wait longer, so its true length is not seen
+    lossy = (link.loss or 0) > LOSSY  # the full queue drops packets, which hides its true length
     carried = link.kbps
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
     most = min(cap.most.kbps, limit)
     if lossy or _is_narrow(cap, link, t, limit):
         most = min(most, PROVEN * carried)
     target = max(target, YIELDED * most)
-    if cap.provisional:  # not all cameras may have begun: that little arrives says little
+    if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return _learned(_lowered(cap, carried, link, t), link, t)
+        return _raise_known(_lower_known(cap, carried, link, t), link, t)
     return replace(
         cap,
         kbps=_short(target),
@@ -341,19 +340,19 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     )
 
 
-def _lowered(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float) -> LinkCap:
-    """The cap where the link proves to carry less than at its last overuse, and no cut is due."""
+def _lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float) -> LinkCap:
+    """Lower the known capacity if the link proves to carry less than at its last overuse, and no cut is due."""
     if cap.overuse is None or carried >= cap.overuse.carried:
         return cap
     known = max(cap.overuse.carried, cap.lowering.known if _is_recent(cap.lowering.t, link, t) else carried)
     return replace(cap, overuse=cap.overuse._replace(carried=carried), lowering=Lowering(t, known))
 
 
-def _learned(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
-    """The cap soon after an overuse, while its queue lasts: the link carries what arrives, if more than it seemed.
+def _raise_known(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
+    """Raise the known capacity soon after an overuse, while its queue lasts, if more arrives than it.
 
-    Likewise soon after a measurement that showed less, but then no more than was known before. After a stall units
-    arrive in bursts, of which one measurement may hold a pause.
+    Likewise soon after a measurement that lowered it, but not above the value before. After a stall units arrive in
+    bursts, and a measurement may include a pause between them.
     """
     last = cap.overuse
     if last is None or link.kbps is None or link.kbps <= last.carried:
@@ -366,20 +365,20 @@ def _learned(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
 
 
 def _is_recent(since: float, link: LinkMeasured, t: float) -> bool:
-    """Whether a measured rate may still hold something of that time."""
+    """Whether a measured rate may still include that time."""
     return t - since <= SEEN_S + _rtt_s(link)
 
 
-def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
+def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
     cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
-        return cap  # a cap that is not in force is not tested, and so does not grow
-    if cap.provisional and t - cap.began >= BEGIN_S:  # standing pictures may never fill it
+        return cap  # a cap that is not in force is untested, and so does not grow
+    if cap.provisional and t - cap.began >= BEGIN_S:  # static pictures may never fill it
         return replace(cap, kbps=None, provisional=False, changed=t)
     if cap.provisional and cap.before is None:
-        return cap  # and it does not grow before a rate has been measured
+        return cap  # it does not grow before a rate has been measured
     if link.kbps is not None and cap.kbps > TESTED * link.kbps:
-        return cap  # nor does one that standing pictures are far from using
+        return cap  # nor does a cap that static pictures are far from using
     steps, factor, last = cap.steps, FAST, cap.overuse
     if cap.provisional or (last and last.t - cap.began < BEGIN_S):
         factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
@@ -393,33 +392,33 @@ def _recovered(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kb
     return replace(cap, kbps=kbps, steps=steps, changed=t)
 
 
-def _stalled(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
-    """One cut at first, since most stalls are short; then half again and again."""
+def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+    """One cut at first, since most stalls are short; then repeated halving."""
     if cap.stall is None:
         if t - cap.idle < SILENCE_S + _rtt_s(link):
             return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
         return replace(cap, kbps=_short(arrived * DEEPEST), stall=Stall(t, 0), changed=t, provisional=False)
-    return _halved(cap, cap.stall, t, limit)
+    return _halve(cap, cap.stall, t, limit)
 
 
-def _halved(cap: LinkCap, stall: Stall, t: float, limit: Kbps) -> LinkCap:
+def _halve(cap: LinkCap, stall: Stall, t: float, limit: Kbps) -> LinkCap:
     if t - cap.changed < SILENCE_S:
         return replace(cap, stall=stall)
     kbps = _short(_in_force(cap, limit) / 2)
     return replace(cap, kbps=kbps, stall=stall._replace(halved=stall.halved + 1), changed=t, provisional=False)
 
 
-def _silent(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
-    """Without a report the link may be gone: half, once for each such time."""
+def _handle_silence(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+    """Without a report the link may be down: halve the cap once per silent period."""
     longest = max(SILENCE_S, 2 * _rtt_s(link) + 3 * REPORT_S)
     if t - max(link.t, cap.changed, cap.idle) < longest:
         return cap
-    return _halved(cap, cap.stall or Stall(link.t, 0), t, limit)
+    return _halve(cap, cap.stall or Stall(link.t, 0), t, limit)
 
 
-def _resumed(cap: LinkCap, limit: Kbps) -> LinkCap:
-    """The first report after a stall that shows an empty queue restores half of what arrived before."""
+def _resume(cap: LinkCap, limit: Kbps) -> LinkCap:
+    """After a stall, the first report with an empty queue restores half of the rate before it."""
     if cap.stall is None:
         return cap
     kbps = cap.kbps
@@ -437,5 +436,5 @@ def _in_force(cap: LinkCap, limit: Kbps) -> Kbps:
 
 
 def _short(kbps: Kbps) -> Kbps:
-    """Rounded down to 0.1 kbit/s: products of many factors would become long numbers."""
+    """Round down to 0.1 kbit/s: fractions from many multiplications would grow long."""
     return max(LEAST, Fraction(kbps.numerator * 10 // kbps.denominator, 10))

@@ -23,7 +23,7 @@ SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
 
 
 class ModelError(ValueError):
-    """The value found at `key` (a path below the object being built) and the rule that it breaks."""
+    """A broken rule: the value found at `key` (a path below the object being built), and the rule."""
 
     def __init__(self, key: str, found: object, rule: str) -> None:
         super().__init__(f"{key}: {found}: {rule}")
@@ -33,7 +33,7 @@ class ModelError(ValueError):
 def exact(number: float | str | Fraction) -> Fraction:
     """The number as the user wrote it, without binary rounding: 0.1 is 1/10.
 
-    A float prints as the shortest decimal text that reads back as itself, which for up to 15 digits is what was typed.
+    A float prints as the shortest decimal text that parses to the same float: up to 15 digits, the text as typed.
     """
     if isinstance(number, int | Fraction):
         return Fraction(number)
@@ -46,9 +46,9 @@ def plain(number: Fraction) -> int | float:
 
 
 def suggest(word: str, known: Iterable[str], most: int = 13) -> str:
-    """End of a message about an unknown word, with its separator: the closest known word, otherwise known words.
+    """Suffix for a message about an unknown word: the closest known word, otherwise a list of known words.
 
-    most  that are listed
+    most  words to list
     """
     known = list(known)
     near = get_close_matches(word, known, 1)
@@ -164,9 +164,9 @@ class Graph:
     wire       what `print` shows in place of server and client, since gst-launch has neither (rtsp only)
     settings   named numbers of the graph (mtu_bytes, jitter_buffer_ms, ...) that properties refer to as {name}
     mutable    (element, property) that knobs set although GStreamer does not declare it mutable while playing
-    verified   False: checked against its schema only, never run by this project's tests
-    key_frame  how to make the encoder start anew when packets were lost for good: "event", GStreamer's own; "caps",
-               a pixel aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
+    verified   False: only checked against its schema, never run by this project's tests
+    key_frame  how to request a key frame after unrecovered packet loss: "event", GStreamer's own; "caps", a pixel
+               aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
     """
 
     transport: str
@@ -185,7 +185,7 @@ class Graph:
         for side, elements in (("vehicle", self.vehicle), ("operator", self.operator)):
             _check_unique(side, [element.name for element in elements])
         if self.transport == "rtsp" and self.vehicle[-1].name != "pay0":
-            rule = "the last element must be named pay0, as the RTSP server asks"
+            rule = "the last element must be named pay0, as the RTSP server requires"
             raise ModelError("vehicle", repr(self.vehicle[-1].name), rule)
         for knob, turns in self.knobs.items():
             for index, turn in enumerate(turns):
@@ -211,7 +211,7 @@ class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
     settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
-    capture     what its cameras are to deliver unless they state otherwise, see `Capture`
+    capture     format requested from its cameras unless they state another, see `Capture`
     credentials file with user name and password, for cameras that name none
     loop        restart at the end without a gap (a clip, a bag)
     frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
@@ -220,8 +220,8 @@ class Source:
     render      name of the procedural drive that makes the clip, or ""
     render_s    length of that drive, s
     plays_bags  frames are the pictures of a topic of a bag, which are pushed into its first element
-    subscribes  the same for a topic of ROS
-    stand_in    elements that `print` shows if gst-launch cannot make the frames (generated in Python, not rendered yet)
+    subscribes  the same for a ROS topic
+    stand_in    elements that `print` shows if gst-launch cannot produce the frames (from Python, or not yet rendered)
     """
 
     elements: tuple[Element, ...]
@@ -260,10 +260,10 @@ class BagTopic:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """What a V4L2 camera is to deliver; None leaves the choice to the camera.
+    """Format requested from a V4L2 camera; None leaves the choice to the camera.
 
     format    mjpeg, h264, h265, raw, or the name of a raw format in GStreamer such as YUY2
-    width     px, of the camera's own picture
+    width     px, of the captured picture
     height    px
     fps       Hz
     controls  V4L2 controls by name, set when the device is opened, as `v4l2-ctl --list-ctrls` shows them
@@ -281,7 +281,7 @@ class Recording:
     """How frames are recorded without loss, as defined in YAML.
 
     codec     its name, for display and for recording.json
-    of_raw    expected size of a file, at most, as a share of the raw frames' size
+    of_raw    upper bound of a file's size as a share of the raw frames' size
     elements  from raw frames to a Matroska stream, may hold {placeholders}
     """
 
@@ -349,11 +349,11 @@ class Place:
 
 
 def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
-    """Cameras whose tile covers part of an earlier camera's, each with the rule that it breaks."""
+    """Cameras whose tile overlaps an earlier camera's, each with the rule that it breaks."""
     for count, (name, place) in enumerate(places.items()):
-        covered = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
-        if covered is not None:
-            yield name, f"overlaps the place of camera {covered}"
+        overlapped = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
+        if overlapped is not None:
+            yield name, f"overlaps the place of camera {overlapped}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,14 +363,14 @@ class Camera:
     width, height   px of the full image, after the crop of the native one
     native          px size of the source's image, of which `crop` is kept; None: it is the full image
     weight          explicit weight in the allocation, >= 0
-    floor_kbps      kbit/s that the camera gets first where `modes` have floors; 0: none
-    shed            where all floors together exceed the total, cameras with the lowest number are given up first;
+    floor_kbps      kbit/s that the camera gets first if the mode's rules have floors; 0: none
+    shed            order in which cameras are given up, lowest first, if all floors together exceed the total;
                     None: never
     mount           device, address, clip: values of the placeholders of these names; bag and topic to play, or topic
                     to subscribe to
-    capture         what its device is to deliver
-    credentials     file with user name and password of its address; None: it asks for none
-    framing         fit: the page's Drive view shows the whole picture; fill: it fills its box; None: by its place
+    capture         format requested from its device
+    credentials     file with user name and password for its address; None: not required
+    framing         in the page's Drive view. fit: the whole picture is shown; fill: it fills its box; None: by place
     calibrated      whether pose, fov_deg and lens were measured, not estimated
     """
 
@@ -416,14 +416,14 @@ class Camera:
 
     @property
     def topic(self) -> str | None:
-        """The topic of ROS that its source subscribes to; None: it does not, or none is named."""
+        """The ROS topic that its source subscribes to; None if it does not, or none is configured."""
         topic = self.mount.get("topic", self.source.settings.get("topic"))
         return str(topic) if self.source.subscribes and topic else None
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a server listens and where its clients reach it."""
+    """Address at which a server listens and its clients reach it."""
 
     host: str
     port: int
@@ -457,8 +457,8 @@ class Media(Endpoint):
 class PageSettings:
     """The operator's page.
 
-    host     address that it is served at
-    late_ms  age of a picture when drawn, above which it is marked as late
+    host     address at which it is served
+    late_ms  age when drawn above which a picture is marked as late
     """
 
     serve: bool
@@ -487,16 +487,16 @@ class Inputs:
             taken: dict[str | int, str] = {}
             for action, value in given.items():
                 if value is not None and value in taken:
-                    raise ModelError(f"{kind}.{action}", repr(value), f"is already that of {taken[value]}")
+                    raise ModelError(f"{kind}.{action}", repr(value), f"is already assigned to {taken[value]}")
                 if value is not None:
                     taken[value] = action
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyLimit:
-    """What latency means for the speed.
+    """Limits the speed by latency.
 
-    limit_ms  from light at the camera to light at the display, at which the vehicle may go at full speed
+    limit_ms  glass-to-glass latency up to which the vehicle may go at full speed
     fixed_ms  the part of it that is not measured: exposure to capture time, decoding to light; None: unknown
     """
 
@@ -523,9 +523,9 @@ class MetricsPorts:
 
 @dataclass(frozen=True, slots=True)
 class RosQos:
-    """What a subscription asks of a topic of ROS 2; None: what its publishers offer.
+    """QoS requested by a subscription to a ROS 2 topic; None: what its publishers offer.
 
-    depth  messages that wait to be taken, of which the oldest go first
+    depth  queue length; the oldest messages are dropped first
     """
 
     reliability: str | None = None
@@ -535,14 +535,14 @@ class RosQos:
 
 @dataclass(frozen=True, slots=True)
 class RosPrediction:
-    """Predictions of the bitrate on a topic of ROS, by one node alone: its full name."""
+    """Bitrate predictions on a ROS topic, accepted from one node only, given by its full name."""
 
     topic: str
     node: str
 
 
 ROS_PYTHON = {1: "/usr/bin/python3", 2: ".venv-ros2/bin/python"}  # by version
-OF_ROS_2 = {  # keys, and what is so in ROS 1
+OF_ROS_2 = {  # keys without effect in ROS 1, and why
     "use_sim_time": "a node follows the parameter /use_sim_time of its master",
     "discovery": "ROS_MASTER_URI names the master, which knows all nodes",
     "qos": "subscribers ask for nothing",
@@ -551,18 +551,18 @@ OF_ROS_2 = {  # keys, and what is so in ROS 1
 
 @dataclass(frozen=True, slots=True)
 class RosSettings:
-    """The node of ROS, which runs in a process of its own.
+    """The ROS node, which runs in its own process.
 
     version       of ROS, 1 or 2
     python        interpreter that can import rclpy or rospy; None: that of `make ros2` or `make ros1`
     node          its name
     namespace     absolute
-    remap         names of topics and nodes by the names that are used here
-    use_sim_time  whether stamps are of the time on /clock; of ROS 2
-    discovery     whose nodes it finds: off, localhost, subnet, system_default; of ROS 2
-    qos           by topic; of ROS 2
+    remap         actual names of topics and nodes, by the names used here
+    use_sim_time  whether stamps refer to the time on /clock; ROS 2 only
+    discovery     range of discovery: off, localhost, subnet, system_default; ROS 2 only
+    qos           by topic; ROS 2 only
     position      topic with the vehicle's position, for the verb `ros`; None: none
-    prediction    predictions, for the verb `ros`; None: none
+    prediction    topic with predictions, for the verb `ros`; None: none
     pictures      whether the operator's side publishes what it decodes
     """
 
@@ -583,11 +583,11 @@ class RosSettings:
         return self.python or ROS_PYTHON[self.version]
 
     def misplaced(self) -> Iterator[ModelError]:
-        """Keys that are set although the version of ROS does not have what they stand for."""
+        """Keys that are set but have no meaning in this version of ROS."""
         if self.version == 1:
-            absent = RosSettings()
+            unset = RosSettings()
             for key, rule in OF_ROS_2.items():
-                if getattr(self, key) != getattr(absent, key):
+                if getattr(self, key) != getattr(unset, key):
                     yield ModelError(key, None, f"is of ROS 2, and ros.version is 1: {rule}")
 
 
@@ -600,11 +600,11 @@ class Vehicle:
     recording  how `record` stores the frames of every camera
     expires_s  age from which the vehicle drops a request, in addition to the round trip
     log_video  whether the log of a drive holds the video of every camera
-    latency    what follows from latency for the speed
-    keys       directory that `tod-runner keys` made for this side; None: nothing is encrypted or authenticated
-    insecure   whether that is intended where video or control leave this machine
-    metrics    where both sides serve figures for Prometheus
-    ros        the node of ROS, for cameras whose source subscribes to topics
+    latency    limit of the speed by latency
+    keys       directory made for this side by `tod-runner keys`; None: nothing is encrypted or authenticated
+    insecure   whether that is intended although video or control leave this machine
+    metrics    ports at which both sides serve metrics for Prometheus
+    ros        the ROS node, for cameras whose source subscribes to topics
     dimensions None: unknown
     inputs     keys and buttons of the operator's page
     """

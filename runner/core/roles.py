@@ -1,4 +1,4 @@
-"""Who may request what of a vehicle. Pure."""
+"""Access rights: which role may request what of a vehicle. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Role(StrEnum):
-    """What a holder of keys is for."""
+    """Role of a holder of keys."""
 
     VEHICLE = "vehicle"
     BROKER = "broker"
@@ -33,7 +33,7 @@ PEOPLE = (Role.CONTROLLER, Role.WATCHER, Role.PREDICTOR, Role.POSITIONER)  # tho
 def denial(role: Role | None, event: str) -> str | None:
     """Why a sender may not request an event; None if it may.
 
-    role   None: a sender that the vehicle's keys do not name
+    role   None: a sender unknown to the vehicle's keys
     event  its name in schemas/event.schema.json
     """
     if role is None:

@@ -1,4 +1,4 @@
-"""A mode is an ordered list of named rules; each takes the draft of a decision one step further.
+"""A mode is an ordered list of named rules; each adds to the draft of a decision.
 
 A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, registered by the
 decorator `rule`, which declares what it needs from earlier rules, what it gives, and which state fields it reads.
@@ -22,13 +22,13 @@ from runner.core.link_cap import (
     LEAST,
     UNCAPPED,
     LinkCap,
-    advanced,
-    believed,
-    idle,
+    believed_limit,
     is_fresh,
-    probing,
-    raised,
-    started,
+    mark_idle,
+    probe,
+    raise_cap,
+    start_cap,
+    update_cap,
 )
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
@@ -39,7 +39,7 @@ Step = tuple[Draft, Memory]
 
 BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
 FACTOR_RULE = "must be a Fraction in ]0, 1]"
-GIVEN = ("total", "demand", "bitrate", "scaling")  # parts that a mode's rules must have given at the end
+GIVEN = ("total", "demand", "bitrate", "scaling")  # parts that a mode's rules must give together
 
 
 class RuleFailed(RunError):
@@ -97,7 +97,7 @@ def rule(
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Register a function as a rule under its own name.
 
-    reads   avoids decisions whose result would be the same: without it any change of the state triggers a new decision
+    reads   fields of the state that the rule depends on; default: all, so that any change triggers a new decision
     raises  ValueError if `reads` names something other than a field of the state: the rule would miss its changes
     """
     read = frozenset(reads)
@@ -131,7 +131,7 @@ def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Me
 
 @rule(gives=["total"], reads=[])
 def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
-    """The total is a constant, independent of the prediction: for comparison."""
+    """The total is a constant, independent of the prediction; for comparison."""
     return draft.replaced(total=kbps), memory
 
 
@@ -207,7 +207,7 @@ def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Each camera that is on gets the same, times its weight, but no more than its demand: for comparison."""
+    """Each camera that is on gets the same, times its weight, but no more than its demand; for comparison."""
     assert draft.total is not None
     # Eq. (2) shares in proportion to weight times demand; this cancels the demand.
     wanted = {name: demand for name, demand in draft.demand.items() if demand}
@@ -219,16 +219,15 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = {}, {}
-    later = (
-        draft.sized_for / draft.total if draft.sized_for and draft.total else None
-    )  # by how much more, if at the start
+    # At the start, sizes are chosen for the larger total that follows.
+    later = draft.sized_for / draft.total if draft.sized_for and draft.total else None
     for name, camera in vehicle.cameras.items():
         if not state.on[name]:
             continue
         allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
         kbps, sized_for = _whole(allocated), allocated if later is None else allocated * later
         bitrate = scaling.as_full_image(sized_for, roi, full)
-        # A camera that cannot be sent shows no picture: however few its pixels, it gets the smallest factor.
+        # A camera that cannot be sent gets the smallest factor, however few its pixels.
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = ""
         if kbps and (later is not None or (roi is not full and roi != full)):
@@ -297,7 +296,7 @@ def fade_when_stale(
     halve_every_s: Fraction,
     floor_kbps: Kbps,
 ) -> Step:
-    """A stale prediction is trusted less and less, unless the measured link has taken its place (`cap_by_link`).
+    """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
     down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run.
@@ -307,7 +306,7 @@ def fade_when_stale(
     if age <= limit or draft.measured:
         return draft, memory
     halvings = int((age - limit) / halve_every_s) + 1
-    # 64 halvings are below any floor; more would only make the numbers long.
+    # 64 halvings are below any floor; more would only produce long fractions.
     total = max(draft.total / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
@@ -332,13 +331,13 @@ def cap_by_link(
 ) -> Step:
     """The total is at most what the uplink carries, as the operator's side measures it; see `runner.core.link_cap`.
 
-    The measured link carries the headers of packets as well, and `reserve_kbps` of it are left to others. The operator
-    measures its own copy of each camera; others that leave the vehicle occupy the link in proportion. While
-    nothing is to be sent, nothing can be measured. A prediction older than its own `valid_s`, otherwise than
-    `alone_after_s`, is left aside while the link is measured: the total then follows the measurement alone. Of one
-    that proved too high again and again less is believed, down to the share `least_trust`; belief returns with time,
-    and falls again where it had fallen lately; see `runner.core.trust`. When an operator connects, the total begins
-    at the share `start` of the limit and recovers as soon as the link has been measured.
+    The measured link also carries packet headers, and `reserve_kbps` of it are left to other traffic. The operator
+    measures its own copy of each camera; other copies that leave the vehicle occupy the link in proportion. While there
+    is nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`,
+    is ignored while the link is measured: the total then follows the measurement alone. A prediction that repeatedly
+    proved too high is trusted less, down to the share `least_trust`; trust recovers with time, and drops again at
+    places where it dropped before; see `runner.core.trust`. When an operator connects, the total starts at the share
+    `start` of the limit and recovers once the link has been measured.
 
     Memory: the cap, `LinkCap`.
     """
@@ -349,23 +348,23 @@ def cap_by_link(
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
     cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
     if draft.total < max(1, len(cameras)) or not cameras or state.operator_lost is not None:
-        cap = idle(cap, state.t)
+        cap = mark_idle(cap, state.t)
     else:
         if alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t):
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = probing(cap, state.t, asked, limit)
-        cap = started(cap, link, state.operator_since, limit, start)
-        cap = advanced(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
-        cap = raised(cap, least)  # with less, some cameras would not be sent, and so not be measured
+            cap = probe(cap, state.t, asked, limit)
+        cap = start_cap(cap, link, state.operator_since, limit, start)
+        cap = update_cap(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
+        cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
-    carried = believed(cap, limit, least_trust)
+    carried = believed_limit(cap, limit, least_trust)
     why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = _why_capped(cap)
-    lowered = _lowered(draft, video_kbps(cameras, carried), why)
-    # A new size restarts the encoder, so those of the start are chosen for the time after it.
+    lowered = _lower_total(draft, video_kbps(cameras, carried), why)
+    # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
@@ -375,8 +374,8 @@ def _why_capped(cap: LinkCap) -> str:
     return "nothing arrives" if cap.stall else "measured capacity of the link"
 
 
-def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:
-    """The draft with a smaller total, in tenths of a kbit/s; unchanged where it is not smaller."""
+def _lower_total(draft: Draft, total: Kbps, why: str) -> Draft:
+    """The draft with a smaller total, in tenths of a kbit/s; unchanged if it would not be smaller."""
     assert draft.total is not None
     if total >= draft.total:
         return draft
@@ -385,7 +384,7 @@ def _lowered(draft: Draft, total: Kbps, why: str) -> Draft:
 
 
 def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
-    """The measurement of one copy of each camera, as if it were of all copies that leave the vehicle."""
+    """The measurement of one copy of each camera, scaled to all copies that leave the vehicle."""
     if state.link is None or state.link.kbps is None or not state.copies:
         return state.link
     sizes = {name: camera.rate_quality.b_full for name, camera in vehicle.cameras.items() if state.on[name]}
@@ -394,7 +393,7 @@ def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
 
 
 def _is_stale(state: State, after_s: Fraction) -> bool:
-    """Whether the prediction is older than its own `valid_s`, otherwise `after_s`; before the first one, the run."""
+    """Whether the prediction (before the first one, the run) is older than its own `valid_s`, otherwise `after_s`."""
     age, limit = _age(state, after_s)
     return age > limit
 
@@ -420,41 +419,43 @@ def pause_without_operator(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
 def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
-    """A larger factor is taken only after it has been requested without a break for `for_s`; a smaller one at once.
+    """A larger factor is applied only after it has been requested continuously for `for_s`; a smaller one immediately.
 
     Memory: by camera, the factor in force and since when a larger one has been requested (None: it is not).
     """
-    draft, held = _held(state, draft, memory.get("hold_upscaling", {}), for_s)
+    draft, held = _hold_back(state, draft, memory.get("hold_upscaling", {}), for_s)
     return draft, {**memory, "hold_upscaling": held}
 
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
 def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
-    """As `hold_upscaling`, while the measured link caps the total: its rate is tried out, and each new size costs bits.
+    """As `hold_upscaling`, while the measured link caps the total: its rate is being probed, and new sizes cost bits.
 
     Memory: as there; empty while nothing caps the total.
     """
     past: Mapping[str, _Hold] = memory.get("hold_while_capped", {})
     if draft.uncapped is None:
         return draft, {**memory, "hold_while_capped": {}} if past else memory
-    draft, held = _held(state, draft, past, for_s)
+    draft, held = _hold_back(state, draft, past, for_s)
     return draft, {**memory, "hold_while_capped": held}
 
 
 _Hold = tuple[Fraction, float | None]
 
 
-def _held(state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction) -> tuple[Draft, Mapping[str, _Hold]]:
+def _hold_back(
+    state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction
+) -> tuple[Draft, Mapping[str, _Hold]]:
     now: dict[str, _Hold] = {}
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
-    for name, called_for in draft.scaling.items():
-        held, since = past.get(name, (called_for, None))
-        if called_for is held or called_for <= held:
-            now[name] = (called_for, None)
+    for name, requested in draft.scaling.items():
+        held, since = past.get(name, (requested, None))
+        if requested is held or requested <= held:
+            now[name] = (requested, None)
             continue
         since = state.t if since is None else since
         if state.t - since >= for_s:
-            now[name] = (called_for, None)
+            now[name] = (requested, None)
         else:
             now[name] = (held, since)
             factors[name] = held
@@ -482,7 +483,7 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
     settings = {name: _setting(state, draft, name) for name in vehicle.cameras}
-    # Without a prediction the measurement is all there is: then nothing is known of a total without it.
+    # Without a prediction there is only the measurement, so the total without it is unknown.
     uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
     return Decision(state.mode, draft.total, settings, asked, uncapped), memory
 
@@ -517,7 +518,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
 
 
 def _is_bitrate(value: Any) -> bool:
-    """A float is refused even if it is whole: rounding noise must never decide a bitrate on a bound."""
+    """A float is rejected even if it is whole: rounding noise must never decide a bitrate on a bound."""
     return type(value) in (Fraction, int) and value.numerator >= 0  # comparing fractions is slow
 
 
@@ -525,7 +526,7 @@ def _is_factor(value: Any) -> bool:
     return type(value) is Fraction and 0 < value.numerator <= value.denominator
 
 
-# Parts of a draft by camera, the check of their values, and the same in words.
+# Parts of a draft by camera, the check of their values, and its description.
 PARTS = (
     ("demand", _is_bitrate, BITRATE_RULE),
     ("bitrate", _is_bitrate, BITRATE_RULE),

@@ -13,7 +13,7 @@ from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle
 
 
 class Refused(Exception):
-    """A well-formed event that cannot be accepted now; the text gives the reason and the valid values."""
+    """A well-formed event cannot be accepted now; the text gives the reason and the valid values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +30,16 @@ class State:
 
     t                 seconds, time of the last event
     manual            by camera: settings of mode single, or the last ones of a camera that is off
-    prediction        the last one, in whichever mode it arrived
+    prediction        the last one, whatever the mode when it arrived
     total_set         kbit/s, the operator's last total
     collective_total  kbit/s, total of mode collective
     link              the newest measurement of the uplink; None: no operator measures it
     position          the newest one
     steering          the newest one
-    copies            by camera, how many copies of its stream leave the vehicle; cameras not named: one
+    copies            by camera, copies of its stream that leave the vehicle; 1 for cameras not named
     operator_since    t at which the operator's side connected; None: it is not connected
     operator_lost     t at which the operator's side disconnected
-    attention         of the person who drives, as the operator in control states it
+    attention         of the driver, as the operator in control states it
     """
 
     mode: Mode
@@ -75,8 +75,8 @@ class State:
 def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
     """The state after an event.
 
-    in_force  the decision that holds when the event arrives, without what the measured link takes off: entering S or C
-              starts from it
+    in_force  the decision in force when the event arrives, without the cap by the measured link: entering S or C starts
+              from it
     raises    Refused
     """
     return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
@@ -94,7 +94,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"total_set": kbps, "collective_total": kbps}
         case ev.CameraSwitched(camera=name, on=on):
             _known(vehicle, name)
-            # Switched on again in S, a camera gets its last values; in S they are the operator's, whatever caps them.
+            # A camera switched on again in S gets its last values; in S these are the operator's, whatever cap applies.
             kept = {} if on or state.mode is Mode.SINGLE else keep(in_force, name)
             manual = {**state.manual, **kept} if kept else state.manual
             return {"on": {**state.on, name: on}, "manual": manual}
@@ -116,7 +116,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             _known(vehicle, name)
             return {}
         case ev.ControlPassed():
-            return {"link": None, "attention": None}  # another place, another path to it, another person
+            return {"link": None, "attention": None}  # another place, network path and person
         case ev.AttentionChanged(attention=attention):
             return {"attention": attention}
         case ev.CopiesCounted(copies=copies):
@@ -127,8 +127,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             since = event.t if state.operator_since is None else state.operator_since
             return {"operator_since": since, "operator_lost": None}
         case ev.OperatorDisconnected():
-            gone = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
-            return gone if state.operator_lost is None else {}
+            changes = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
+            return changes if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
         case ev.SteeringReported():
@@ -140,7 +140,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
-    """What the cameras that are on are given, whether or not an operator is connected, as settings of mode single."""
+    """Bitrate and factor of the cameras that are on as settings of mode single, even without a connected operator."""
     settings = ((name, in_force.settings[name]) for name in names or in_force.settings)
     return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 

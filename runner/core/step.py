@@ -1,4 +1,4 @@
-"""Process one event: the pure step that live runs, dry runs, replay and simulation share."""
+"""Processes one event: the pure step shared by live runs, dry runs, replay and simulation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Run:
     """State of a run after an event.
 
     commanded  by camera and knob, the value last commanded
-    commands   what follows from this event: the difference
+    commands   the changes caused by this event
     refused    why the event was not accepted; None if it was
     fault      why the rules could not decide, so that an earlier decision stays in force; None if they could
     """
@@ -82,7 +82,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
 
 
 def _to_keep(vehicle: Vehicle, run: Run, event: Event) -> Decision:
-    """The decision whose settings outlast an event. What the measured link takes off now returns with the link."""
+    """The decision whose settings outlast an event: without the cap by the measured link, which is temporary."""
     if isinstance(event, (ModeSelected, CameraSwitched)) and run.decision.uncapped > run.decision.total:
         with suppress(rules.RuleFailed):
             return rules.decide_without_link(vehicle, run.state, run.memory)

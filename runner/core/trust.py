@@ -1,7 +1,7 @@
-"""How much of a limit is believed, after limits that proved too high. Pure.
+"""How far a limit is trusted, after limits that proved too high. Pure.
 
-A prediction that is too high fills the queue again each time it is followed. So less of it is believed in the time that
-follows, and at the place where it happened when the vehicle comes there again.
+A prediction that is too high fills the queue each time it is followed. So it is trusted less for some time, and again
+when the vehicle returns to the place where it failed.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from math import cos, hypot, radians
 
 from runner.core.events import PositionReported
 
-FALL_S = 1.0  # cuts within this time answer the same fall of the link
-EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many falls within this time ...
-LATE_S = 2.5  # ... and at least this long after the first: a prediction that is only late is right by then
-CONFIRM_S = 0.5  # a limit that follows a fall of the link within this time, as a prediction does, is not doubted
-REGAINED = Fraction(3, 100)  # share of the limit that is believed again in each second
+FALL_S = 1.0  # cuts within this time belong to the same drop of the link
+EPISODE_S, FEW = 8.0, 3  # a limit is doubted after this many drops within this time ...
+LATE_S = 2.5  # ... and at least this long after the first: by then a merely late prediction is right
+CONFIRM_S = 0.5  # a limit that follows a drop of the link within this time, as a prediction does, is not doubted
+REGAINED = Fraction(3, 100)  # of the limit, regained per second
 NEAR_M = 100.0  # a place reaches this far: about as far as the shadow of a building
-REMEMBERED_S = 600  # a place is forgotten, little by little, in this time: load and coverage of a cell change
-KNOWN_S = 2.0  # a position that is older is not where the vehicle is
+REMEMBERED_S = 600  # a place is gradually forgotten in this time: load and coverage of a cell change
+KNOWN_S = 2.0  # an older position is stale
 MOST_PLACES = 50
 METRES_PER_DEGREE = 111_195.0  # of latitude
 
 
 @dataclass(frozen=True, slots=True)
 class DoubtedPlace:
-    """Where a limit proved too high, when (t), and the share of limits that was believed then.
+    """Where and when (t) a limit proved too high, and the share of limits that was believed then.
 
-    near  whether the vehicle was near it at its last known position
+    near  whether the last known position of the vehicle was near it
     """
 
     at: PositionReported
@@ -36,8 +36,8 @@ class DoubtedPlace:
     share: Fraction
     near: bool = True
 
-    def believed(self, t: float) -> Fraction:
-        """Share of limits that is believed when the vehicle comes there again."""
+    def share_at(self, t: float) -> Fraction:
+        """Share of limits that is believed when the vehicle returns at time t."""
         age = Fraction(min(REMEMBERED_S, int(t - self.t)), REMEMBERED_S)
         return thousandths(self.share + (1 - self.share) * age)
 
@@ -48,7 +48,7 @@ class Trust:
 
     share    share of the limit that is believed
     changed  t of its last change
-    doubts   (t, share of the limit that the link carried) of the last cuts
+    doubts   (t, share of the limit that the link carried) at the last cuts
     places   oldest first
     """
 
@@ -61,17 +61,17 @@ class Trust:
 UNDOUBTED = Trust()
 
 
-def updated(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
-    """Trust at time t: it falls after doubts and at a place where it had fallen, and returns with time.
+def update_trust(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
+    """Trust at time t: it falls after doubts and at a place where it fell before, and recovers with time.
 
-    least  share that is believed at least
+    least  minimum share that is believed
     """
-    trust = _confirmed(trust, t, least, position)
+    trust = _confirm(trust, t, least, position)
     places, share = trust.places, trust.share
     if position is not None and places and t - position.t <= KNOWN_S:
         seen = [(place, is_near(place.at, position)) for place in places if t - place.t <= REMEMBERED_S]
         places = tuple(replace(place, near=near) for place, near in seen)
-        share = min((share, *(place.believed(t) for place, near in seen if near and not place.near)))
+        share = min((share, *(place.share_at(t) for place, near in seen if near and not place.near)))
     if share < trust.share:
         return replace(trust, share=share, changed=t, places=places)
     if share < 1 and t - trust.changed >= 1:
@@ -79,7 +79,7 @@ def updated(trust: Trust, t: float, least: Fraction, position: PositionReported 
     return trust if places is trust.places else replace(trust, places=places)
 
 
-def doubted(trust: Trust, t: float, carried: Fraction) -> Trust:
+def add_doubt(trust: Trust, t: float, carried: Fraction) -> Trust:
     """Trust after a cut.
 
     carried  share of the limit that the link carried
@@ -90,7 +90,7 @@ def doubted(trust: Trust, t: float, carried: Fraction) -> Trust:
     return replace(trust, changed=t, doubts=(*doubts, (t, carried)))
 
 
-def relieved(trust: Trust, t: float, ratio: Fraction) -> Trust:
+def relieve(trust: Trust, t: float, ratio: Fraction) -> Trust:
     """Trust after the limit has fallen to a ratio of what it was at the cut at time t."""
     if not trust.doubts or trust.doubts[-1][0] != t:
         return trust
@@ -98,30 +98,30 @@ def relieved(trust: Trust, t: float, ratio: Fraction) -> Trust:
     return replace(trust, doubts=(*trust.doubts[:-1], (t, carried)))
 
 
-def _confirmed(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
-    """Trust some time after a cut: less, if the limit has been too high for some time, and still is."""
+def _confirm(trust: Trust, t: float, least: Fraction, position: PositionReported | None) -> Trust:
+    """Lower the trust some time after a cut, if the limit has been too high for a while and still is."""
     doubts = trust.doubts
     if len(doubts) < FEW or doubts[-1][0] - doubts[0][0] < LATE_S or trust.changed != doubts[-1][0]:
         return trust
-    # Use the mildest of these falls: a limit that is only late is far off at first, and almost right soon after.
+    # Use the mildest of these drops: a limit that is only late is far off at first, and almost right soon after.
     share = max(least, *(part for _, part in doubts))
     if not CONFIRM_S <= t - doubts[-1][0] <= EPISODE_S or share >= trust.share:
         return trust
     places = trust.places
     if position is not None and t - position.t <= KNOWN_S:
-        places = _with(places, DoubtedPlace(position, t, share))
+        places = _add_place(places, DoubtedPlace(position, t, share))
     return replace(trust, share=share, changed=t, places=places)
 
 
-def _with(places: tuple[DoubtedPlace, ...], new: DoubtedPlace) -> tuple[DoubtedPlace, ...]:
-    """Places with a new one, or with its share where known ones are close: they stay where the fall began."""
+def _add_place(places: tuple[DoubtedPlace, ...], new: DoubtedPlace) -> tuple[DoubtedPlace, ...]:
+    """Add a place, or update the share of known ones nearby, which stay where the drop began."""
     close = [place for place in places if is_near(place.at, new.at, NEAR_M / 2)]
     others = [place for place in places if place not in close]
     return (*others, *(replace(new, at=place.at) for place in close or [new]))[-MOST_PLACES:]
 
 
 def is_near(a: PositionReported, b: PositionReported, metres: float = NEAR_M) -> bool:
-    """Whether two positions are at most that far apart; the curvature between them is neglected."""
+    """Whether two positions are at most `metres` apart, neglecting curvature."""
     north = abs(a.lat - b.lat) * METRES_PER_DEGREE
     if north > metres:
         return False
@@ -130,5 +130,5 @@ def is_near(a: PositionReported, b: PositionReported, metres: float = NEAR_M) ->
 
 
 def thousandths(share: Fraction) -> Fraction:
-    """Rounded down: products of many shares would become long numbers."""
+    """Round down to thousandths: fractions from many multiplications would grow long."""
     return Fraction(share.numerator * 1000 // share.denominator, 1000)

@@ -1,12 +1,12 @@
-"""What the uplink carries, estimated from what the operator's side receives of every camera. Pure.
+"""Estimates the capacity of the uplink from what the operator's side receives from every camera. Pure.
 
 All cameras share one uplink and so one estimate. An access unit is delayed by the path and by the queue in front of the
-link. The smallest delay that its camera had lately is the path's; the rest is the queue's, and an offset between the
-clocks of both sides cancels out. While a queue lasts, the rate at which units arrive is the rate of the link.
+link. The smallest recent delay of its camera is the path's; the rest is the queue's, and an offset between the clocks
+of both sides cancels out. While a queue lasts, units arrive at the rate of the link.
 
-Delay-based like NADA (RFC 8698), with the two cases in which delay misleads kept apart. A link that stalls and then
-delivers everything at once, as cellular links do, shows a gap and no lasting queue. A path that becomes longer shows a
-queue that does not drain although less is sent.
+Delay-based like NADA (RFC 8698), with special handling of two cases in which delay misleads. A link that stalls and
+then delivers everything in a burst, as cellular links do, shows a gap and no lasting queue. A path that becomes longer
+shows a queue that does not drain although less is sent.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from operator import attrgetter
 from statistics import median
 from types import MappingProxyType
 
-BUCKET_S = 10.0  # the path's delay is the minimum of the current bucket of time and the one before
-NEW_S = 1.0  # how long a new camera has to send before its own path is measured
-KEPT_S, MOST_UNITS = 1.0, 5000  # units are kept for this long, and no more of them
-SAME_S = 0.001  # capture times that are closer, after rounding, are those of the same frame
-STEADY_S = 0.25  # the link's rate is the highest measured in this time: what is late makes it look lower
+BUCKET_S = 10.0  # the path's delay is the minimum of the current time bucket and the previous one
+NEW_S = 1.0  # how long a new camera must send before its own path is measured
+KEPT_S, MAX_UNITS = 1.0, 5000  # units are stored for this long, and at most this many
+SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
+STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
-RECENT_S = 0.06  # the queue is the shortest that a unit met within this time, or within a frame interval
+RECENT_S = 0.06  # the queue is the shortest that a unit met in this time, or in a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
-# A link whose queue is longer than the first of these has probably fallen: its rate before counts no more. It is busy,
-# so that a short time shows the new one.
+# With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
+# obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
-EVIDENCE_S = 0.08  # a rate measured over a shorter time says nothing about the link
+EVIDENCE_S = 0.08  # a rate measured over a shorter time is not significant
 EMPTY_S = 0.010  # a unit that waited less met no queue
 GROWN_S = 0.020  # a queue from here on may be growing
-GROWTH_S = 0.006  # by how much a queue must grow within COMPARED_S to be growing, or shrink to be draining
+GROWTH_S = 0.006  # change within COMPARED_S from which a queue counts as growing or draining
 COMPARED_S = 0.08
 LONG_S = 0.060  # a queue from here on is too long unless it drains
 UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
-PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, the rate is measured anew
+PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, measurement of the rate restarts
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
-FEW_PACKETS = 100  # of fewer no share of losses is stated
-OVERFLOWING = 0.1  # packets lost for each that arrives, more than on the radio link; a queue that drops so many is full
-STUCK_GROWTH = 1.5  # times its shortest; one that is longer grows
+FEW_PACKETS = 100  # with fewer packets the loss share is not reported
+OVERFLOWING = 0.1  # packets lost per packet received, more than on the radio link: the queue overflows
+STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
 
 
 class LinkState(StrEnum):
-    """What the queue in front of the link does."""
+    """State of the queue in front of the link."""
 
     CLEAR = "clear"
     FILLING = "filling"
@@ -60,10 +60,10 @@ class LinkState(StrEnum):
 class ReceivedUnit:
     """A frame as the operator's side received it, or a part of one: its rest may follow in a later report.
 
-    captured  s, by the vehicle's clock
-    arrived   s, by the operator's monotonic clock: when its last packet came
-    bytes     that arrived, on the wire, headers included
-    whole     whether no packet was missing at first
+    captured  s by the vehicle's clock
+    arrived   of its last packet, s by the operator's monotonic clock
+    bytes     received on the wire, including headers
+    whole     whether no packet was initially missing
     """
 
     camera: str
@@ -92,7 +92,7 @@ class LinkReport:
 class LinkEstimate:
     """The uplink at the time of a report.
 
-    kbps      kbit/s that arrive; while the link is filling or draining, what it carries. None: too little has arrived
+    kbps      received kbit/s; while the queue is filling or draining, the capacity. None: too little has arrived
     queue_ms  wait in the queue
     loss      share of packets lost in the last second, 0 to 1
     """
@@ -105,10 +105,10 @@ class LinkEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """Delay of one camera's path: the minimum of the bucket of time before and of the current one, which began then.
+    """Delay of one camera's path: the minimum of the previous time bucket and the current one, which began at `began`.
 
-    own  whether this camera was seen with an empty queue. Until then the path is the shortest of all cameras: one that
-         starts while a queue lasts, or slowly, would take that for its path
+    own  whether this camera was measured with an empty queue. Until then the path is the shortest of all cameras: a
+         camera that starts slowly or while a queue lasts would mistake that delay for its path
     """
 
     before: float
@@ -173,14 +173,14 @@ class UplinkMemory:
 
 
 def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, LinkEstimate | None]:
-    """Take a report.
+    """Update the estimate with a report.
 
     returns  None before the first unit has arrived
     """
-    before, uplink = uplink, _received(uplink, report.units)
-    packets = (*_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
+    before, uplink = uplink, _add_units(uplink, report.units)
+    packets = (*_entries_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
     if uplink.resumed != before.resumed:
-        packets = ()  # what was lost in a stall says nothing about the link after it
+        packets = ()  # losses in a stall say nothing about the link after it
     uplink = replace(uplink, packets=packets)
     if not uplink.units:
         return uplink, None
@@ -192,27 +192,27 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
     else:
         onset = uplink.onset
-    queues = (*_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
+    queues = (*_entries_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
     fallen = onset is not None and queue > FALLEN_S
     own = min(frame, SLOW_S)
     kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
     uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
-        return _lengthened(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
+        return _lengthen_path(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     stalled = report.at - last > _longest_gap(frame)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
     if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
         steady = FALLEN_RATE_S if fallen else STEADY_S
-        rates = (*_since(uplink.rates, max(report.at - steady, since)), (report.at, kbps))
+        rates = (*_entries_since(uplink.rates, max(report.at - steady, since)), (report.at, kbps))
         uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
     elif state is LinkState.CLEAR:
         uplink = replace(uplink, rates=())
     return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
 
 
-def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemory:
-    """Add units; a capture time that goes back shows a clock that was set, after which all delays are unknown."""
+def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemory:
+    """Add units; a capture time that goes backwards reveals that a clock was set, which invalidates all delays."""
     paths, captured, intervals = dict(uplink.paths), dict(uplink.captured), dict(uplink.intervals)
     kept, resumed = list(uplink.units), uplink.resumed
     newest = kept[-1].arrived if kept else None
@@ -224,7 +224,7 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
             intervals[unit.camera] = min(LONGEST_INTERVAL_S, after)
         captured[unit.camera] = unit.captured
         path = paths.get(unit.camera)
-        if unit.whole:  # one that misses its last packets seems to have come sooner
+        if unit.whole:  # without its last packets a unit seems to arrive sooner
             path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
@@ -232,8 +232,8 @@ def _received(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemo
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
         kept.append(_Unit(unit.arrived, max(0.0, unit.arrived - unit.captured - shortest), unit.bytes))
-    kept.sort(key=attrgetter("arrived"))  # one that misses its last packets is reported late
-    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MOST_UNITS:]
+    kept.sort(key=attrgetter("arrived"))  # a unit without its last packets is reported late
+    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MAX_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
 
@@ -242,17 +242,17 @@ def _frame_interval(intervals: Mapping[str, float]) -> float:
 
 
 def _longest_gap(frame: float) -> float:
-    """s between two units of any cameras that are not yet a stall."""
+    """Longest time between two units of any camera that is not a stall, s."""
     return max(GAP_S, 2 * frame)
 
 
 def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame: float) -> tuple[float | None, float]:
-    """kbit/s that arrived: since the queue began or doubled where it lasts, and never across a gap. And since when.
+    """Received kbit/s, and since when they are measured: the start or the doubling of the queue, never across a gap.
 
-    A shorter time than a frame interval may lack the frame of a camera that sends most of all.
+    A shorter time than a frame interval may lack the frame of the camera that sends most.
     """
     evidence = max(EVIDENCE_S, frame)
-    # From one arrival to another: a window that begins between two would count too much or too little.
+    # From one arrival to another: a window that begins in between would count too much or too little.
     begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-inf)
     begin = max(begin, uplink.units[0].arrived)
     began = uplink.resumed if uplink.onset is None else max(uplink.resumed, uplink.onset)
@@ -282,7 +282,7 @@ def _state(queues: Sequence[tuple[float, float, int, int]], queue: float, onset:
 
 
 def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
-    """Whether a queue lasts although less arrives than at its beginning, so that it cannot be one."""
+    """Whether a queue lasts although less arrives than at its start, so that it cannot be a queue."""
     queues = [was for _, was, _, _ in uplink.queues]
     received, lost = sum(some for _, _, some, _ in uplink.queues), sum(some for _, _, _, some in uplink.queues)
     return (
@@ -296,8 +296,8 @@ def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
     )
 
 
-def _lengthened(uplink: UplinkMemory) -> UplinkMemory:
-    """The path's delays raised by what was taken for a queue."""
+def _lengthen_path(uplink: UplinkMemory) -> UplinkMemory:
+    """Add to the paths' delays what was mistaken for a queue."""
     longer = min(was for _, was, _, _ in uplink.queues)
     paths = {
         name: _Path(path.delay + longer, path.delay + longer, path.began, path.own)
@@ -312,5 +312,5 @@ def _loss(packets: Sequence[tuple[float, int, int]]) -> float:
     return lost / (received + lost) if received + lost >= FEW_PACKETS else 0.0
 
 
-def _since(entries: Iterable[tuple[float, ...]], begin: float) -> tuple[tuple, ...]:  # type: ignore[type-arg]
+def _entries_since(entries: Iterable[tuple[float, ...]], begin: float) -> tuple[tuple, ...]:  # type: ignore[type-arg]
     return tuple(entry for entry in entries if entry[0] > begin)

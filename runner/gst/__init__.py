@@ -1,6 +1,6 @@
 """Everything that touches GStreamer, used only through `runner/apply.py`.
 
-raises  MissingBindings on import, with every part that does not load
+raises  MissingBindings on import, naming every part that fails to load
 """
 
 import ctypes
@@ -10,8 +10,8 @@ from importlib import import_module
 from runner.errors import MissingBindings
 from runner.gst.memory import limit_heaps
 
-# GStreamer loads libunwind, whose functions replace those of libgcc in all libraries loaded later: the next C++
-# exception, in Matplotlib or OpenCV, then ends the process. The library loaded first is found first.
+# GStreamer loads libunwind, whose symbols override those of libgcc in all libraries loaded later: the next C++
+# exception, in Matplotlib or OpenCV, would end the process. So libgcc is loaded first, and its symbols take precedence.
 with suppress(OSError):
     ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
 
@@ -57,13 +57,13 @@ Gst.init(None)
 
 
 def load_types() -> None:
-    """Let PyGObject make the classes of all types, before threads use them.
+    """Let PyGObject create the classes of all types before threads use them.
 
-    It makes a class when it is first used; where two threads are the first, it makes two, and objects of one are
-    refused by the methods of the other.
+    It creates a class on first use. If two threads race, it creates two, and the methods of one reject objects of the
+    other.
     """
     for name in TYPELIBS:
         module = import_module(f"gi.repository.{name}")
         for attribute in dir(module):
-            with suppress(AttributeError):  # some are of newer libraries than the one installed
+            with suppress(AttributeError):  # some need newer libraries than those installed
                 getattr(module, attribute)

@@ -1,4 +1,4 @@
-"""When the packets of each frame arrived, before anything waits for missing ones: what the link did to the frame."""
+"""Arrival times of the packets of each frame, taken before anything waits for missing ones: the effect of the link."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from dataclasses import dataclass
 
 from runner.records import Arrival
 
-KEPT = 1024  # frames that have not been read yet; the oldest are dropped
-TAIL_S = 0.01  # without a packet for this long, a frame has ended though its last packet is missing ...
-GAPS = 2  # ... and for this many times the longest recent gap between packets of a frame: a slow link spreads them
-FORGET = 0.99  # what is left of that gap at each packet
+MAX_FRAMES = 1024  # unread frames; beyond that the oldest are dropped
+TAIL_S = 0.01  # a frame whose last packet is missing counts as ended after this long without a packet ...
+TAIL_GAPS = 2  # ... and after this many times the longest recent gap within a frame: a slow link spreads packets out
+GAP_DECAY = 0.99  # factor by which that gap decays with each packet
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
-HEADER_BYTES = 32  # of a packet, in which a header without contributing sources and the capture time end
+HEADER_BYTES = 32  # of a packet: enough for the header without contributing sources, and the capture time
 CAPTURE_ID = 1  # of the header extension with the capture time
 EXTENDED, SOURCES, MARKER, HALF = 0x10, 0x0F, 0x80, 0x8000  # RFC 3550, section 5.1; half of all sequence numbers
-# Packets by which a stream jumps that begins anew, ahead or back, if the next one follows (RFC 3550, A.1).
+# Jump of the sequence number, ahead or back, that marks a restarted stream if the next packet follows (RFC 3550, A.1).
 DROPOUT, MISORDER = 3000, 100
 ONE_BYTE, FIXED_BYTES, WORD_BYTES, NTP_BYTES = b"\xbe\xde", 12, 4, 8  # RFC 8285, section 4.2; RFC 6051
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """What the header of an RTP packet says.
+    """The header fields of an RTP packet.
 
     stamp     RTP timestamp, the same for all packets of a frame
     last      whether it is the last packet of its frame
     bytes     of the payload
-    captured  s since 1970, by the sender's clock; None if the packet does not carry it
+    captured  s since 1970 by the sender's clock; None if the packet does not carry it
     """
 
     number: int
@@ -40,132 +40,131 @@ class Packet:
 
 
 def read_packet(header: bytes, size: int) -> Packet:
-    """The header of a packet of that many bytes, from its first HEADER_BYTES."""
-    begin, captured = FIXED_BYTES + WORD_BYTES * (header[0] & SOURCES), None
+    """Parse the header of a packet of `size` bytes from its first HEADER_BYTES."""
+    start, captured = FIXED_BYTES + WORD_BYTES * (header[0] & SOURCES), None
     if header[0] & EXTENDED:
-        extension = header[begin:]
+        extension = header[start:]
         captured = _captured(extension)
-        begin += WORD_BYTES * (1 + int.from_bytes(extension[2:4], "big"))
+        start += WORD_BYTES * (1 + int.from_bytes(extension[2:4], "big"))
     return Packet(
         number=int.from_bytes(header[2:4], "big"),
         stamp=int.from_bytes(header[4:8], "big"),
         last=bool(header[1] & MARKER),
-        bytes=max(0, size - begin),
+        bytes=max(0, size - start),
         captured=captured,
     )
 
 
 def _captured(extension: bytes) -> float | None:
-    """The capture time, of which this project's sender makes the first element of a header extension."""
-    begin = WORD_BYTES + 1
-    if extension[:2] != ONE_BYTE or extension[WORD_BYTES:begin] != bytes([CAPTURE_ID << 4 | NTP_BYTES - 1]):
+    """The capture time, which this project's sender writes as the first element of a header extension."""
+    start = WORD_BYTES + 1
+    if extension[:2] != ONE_BYTE or extension[WORD_BYTES:start] != bytes([CAPTURE_ID << 4 | NTP_BYTES - 1]):
         return None
-    ntp = int.from_bytes(extension[begin : begin + NTP_BYTES], "big")
+    ntp = int.from_bytes(extension[start : start + NTP_BYTES], "big")
     return ntp / 2**32 - NTP_EPOCH_S
 
 
 class ArrivingFrames:
-    """Packets of one camera in the order of their arrival, gathered into frames.
+    """Groups the packets of one camera into frames, in order of arrival.
 
     The thread in which packets arrive adds them; any one other thread takes the frames.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._frames: deque[Arrival] = deque(maxlen=KEPT)
+        self._frames: deque[Arrival] = deque(maxlen=MAX_FRAMES)
         self._clock = MediaClock(1 / RTP_HZ)
         self._newest: Packet | None = None
-        self._at = 0.0  # when it came
-        self._captured, self._bytes = 0.0, 0  # of its frame; bytes that have not been given
+        self._arrived = 0.0  # when the newest packet arrived
+        self._captured, self._bytes = 0.0, 0  # of its frame; bytes not emitted yet
         self._whole = False  # no packet of the frame is missing so far
-        self._open = self._given = False  # the frame has not ended; what came of it is among the frames
+        self._open = self._emitted = False  # the frame has not ended; its arrival is in `_frames`
         self._gap = 0.0
-        self._gone: deque[int] = deque(maxlen=MISORDER)  # numbers that are missing
-        self._restarted: int | None = None  # the number after one that jumped
-        self.received = self.missing = 0  # packets that came, and that did not before a later one came
+        self._missing: deque[int] = deque(maxlen=MISORDER)  # sequence numbers
+        self._restarted: int | None = None  # the sequence number that confirms a restart
+        self.received = self.missing = 0  # packets received, and packets missing when a later one arrived
 
-    def add(self, packet: Packet, now: float, *, again: bool = False) -> bool:
-        """Take a packet; returns whether it is newer than all before.
+    def add(self, packet: Packet, now: float, *, retransmitted: bool = False) -> bool:
+        """Add a packet; returns whether it is newer than all earlier ones.
 
-        now    s, when it came
-        again  it was missing, and sent again
+        now  s, when it arrived
         """
         with self._lock:
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % (2 * HALF)
-            if ahead >= (HALF if again else 2 * HALF - MISORDER):
-                self._add_older(packet, again)
+            if ahead >= (HALF if retransmitted else 2 * HALF - MISORDER):
+                self._add_older(packet, retransmitted)
                 return False
             if ahead < DROPOUT:
-                self._add_newer(packet, now, again, whole=not ahead)
-                self._miss(packet.number, ahead)
+                self._add_newer(packet, now, retransmitted, whole=not ahead)
+                self._note_missing(packet.number, ahead)
                 return True
             expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
             if packet.number != expected:
                 return False
-            self._add_newer(packet, now, again, whole=False)
+            self._add_newer(packet, now, retransmitted, whole=False)
             return True
 
     def is_late(self, now: float) -> bool:
-        """Whether the frame should have ended by now: its last packets are missing."""
-        return self._open and now - self._at > max(TAIL_S, GAPS * self._gap)
+        """Whether the current frame is overdue, so that its last packets are missing."""
+        return self._open and now - self._arrived > max(TAIL_S, TAIL_GAPS * self._gap)
 
     def next_number(self) -> int:
-        """Sequence number of the packet that should come next."""
+        """Sequence number of the next packet expected."""
         newest = self._newest
         return (newest.number + 1) % (2 * HALF) if newest else 0
 
     def take(self, now: float) -> list[Arrival]:
-        """Frames that have ended since the last call, or should have."""
+        """Frames that have ended since the last call, or are overdue."""
         with self._lock:
-            if self.is_late(now) and not self._given:
+            if self.is_late(now) and not self._emitted:
                 self._whole = False
-                self._give()
+                self._emit()
             taken = list(self._frames)
             self._frames.clear()
             return taken
 
-    def _add_older(self, packet: Packet, again: bool) -> None:
-        """Take a packet that was overtaken, is sent again, or comes twice."""
-        if again:
+    def _add_older(self, packet: Packet, retransmitted: bool) -> None:
+        """Add a packet that was reordered, retransmitted or duplicated."""
+        if retransmitted:
             self._bytes += packet.bytes
-        elif packet.number in self._gone:
-            self._gone.remove(packet.number)
+        elif packet.number in self._missing:
+            self._missing.remove(packet.number)
             self._bytes += packet.bytes
             self.received, self.missing = self.received + 1, self.missing - 1
 
-    def _add_newer(self, packet: Packet, now: float, again: bool, *, whole: bool) -> None:
-        """Take a packet that is newer than all before. whole: it follows the one before."""
-        self.received, self.missing = self.received + (not again), self.missing + again
+    def _add_newer(self, packet: Packet, now: float, retransmitted: bool, *, whole: bool) -> None:
+        """Add a packet that is newer than all earlier ones. whole: no packet is missing before it."""
+        self.received, self.missing = self.received + (not retransmitted), self.missing + retransmitted
         if self._newest is None or packet.stamp != self._newest.stamp:
             self._begin(packet)
-        elif not again:
-            self._gap = max(now - self._at, FORGET * self._gap)
-        self._whole &= whole and not again
-        self._newest, self._at, self._bytes = packet, now, self._bytes + packet.bytes
-        self._open, self._given = not packet.last, False
+        elif not retransmitted:
+            self._gap = max(now - self._arrived, GAP_DECAY * self._gap)
+        self._whole &= whole and not retransmitted
+        self._newest, self._arrived, self._bytes = packet, now, self._bytes + packet.bytes
+        self._open, self._emitted = not packet.last, False
         if packet.last:
-            self._give()
+            self._emit()
 
-    def _miss(self, number: int, count: int) -> None:
-        """So many packets before one are missing."""
+    def _note_missing(self, number: int, count: int) -> None:
+        """`count` packets before the one with this number are missing."""
         self.missing += count
-        self._gone.extend(gone % (2 * HALF) for gone in range(number - min(count, MISORDER), number))
+        self._missing.extend(each % (2 * HALF) for each in range(number - min(count, MISORDER), number))
 
     def _begin(self, packet: Packet) -> None:
-        if self._open and not self._given:
+        if self._open and not self._emitted:
             self._whole = False
-            self._give()
+            self._emit()
         self._clock.tick(packet.stamp)
         self._captured = self._clock.seconds if packet.captured is None else packet.captured
         self._whole = True
 
-    def _give(self) -> None:
-        self._frames.append(Arrival(self._at, self._captured, self._bytes, self._whole))
-        self._bytes, self._given = 0, True
+    def _emit(self) -> None:
+        self._frames.append(Arrival(self._arrived, self._captured, self._bytes, self._whole))
+        self._bytes, self._emitted = 0, True
 
 
 class MediaClock:
-    """Time of a counter of 32 bits that wraps around; 0 before its first value."""
+    """Converts a 32-bit counter that wraps around to seconds; 0 before its first value."""
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s, self._last, self._ticks = tick_s, 0, 0
@@ -176,5 +175,5 @@ class MediaClock:
 
     def tick(self, counter: int) -> None:
         ahead = (counter - self._last) & 0xFFFFFFFF
-        self._ticks += ahead - (ahead >> 31 << 32)  # of two directions the shorter
+        self._ticks += ahead - (ahead >> 31 << 32)  # the shorter of both directions
         self._last = counter

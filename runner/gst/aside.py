@@ -1,4 +1,4 @@
-"""State changes that may never return, kept off the thread that serves all cameras."""
+"""State changes that may hang, run off the thread that serves all cameras."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _workers: set[threading.Thread] = set()
 _lock = threading.Lock()
 
 
-def set_state_aside(
+def set_state_in_thread(
     element: Gst.Element,
     state: Gst.State,
     on_hung: Callable[[], None] = lambda: None,
@@ -25,10 +25,10 @@ def set_state_aside(
 ) -> threading.Thread:
     """Change an element's state in a separate thread, which ends with the change.
 
-    Network elements can deadlock in a state change. Such a thread cannot be ended, so it is left alone.
+    Network elements can deadlock in a state change. A thread cannot be killed, so a hung one is abandoned.
 
     on_hung  called once, from another thread, when the change has taken HUNG_S
-    after    an earlier change of this element, which has to finish first
+    after    an earlier state change of this element, which must finish first
     """
     watchdog = threading.Timer(HUNG_S, on_hung)
     watchdog.daemon = True
@@ -53,8 +53,8 @@ def set_state_aside(
 
 def settle(limit_s: float) -> None:
     """Wait for all pending changes, up to a time limit."""
-    until = time.monotonic() + limit_s
+    deadline = time.monotonic() + limit_s
     with _lock:
         workers = list(_workers)
     for worker in workers:
-        worker.join(max(0.0, until - time.monotonic()))
+        worker.join(max(0.0, deadline - time.monotonic()))

@@ -1,4 +1,4 @@
-"""Pictures of a bag for an appsrc: read in a thread of their own, at their own pace or as fast as they are taken."""
+"""Feeds pictures of a bag into an appsrc: read in a separate thread, in real time or as fast as they are consumed."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from runner.core.model import BagTopic, ModelError
 from runner.graph import Plan
 from runner.gst.source import BEHIND_S
 
-LOOK_S = 0.5  # a thread that waits for its next picture looks this often whether its pipeline is gone
+POLL_S = 0.5  # while waiting for the next picture, how often the thread checks that its pipeline still runs
 ENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
-UNPACED = {"is-live": False, "leaky-type": 0, "block": True}  # of an appsrc that waits until each picture is taken
+UNPACED = {"is-live": False, "leaky-type": 0, "block": True}  # of an appsrc that blocks until each picture is consumed
 
 
 def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[str], None]) -> None:
@@ -27,22 +27,22 @@ def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[
 
 
 def read_bag(source: Gst.Element, bag: BagTopic, fps: Fraction, loop: bool = False) -> BagFeed:
-    """Let an appsrc of a new pipeline pass a bag's pictures as fast as they are taken: none is left out."""
+    """Let an appsrc of a new pipeline pass a bag's pictures as fast as they are consumed; none may be skipped."""
     for key, value in UNPACED.items():
         source.set_property(key, value)
     return BagFeed(source, bag, fps, loop)
 
 
 class BagFeed:
-    """Pushes the pictures of a topic into an appsrc, from the moment that it asks for the first one.
+    """Pushes the pictures of a topic into an appsrc once it requests data.
 
-    The first picture comes at once; the running times of the others follow from their stamps. A bag that cannot be read
-    ends the pipeline, as an error of its source.
+    The first picture is pushed immediately; the running times of the others follow from their stamps. A bag
+    that cannot be read ends the pipeline, as an error of its source.
 
     fps        stated in the caps, Hz
     loop       start again at the end, one mean interval after the last picture
-    on_report  called with a line about pictures that are left out; each comes at its time. None: they come as fast as
-               they are taken, and one that would be left out is an error
+    on_report  called with a line about skipped pictures; playback is in real time. None: pictures are pushed as fast
+               as they are consumed, and a picture that would be skipped is an error
 
     `first` is the stamp of the first picture, ns since 1970; None before it.
     """
@@ -61,8 +61,8 @@ class BagFeed:
         self._shift = 0  # from stamps to running time, ns
         self._last = -1  # running time of the last picture, ns
         self._form: Picture | None = None  # the picture whose size and format the others must have
-        self._told = False
-        self._waiting = threading.Event()  # never set: the thread is a daemon and looks whether its pipeline is gone
+        self._skip_reported = False
+        self._waiting = threading.Event()  # never set: the daemon thread itself checks that its pipeline still runs
         self._starting = source.connect("need-data", self._on_need_data)
 
     def _on_need_data(self, source: Gst.Element, _bytes: int) -> None:
@@ -74,20 +74,20 @@ class BagFeed:
         try:
             with Bag(Path(self._bag.path)) as bag:
                 bag.find(PICTURES, self._bag.topic, "pictures")
-                while self._round(bag) and self._loop:
+                while self._play_once(bag) and self._loop:
                     pass
             self._source.emit("end-of-stream")
         except ModelError as error:
             self._fail(f"{error.found}: {error.rule}")
 
-    def _round(self, bag: Bag) -> bool:
+    def _play_once(self, bag: Bag) -> bool:
         """Play the bag once; returns False if the pipeline is gone."""
         began, count = 0, 0
         for number, picture in enumerate(bag.pictures(self._bag.topic), 1):
             if number == 1:
                 self._begin(picture)
-            if why := self._misfit(picture):
-                self._leave_out(bag, why.format(number))
+            if why := self._mismatch(picture):
+                self._skip(bag, why.format(number))
                 continue
             self._last = picture.ns + self._shift
             if not self._push(picture):
@@ -98,7 +98,7 @@ class BagFeed:
         return count > 0
 
     def _begin(self, picture: Picture) -> None:
-        """A round begins with this picture."""
+        """Start a round with this picture."""
         if self._form is None:
             self._form, self.first = picture, picture.ns
             form = caps(picture.format, picture.width, picture.height, self._fps)
@@ -108,8 +108,8 @@ class BagFeed:
             start = self._last + self._interval
         self._shift = start - picture.ns
 
-    def _misfit(self, picture: Picture) -> str | None:
-        """Why a picture cannot follow those before it; None: it can."""
+    def _mismatch(self, picture: Picture) -> str | None:
+        """Why a picture cannot follow the previous ones; None: it can."""
         first = self._form
         assert first is not None
         if (picture.width, picture.height) != (first.width, first.height):
@@ -120,20 +120,20 @@ class BagFeed:
             return "picture {} is not later than the one before"
         return None
 
-    def _leave_out(self, bag: Bag, why: str) -> None:
-        """Report the first picture of this kind; raises ModelError if no picture may be missing."""
+    def _skip(self, bag: Bag, why: str) -> None:
+        """Report the first skipped picture; raises ModelError if none may be skipped."""
         where = bag.names(self._bag.topic)
         if self._on_report is None:
             raise ModelError("topic", where, why)
-        if not self._told:
-            self._told = True
+        if not self._skip_reported:
+            self._skip_reported = True
             self._on_report(f"{where}: {why}: such pictures are left out")
 
     def _push(self, picture: Picture) -> bool:
         """Push a picture when it is due; returns False if the pipeline is gone."""
         if self._on_report:
             while (early := self._last - self._now()) > 0:
-                self._waiting.wait(min(early / Gst.SECOND, LOOK_S))
+                self._waiting.wait(min(early / Gst.SECOND, POLL_S))
                 if self._source.get_state(0).state < Gst.State.PAUSED:
                     return False
             if -early > BEHIND_S * Gst.SECOND:  # like a clip, it does not catch up
@@ -144,7 +144,7 @@ class BagFeed:
         return bool(self._source.emit("push-buffer", buffer) == Gst.FlowReturn.OK)
 
     def _now(self) -> int:
-        """Running time of the pipeline, ns; 0 once the source has been taken out of it."""
+        """Running time of the pipeline, ns; 0 once the source has been removed from it."""
         clock = self._source.get_clock()
         return int(clock.get_time() - self._source.get_base_time()) if clock else 0
 
@@ -154,7 +154,7 @@ class BagFeed:
 
 
 def caps(form: str, width: int, height: int, fps: Fraction) -> str:
-    """Caps of pictures of a format, as `Picture` names it."""
+    """Caps for a format named as in `Picture`."""
     rate = f"framerate={fps.numerator}/{fps.denominator}"
     if form in ENCODED:
         return f"{ENCODED[form]},{rate}"

@@ -21,7 +21,7 @@ def write_clip(
     frames  each width * height * 3 / 2 bytes: Y, U, V, contiguous
     raises  RuntimeError with GStreamer's message
 
-    The stream is made for cheap decoding: no B-frames, no CABAC, no deblocking, a keyframe every second.
+    The stream is cheap to decode: no B-frames, no CABAC, no deblocking, a keyframe every second.
     """
     caps = (
         f"video/x-raw,format=I420,width={width},height={height},framerate={fps.numerator}/{fps.denominator},"
@@ -65,7 +65,7 @@ def _push(pipeline: Any, frames: Iterable[bytes], fps: Fraction) -> None:
 
 
 def _wait(pipeline: Any, nanoseconds: int, for_what: Any) -> None:
-    """Wait for a message or the timeout; an error is raised."""
+    """Wait for a message or the timeout; raises the error of an error message."""
     message = pipeline.get_bus().timed_pop_filtered(nanoseconds, for_what | Gst.MessageType.ERROR)
     if message and message.type == Gst.MessageType.ERROR:
         error, _ = message.parse_error()

@@ -16,8 +16,8 @@ from gi.repository import GstRtspServer
 from runner.gst.viewers import StreamViewer
 
 USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data stays unacknowledged for this long (RFC 5482)
-KEEPALIVE_S, KEEPALIVES = 2, 3  # a machine that answers none of this many probes, this far apart, is gone
-_SIOCOUTQ = 0x5411  # bytes that are not acknowledged yet (linux/sockios.h)
+KEEPALIVE_S, KEEPALIVES = 2, 3  # a peer that answers none of this many probes, this far apart, is gone
+_SIOCOUTQ = 0x5411  # unacknowledged bytes (linux/sockios.h)
 _BYTES_ACKED, _MIN_RTT = 120, 148  # offsets in struct tcp_info (linux/tcp.h)
 BUFFER_S = 0.35  # of video in the send buffer, in addition to the round-trip time
 LEAST_BUFFER_BYTES = 16_384
@@ -26,18 +26,18 @@ LEAST_BUFFER_BYTES = 16_384
 class RtspConnection:
     """One client of the RTSP server, seen through its TCP connection.
 
-    silent_s     how long the other machine may be silent before the kernel probes it
+    silent_s     how long the peer may be silent before the kernel probes it
 
     viewer       its address and its operator
-    cameras      what it watches, with the library's transport once it is set up
-    described    camera that was last described to it: the library keeps that one open for it
+    cameras      those it watches, with the library's transport once it is set up
+    described    camera of its last DESCRIBE: the library keeps it open for the client
     interleaved  whether this connection also carries video
-    last_request monotonic time of its last complete request, s; that of its start before the first
+    last_request monotonic time of its last complete request, s; before the first, of its start
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
         connection = client.get_connection()
-        # Our own descriptor: the library closes its one from another thread, and the next file opened gets its number.
+        # Our own descriptor: the library closes its own from another thread, and the number is then reused.
         self._socket = socket.socket(fileno=os.dup(connection.get_write_socket().get_fd()))
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
@@ -48,35 +48,35 @@ class RtspConnection:
         self.interleaved = False
         self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = 0
-        self._written: deque[tuple[float, int]] = deque()  # when, bytes ever written by then
+        self._written: deque[tuple[float, int]] = deque()  # when, total bytes written by then
 
     def __str__(self) -> str:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
 
-    def keeps_waiting(self, now: float) -> float:
-        """How long it has not made its first request, s: over TLS, perhaps in the middle of a handshake."""
+    def unused_s(self, now: float) -> float:
+        """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
         return now - self.viewer.since if self.last_request == self._began else 0.0
 
     def identify(self, operator: str | None) -> None:
         self.viewer = self.viewer._replace(operator=operator or "")
 
     def carry_video(self) -> None:
-        """This connection will carry video: the kernel closes it when data is no longer acknowledged."""
+        """Prepare for interleaved video: the kernel closes the connection when data is no longer acknowledged."""
         self.interleaved = True
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
 
     def lag(self, kbps: int, shared: bool) -> float:
-        """Age of the oldest byte that the other side has not acknowledged, s; to be called a few times a second.
+        """Age of the oldest byte that the peer has not acknowledged, s; to be called a few times a second.
 
         kbps    of its video, which sizes the send buffer: by default, the kernel buffers up to 4 MB
-        shared  whether others watch the same. Then the video continues while the send buffer is full, and data queued
-                before the buffer is not visible here: the time since it last had room counts as well. A single reader
-                exerts back-pressure on the encoder, and its data is no older than the buffer.
+        shared  whether others watch the same camera. Then the video continues while the send buffer is full, and data
+                queued in front of it is not visible here: the time since it last had room counts as well. A single
+                reader exerts back-pressure on the encoder, and its data is no older than the buffer.
         """
         now = time.monotonic()
         info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
         (acked,), (rtt_us,) = struct.unpack_from("Q", info, _BYTES_ACKED), struct.unpack_from("I", info, _MIN_RTT)
-        self._bound(round(kbps * 125 * (BUFFER_S + rtt_us / 1e6)))
+        self._resize_buffer(round(kbps * 125 * (BUFFER_S + rtt_us / 1e6)))
         (waiting,) = struct.unpack("i", ioctl(self._socket, _SIOCOUTQ, bytes(4)))
         self._written.append((now, acked + waiting))
         while self._written and self._written[0][1] <= acked:
@@ -85,10 +85,10 @@ class RtspConnection:
             self._writable = now
         return now - min(self._writable, self._written[0][0] if self._written else now)
 
-    def _bound(self, size: int) -> None:
+    def _resize_buffer(self, size: int) -> None:
         size = max(size, LEAST_BUFFER_BYTES)
         if abs(size - self._buffer) > self._buffer / 10:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size // 2)  # which the kernel doubles
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size // 2)  # the kernel doubles it
             self._buffer = size
 
     def _has_room(self) -> bool:
@@ -97,10 +97,10 @@ class RtspConnection:
         return bool(room.poll(0))
 
     def close(self) -> None:
-        """End the connection. The server then notices this in its own thread."""
+        """Shut the connection down; the server notices in its own thread."""
         with suppress(OSError):  # it may have ended already
             self._socket.shutdown(socket.SHUT_RDWR)
 
-    def forget(self) -> None:
-        """The server has closed it."""
+    def release(self) -> None:
+        """Close our descriptor, once the server has closed the connection."""
         self._socket.close()

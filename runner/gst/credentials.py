@@ -13,9 +13,9 @@ LONGEST = 1000  # bytes
 
 
 def log_in(pipeline: Gst.Bin, plan: Plan) -> str | None:
-    """Give the elements of a new source the user name and password that its camera asks for.
+    """Set the user name and password of the elements of a new source.
 
-    returns  why it cannot, as for a file that others may read; None if it can, or no file is named
+    returns  why it cannot, such as a file that others may read; None if it can, or no file is configured
     """
     if plan.camera.credentials is None:
         return None
@@ -38,5 +38,5 @@ def _read(path: Path) -> tuple[str, str]:
         raise ValueError(exposed)
     user, _, password = lines[0].partition(":") if len(lines) == 1 else ("", "", "")
     if not user or not password:
-        raise ValueError("must hold one line user:password")
+        raise ValueError("must contain one line user:password")
     return user, password

@@ -1,4 +1,4 @@
-"""Many encoders on one sequence: decoded once, scaled once for each factor, encoded and decoded again in lanes.
+"""Runs many encoders on one sequence: decoded once, scaled once per factor, encoded and decoded in lanes.
 
 Offline work, so Python per frame is fine here.
 """
@@ -16,7 +16,7 @@ from gi.repository import GLib, Gst
 from runner.errors import RunError
 from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
-from runner.gst.pipeline import counted
+from runner.gst.pipeline import passed_counts
 from runner.lanes import BAG, FRAMES, LaneSet
 
 POLL_NS = 200 * 1_000_000
@@ -30,7 +30,7 @@ OnDecoded = Callable[[int, int, LumaPlane], None]  # lane, number of the frame, 
 class Encoded:
     """Result of one lane.
 
-    frames    pictures that came out of the decoder
+    frames    decoded pictures
     bytes     of coded video
     encode_s  CPU time of the encoder in its own thread, s
     """
@@ -47,8 +47,8 @@ class _Run:
     fps: Fraction
     form: str = ""
     frames: int = 0
-    moved: float = field(default_factory=time.monotonic)
-    failed: BaseException | None = None
+    last_frame: float = field(default_factory=time.monotonic)  # time at which a frame last passed
+    error: BaseException | None = None
 
 
 def run_lanes(
@@ -82,7 +82,7 @@ def run_lanes(
             raise RunError(_message(pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)))
         _wait(pipeline, run, on_progress)
         for result, lane in zip(results, lanes.lanes, strict=True):
-            result.bytes = counted(pipeline.get_by_name(lane.counter))[1]
+            result.bytes = passed_counts(pipeline.get_by_name(lane.counter))[1]
     finally:
         pipeline.set_state(Gst.State.NULL)
     return results
@@ -100,15 +100,15 @@ def _wait(pipeline: Gst.Pipeline, run: _Run, on_progress: Callable[[int], None])
     bus = pipeline.get_bus()
     while True:
         message = bus.timed_pop_filtered(POLL_NS, Gst.MessageType.ERROR | Gst.MessageType.EOS)
-        if run.failed:
-            raise run.failed
+        if run.error:
+            raise run.error
         if message and message.type == Gst.MessageType.ERROR:
             raise RunError(_message(message))
         if message:
             return
         on_progress(run.frames)
-        if time.monotonic() - run.moved > STALLED_S:
-            raise RunError(f"no frame has moved for {STALLED_S} s")
+        if time.monotonic() - run.last_frame > STALLED_S:
+            raise RunError(f"no frame has passed for {STALLED_S} s")
 
 
 def _message(message: Gst.Message | None) -> str:
@@ -126,7 +126,7 @@ def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFram
         if event.type == Gst.EventType.CAPS:
             _check_form(run, event.parse_caps())
         return Gst.PadProbeReturn.OK
-    number, run.frames, run.moved = run.frames, run.frames + 1, time.monotonic()
+    number, run.frames, run.last_frame = run.frames, run.frames + 1, time.monotonic()
     _guarded(run, lambda: on_frame(number, luma_of(info.get_buffer(), pad.get_current_caps())))
     return Gst.PadProbeReturn.OK
 
@@ -135,25 +135,25 @@ def _check_form(run: _Run, caps: Gst.Caps) -> None:
     picture = structure(caps)
     form = f"{picture.get_int('width')[1]}x{picture.get_int('height')[1]}"
     if run.form and form != run.form:
-        run.failed = run.failed or RunError(f"the size changes from {run.form} to {form} within the sequence")
+        run.error = run.error or RunError(f"the size changes from {run.form} to {form} within the sequence")
     run.form = form
 
 
 def _watch_encoder(encoder: Gst.Element, result: Encoded) -> None:
-    """Add up the CPU time from each frame's entry to its packet's exit, in the encoder's thread."""
+    """Add up the CPU time of the encoder's thread from each frame's input to its output."""
     began: dict[int, float] = {}
 
-    def goes_in(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def on_input(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         began[threading.get_ident()] = time.thread_time()
         return Gst.PadProbeReturn.OK
 
-    def comes_out(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def on_output(_pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         start = began.pop(threading.get_ident(), None)
         result.encode_s += 0.0 if start is None else time.thread_time() - start
         return Gst.PadProbeReturn.OK
 
-    encoder.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, goes_in)
-    encoder.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, comes_out)
+    encoder.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, on_input)
+    encoder.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_output)
 
 
 def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_picture: OnDecoded) -> Gst.FlowReturn:
@@ -163,16 +163,16 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     # An encoder may skip frames; the timestamp identifies this one.
     number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
     result.frames += 1
-    run.moved = time.monotonic()
+    run.last_frame = time.monotonic()
     _guarded(run, lambda: on_picture(lane, number, luma_of(buffer, sample.get_caps())))
-    return Gst.FlowReturn.ERROR if run.failed else Gst.FlowReturn.OK
+    return Gst.FlowReturn.ERROR if run.error else Gst.FlowReturn.OK
 
 
 def _guarded(run: _Run, work: Callable[[], None]) -> None:
-    """Run work in a streaming thread; its exceptions are raised in the waiting thread."""
-    if run.failed:
+    """Run work in a streaming thread; the waiting thread raises its exceptions."""
+    if run.error:
         return
     try:
         work()
     except BaseException as error:
-        run.failed = error
+        run.error = error

@@ -1,20 +1,19 @@
-"""Memory of pictures and of ended pipelines goes back to the system. For the GNU C library; others keep their ways."""
+"""Returns the memory of pictures and of ended pipelines to the system. For the GNU C library; no effect with others."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 
-PICTURE_BYTES = 256 * 1024  # blocks of this size and more are mapped one by one, and unmapped when they are freed
+PICTURE_BYTES = 256 * 1024  # blocks of this size and more are mapped individually, and unmapped when freed
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # malloc.h
 
 
 def limit_heaps() -> None:
-    """Keep pictures out of the heaps, and have no more of these than processors, see mallopt(3).
+    """Keep pictures out of the heaps, and limit the number of heaps to that of processors, see mallopt(3).
 
-    Heaps shrink only from their ends, or page by page. By default the library has eight for each processor, all of
-    which the threads of pipelines use, and raises the size from which it maps blocks to the largest ever freed, up to
-    32 MB.
+    Heaps shrink only from their ends, or page by page. By default the library has eight per processor, all of which
+    pipeline threads use, and it raises the size from which it maps blocks to the largest ever freed, up to 32 MB.
     Pools and encoders allocate their pictures once, so this costs no time while streaming.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

@@ -1,8 +1,8 @@
-"""Looks at one buffer of a pad in many, without cost for the others, and without memory that is never freed.
+"""Samples single buffers of a pad, at no cost for the others and without leaking memory.
 
-PyGObject before 3.44.2 (Debian 12, Ubuntu 22.04) keeps for good what it makes for each callback that is given to C,
-such as a probe: 130 bytes. Latencies of eight cameras are sampled 80 times a second, which would be a gigabyte a day.
-So these probes share one callback, made once by ctypes, which reads the structures of GStreamer's stable interface.
+PyGObject before 3.44.2 (Debian 12, Ubuntu 22.04) leaks 130 bytes for each callback passed to C, such as a probe.
+Latencies of eight cameras are sampled 80 times a second, which would leak a gigabyte a day. So these probes share one
+ctypes callback, which reads the structures of GStreamer's stable ABI.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ _pointer.restype, _pointer.argtypes = c_void_p, (ctypes.py_object, c_char_p)
 
 
 class PassingBuffer:
-    """A buffer on its way through a pad; valid as long as the callback that gets it runs."""
+    """A buffer passing a pad; valid only during the callback that receives it."""
 
     def __init__(self, address: int) -> None:
         self._address = address
 
     @property
     def pts(self) -> int | None:
-        """ns; None: it has none."""
+        """ns; None if not set."""
         pts = int(_Buffer.from_address(self._address).pts)
         return None if pts == Gst.CLOCK_TIME_NONE else pts
 
@@ -76,22 +76,22 @@ class PassingBuffer:
 
     @property
     def reference_ns(self) -> int | None:
-        """The reference timestamp that it carries; None: it carries none."""
+        """Its reference timestamp; None if it has none."""
         meta = _get_reference(self._address, None)
         return int(meta.contents.timestamp) if meta else None
 
     def extract(self, offset: int, count: int) -> bytes:
-        """Some of its bytes, as far as it has so many."""
+        """Up to `count` bytes from an offset."""
         data = ctypes.create_string_buffer(count)
         copied = _extract(self._address, offset, data, count)
         return data.raw[:copied]
 
 
 class OneShot:
-    """A probe that can be armed again and again. While it is not, a buffer costs nothing.
+    """A probe that can be armed repeatedly. While it is not armed, buffers cost nothing.
 
-    on_buffer  called in the streaming thread with the pad and each buffer that passes it, until it returns True
-    armed      whether a buffer is awaited
+    on_buffer  called in the streaming thread with the pad and each buffer, until it returns True
+    armed      whether it waits for a buffer
     """
 
     def __init__(self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool]) -> None:
@@ -101,13 +101,13 @@ class OneShot:
         _shots[self._key] = self
 
     def arm(self) -> None:
-        """Look at the next buffer, unless one is awaited already. To be called by one thread at a time."""
+        """Wait for the next buffer, unless already armed. To be called by one thread at a time."""
         if not self.armed:
             self.armed = True
             address = int(_pointer(self._pad.__gpointer__, None))
             _add_probe(address, Gst.PadProbeType.BUFFER, _on_probe, self._key, None)
 
-    def look(self, address: int) -> int:
+    def handle(self, address: int) -> int:
         if not self._on_buffer(self._pad, PassingBuffer(address)):
             return int(Gst.PadProbeReturn.OK)
         self.armed = False
@@ -118,10 +118,10 @@ _keys = itertools.count(1)
 _shots: WeakValueDictionary[int, OneShot] = WeakValueDictionary()
 
 
-def _look(_pad: int, info: Any, key: int) -> int:
-    """A pad does not keep its probe alive: with the owner of one that is armed it ends as well."""
+def _dispatch(_pad: int, info: Any, key: int) -> int:
+    """A pad does not keep its probe alive: an armed probe is removed once its owner is gone."""
     shot = _shots.get(key)
-    return shot.look(info.contents.data) if shot else int(Gst.PadProbeReturn.REMOVE)
+    return shot.handle(info.contents.data) if shot else int(Gst.PadProbeReturn.REMOVE)
 
 
-_on_probe = _Callback(_look)
+_on_probe = _Callback(_dispatch)

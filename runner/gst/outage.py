@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from gi.repository import GLib
 
-GATHER_MS = 300
+MERGE_MS = 300
 
 
 class Outage:
@@ -23,10 +23,10 @@ class Outage:
 
     @property
     def reason(self) -> str | None:
-        """Why it began; None while there is no outage."""
+        """Its first reason; None while there is no outage."""
         return next(iter(tuple(self._reasons)), None)  # another thread may clear them
 
-    def failed(self, why: str, since: float) -> None:
+    def report_failure(self, why: str, since: float) -> None:
         """Record a failure.
 
         since  when the camera last worked; used for the first failure only
@@ -37,17 +37,17 @@ class Outage:
             self._reasons.append(why)
             self._on_report(why)
 
-    def over(self, now: float) -> None:
-        """The camera works again."""
+    def report_recovery(self, now: float) -> None:
+        """End the outage: the camera works again."""
         if self._reasons:
             self._on_report(f"works again after {now - self._began:.0f} s")
         self._reasons.clear()
 
 
-class Gathered:
+class ReportMerger:
     """Merges identical reports of several cameras at about the same time: `front, rear: no frame for 2 s`.
 
-    on_report  called from GLib's thread: cameras, what happened to them
+    on_report  called from GLib's thread with cameras and what happened to them
     """
 
     def __init__(self, on_report: Callable[[str, str], None]) -> None:
@@ -63,11 +63,11 @@ class Gathered:
             if camera not in cameras:
                 cameras.append(camera)
         if first:
-            GLib.timeout_add(GATHER_MS, self.flush)
+            GLib.timeout_add(MERGE_MS, self.flush)
 
     def flush(self) -> bool:
         with self._lock:
-            gathered, self._cameras = self._cameras, {}
-        for what, cameras in gathered.items():
+            merged, self._cameras = self._cameras, {}
+        for what, cameras in merged.items():
             self._on_report(", ".join(cameras), what)
         return False

@@ -12,7 +12,7 @@ from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
-from runner.gst.repeats import RepeatedPicture
+from runner.gst.repeats import RepeatDetector
 from runner.gst.sender_stages import EncoderWatch, SenderStages
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
@@ -26,14 +26,14 @@ CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with 
 
 
 class CameraPipeline:
-    """Sets up a newly built pipeline, and turns its knobs from then on.
+    """Sets up a newly built pipeline, then turns its knobs.
 
     wanted     the wanted knob values
     on_turned  called, from any thread, after knobs were set
-    on_report  called, from a streaming thread, with a fault of the source, and when it has passed
+    on_report  called, from a streaming thread, with a fault of the source, and on its recovery
     source     the source, if it is watched
 
-    `untimed` is whether the source does not know when the last picture was captured: it came at its stated time.
+    `untimed` is whether the source does not know when the last picture was captured.
     """
 
     def __init__(
@@ -59,30 +59,30 @@ class CameraPipeline:
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
-        self._repeats = RepeatedPicture(entry, plan.camera.source.repeated_s, on_report)
+        self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
-        self._stamp(last.get_parent_element())
+        self._add_capture_time(last.get_parent_element())
         self.knobs.set_now(self._allowed(wanted))
         last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
         last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
 
     @property
     def source_fault(self) -> str | None:
-        """The fault of a source that delivers nothing and is being replaced, or repeats a picture; None: it is fine."""
+        """The fault of a source that is frozen and being replaced, or repeats a picture; None if it works."""
         failed = self._source.outage.reason if self._source else None
         return failed or self._repeats.outage.reason
 
     def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
-        """Set the knobs to the wanted values; `changed` holds those that are new."""
+        """Set the knobs to the wanted values; `changed` has the new ones."""
         self._wanted = wanted
         allowed = self._allowed(changed)
         if allowed:
             self.knobs.turn(allowed)
 
     def _allowed(self, values: Mapping[str, KnobValue]) -> Mapping[str, KnobValue]:
-        """Until the first frame is out, sending is not changed.
+        """Until the first frame has been sent, `sending` is not changed.
 
-        A gate that is closed from the start passes no caps, and a client's DESCRIBE would wait for them in vain.
+        A gate that is closed from the start passes no caps, so a client's DESCRIBE would wait for them forever.
         """
         return values if self._started else {knob: value for knob, value in values.items() if knob != "sending"}
 
@@ -93,14 +93,14 @@ class CameraPipeline:
 
     @property
     def kbps(self) -> int:
-        """The encoder's bitrate as read back, 0 before it was set."""
+        """The encoder's bitrate as read back, 0 before it is set."""
         bitrate = self.knobs.applied.get("bitrate", 0)
         return bitrate if isinstance(bitrate, int) else 0
 
     def push(self, frame: Any) -> bool:
         """Hand one frame to the source, which must be an appsrc.
 
-        raises  ValueError if the frame's length is not width * height * 3 / 2
+        raises  ValueError unless the frame's length is width * height * 3 / 2
         """
         width, height = self._plan.camera.source_size
         data = bytes(memoryview(frame).cast("B"))
@@ -120,15 +120,15 @@ class CameraPipeline:
     def counters(self) -> tuple[int, int]:
         """Frames and bytes that the encoder has output so far, counted in C."""
         sent = self._pipeline.get_by_name("sent")
-        return counted(sent) if sent else (0, 0)
+        return passed_counts(sent) if sent else (0, 0)
 
     @property
     def frame_s(self) -> float:
         """Interval between two frames."""
         return 1 / float(self._plan.camera.fps)
 
-    def drop_waiting(self) -> None:
-        """Drop the packet that waits for an interleaved viewer, if there is one."""
+    def drop_queued_packet(self) -> None:
+        """Drop the packet queued for an interleaved viewer, if any."""
         pipeline = self._pipeline
         while parent := pipeline.get_parent():
             pipeline = parent
@@ -136,10 +136,10 @@ class CameraPipeline:
         sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
 
     def send_key_frame(self) -> None:
-        """Let the encoder start anew with its next picture, if the graph states how."""
+        """Make the encoder send a key frame next, if the graph states how."""
         match self._plan.camera.graph.key_frame:
             case "caps":
-                self.knobs.set_anew("size")
+                self.knobs.restart_encoder("size")
             case "event":
                 event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
                 if sent := self._pipeline.get_by_name("sent"):
@@ -148,47 +148,47 @@ class CameraPipeline:
     def stages(self) -> SenderStages | None:
         """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.
 
-        None: unknown, as while nothing is sent
+        None: unknown, for example while nothing is sent
         """
-        self._repeats.look()
+        self._repeats.check_next()
         return self._encoder.take()
 
     def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._started = True
-        self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _keep_below)
+        self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _drop_reconfigure)
         if "sending" in self._wanted:
             self.knobs.turn({"sending": self._wanted["sending"]})
         return Gst.PadProbeReturn.REMOVE
 
-    def _stamp(self, payloader: Gst.Element) -> None:
-        """Let every packet carry the capture time of its frame."""
+    def _add_capture_time(self, payloader: Gst.Element) -> None:
+        """Add the capture time of its frame to the header of every packet."""
         if isinstance(payloader, GstRtp.RTPBasePayload):
             extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
             extension.set_id(CAPTURE_ID)
             payloader.emit("add-extension", extension)
 
 
-def _keep_below(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """New caps make every upstream element renegotiate. The source need not: its output does not change.
+def _drop_reconfigure(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    """Keep new caps from making the source renegotiate: its output does not change.
 
-    And it must not: it queries caps between two frames, just when the next knobs are turned, and sees half of them.
+    It would query caps between two frames, while the next knobs are being turned, and see only some of them.
     """
-    wanted = info.get_event().type != Gst.EventType.RECONFIGURE
-    return Gst.PadProbeReturn.OK if wanted else Gst.PadProbeReturn.DROP
+    reconfigures = info.get_event().type == Gst.EventType.RECONFIGURE
+    return Gst.PadProbeReturn.DROP if reconfigures else Gst.PadProbeReturn.OK
 
 
 def _refuse_seeks(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """A camera is not seekable; a query that is answered unchanged says so.
+    """Report a camera as not seekable, by answering the query unchanged.
 
-    The RTSP server trusts the source's answer. It would seek a clip or a test picture for every PLAY with a Range, a
-    Scale or a Speed: flush the stream of all viewers, and wait for a frame that a closed gate never passes.
+    The RTSP server relies on the source's answer. It would seek a clip or a test picture for every PLAY with a Range,
+    Scale or Speed: flush the stream of all viewers, and wait for a frame that a closed gate never passes.
     """
     seeking = info.get_query().type == Gst.QueryType.SEEKING
     return Gst.PadProbeReturn.HANDLED if seeking else Gst.PadProbeReturn.OK
 
 
-def counted(identity: Gst.Element) -> tuple[int, int]:
-    """Buffers and bytes that an identity has passed."""
+def passed_counts(identity: Gst.Element) -> tuple[int, int]:
+    """Number of buffers and bytes that an identity has passed."""
     stats = identity.get_property("stats")
     return stats.get_value("num-buffers"), stats.get_value("num-bytes")
 
@@ -196,7 +196,7 @@ def counted(identity: Gst.Element) -> tuple[int, int]:
 def encrypt(pipeline: Gst.Bin, passphrase: str) -> None:
     """Set the passphrase of the pipeline's SRT elements.
 
-    raises  RunError if it has none: its transport cannot be encrypted
+    raises  RunError if it has no SRT element: its transport cannot be encrypted
     """
     found = [element for element in pipeline.iterate_recurse() if element.find_property("passphrase")]
     for element in found:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
-from runner.gst.arriving import KEPT, NTP_EPOCH_S, RTP_HZ, MediaClock
+from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.caps import structure
 from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.gst.repair import RepairBuffer
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
-DIALLED_S = 1.0  # the same where the vehicle dials: it calls again, and a listener holds on to its first caller
+DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -39,14 +39,14 @@ class Reception:
     frames      access units received
     bytes       their payload
     decoded     frames that reached the sink
-    damaged     frames whose picture shows that packets were lost, see `runner.h264.damage`
+    damaged     frames whose picture shows packet loss, see `runner.h264.damage`
     lost        RTP packets that never arrived
     foreign     RTP and RTCP packets from hosts other than the vehicle, dropped
     width, height  px of the decoded picture, 0 before the first
-    latency_ms  decode of the last sampled frame by this machine's clock minus capture by the vehicle's; None before the
-                first, and where it is not recent
-    latency_at  when that was, s by the monotonic clock
-    buffer_ms   how long a picture waits for packets that are sent again; None: they are not, or the transport does it
+    latency_ms  decode time of the last sampled frame by this machine's clock minus its capture time by the vehicle's;
+                None before the first, and if it is not recent
+    latency_at  when it was measured, s by the monotonic clock
+    buffer_ms   how long a picture waits for retransmitted packets; None: there are none, or the transport handles them
     waited_ms   how long a sampled frame was in the jitter buffer; None: unknown, as without RTP
     decode_ms   from a sampled access unit to its picture; None: unknown
     rebuilt     how often a pipeline that had received frames was rebuilt
@@ -71,7 +71,7 @@ class Reception:
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
-OnUnit = Callable[[str, AccessUnit], None]  # camera, what was received
+OnUnit = Callable[[str, AccessUnit], None]  # camera, access unit
 OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
 PICTURES = (
     "videoconvert ! video/x-raw,format=RGB "
@@ -85,9 +85,9 @@ class Receiver:
     on_unit     called with each access unit, from the streaming thread
     on_picture  called with each decoded picture, from the streaming thread
     arrivals    record when each access unit arrived
-    video       where to keep what is received; the plan then has `video`
+    video       where to store the received stream; the plan must have `video`
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
-    login       how it proves who it is; None: to a vehicle that does not ask
+    login       credentials for the vehicle; None: the vehicle does not authenticate
     """
 
     def __init__(
@@ -105,10 +105,10 @@ class Receiver:
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
-        self._unread: deque[Arrival] = deque(maxlen=KEPT)  # access units, where no jitter buffer sees packets
+        self._unread: deque[Arrival] = deque(maxlen=MAX_FRAMES)  # access units, if there is no jitter buffer
         self._packets = (0, 0)  # received and missing, as last read
         self._newest: Arrival | None = None
-        # Without RTSP no element reads the capture time of a frame.
+        # Without RTSP, no element parses the capture time of a frame.
         self._untimed = "" if plan.serves else next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
         self._media_clock = MediaClock(1 / RTP_HZ)
         settings = plan.camera.graph.settings
@@ -123,17 +123,20 @@ class Receiver:
         self._frames = self._bytes = 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._is_dialled = not plan.serves
-        self._stall_s = DIALLED_S if self._is_dialled else STALL_S
+        self._stall_s = DIALLED_STALL_S if self._is_dialled else STALL_S
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
-        self._before = Reception()  # counts of earlier pipelines
+        self._before = Reception()  # counters of earlier pipelines
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
         self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
-        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when anything moved
-        self._silent = time.monotonic()  # when the camera was last not expected to send
-        self._was_sending = False  # expected to, as of the last sample
+        self._progress = (
+            0,
+            time.monotonic(),
+        )  # frames at the last change of the counter, and time of the last progress
+        self._last_unexpected = time.monotonic()  # when the camera was last not expected to send
+        self._was_expected = False  # whether it was expected to send at the last sample
         self.should_send: bool | None = None  # None: unknown while the vehicle is offline
 
     def start(self) -> None:
@@ -144,7 +147,7 @@ class Receiver:
         self._close_filter()
 
     def sample(self) -> Reception:
-        """What was received so far; requests the latency of the next frame."""
+        """Reception so far; requests the latency of the next frame."""
         waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
         received = self._count()
         waited = [ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None]
@@ -156,17 +159,17 @@ class Receiver:
         )
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
-            self._on_report(self._name, "packets from other hosts than the vehicle are dropped")
+            self._on_report(self._name, "packets from hosts other than the vehicle are dropped")
         now = time.monotonic()
         if self._login and self._login.is_withdrawn():
-            self._supervised.restart("the vehicle's keys are not accepted any more")
-        expected = self._was_sending = self._is_expected()
+            self._supervised.restart("the vehicle's keys are no longer accepted")
+        expected = self._was_expected = self._is_expected()
         if not expected:
-            self._silent = now
-        if received.frames != self._moved[0] or self.should_send is False:
-            self._moved = (received.frames, now)
-        elif expected and now - self._moved[1] > self._stall_s and now - self._silent > GRACE_S:
-            self._moved = (received.frames, now)
+            self._last_unexpected = now
+        if received.frames != self._progress[0] or self.should_send is False:
+            self._progress = (received.frames, now)
+        elif expected and now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S:
+            self._progress = (received.frames, now)
             self._supervised.restart(f"no frame for {self._stall_s:g} s")
         else:
             return received
@@ -174,13 +177,13 @@ class Receiver:
         return received
 
     def _is_expected(self) -> bool:
-        """Whether frames should come.
+        """Whether frames should arrive.
 
-        While the vehicle is offline that is unknown. But a caller may be gone together with its control link, and must
-        find a listener that waits for it: a stream that flowed is expected until it is built anew.
+        Unknown while the vehicle is offline. But a caller may disappear together with its control link, and needs a
+        waiting listener when it is back: a stream that was flowing is expected until its pipeline is rebuilt.
         """
         if self.should_send is None and self._is_dialled:
-            return self._was_sending and self._begun
+            return self._was_expected and self._begun
         return bool(self.should_send)
 
     @property
@@ -189,7 +192,7 @@ class Receiver:
         return self._newest
 
     def take_arrivals(self) -> list[Arrival]:
-        """What has arrived since the last call; packets that are missing are not waited for. From any one thread."""
+        """Frames that arrived since the last call, without waiting for missing packets. From any one thread."""
         if self._buffers:
             now = time.monotonic()
             return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
@@ -197,19 +200,19 @@ class Receiver:
 
     @property
     def is_damaged(self) -> bool:
-        """Whether the newest picture shows that packets were lost for good."""
-        return self._begun and self._damage.lasts
+        """Whether the newest picture shows unrecovered packet loss."""
+        return self._begun and self._damage.is_damaged
 
     def take_packets(self) -> tuple[int, int]:
-        """RTP packets received, and missing at first, since the last call. From any one thread."""
+        """RTP packets received, and initially missing, since the last call. From any one thread."""
         frames = [buffer.frames for buffer in self._buffers]
         received, missing = sum(each.received for each in frames), sum(each.missing for each in frames)
         before = self._packets if received >= self._packets[0] else (0, 0)  # a new pipeline counts from 0
-        self._packets = received, max(missing, before[1])  # fewer than before: some were only overtaken
+        self._packets = received, max(missing, before[1])  # it drops if packets were only reordered
         return received - before[0], self._packets[1] - before[1]
 
     def request_tails(self) -> None:
-        """Request packets whose loss no later packet shows; to be called a hundred times a second."""
+        """Request missing packets at the end of a frame (tail loss); to be called a hundred times a second."""
         if self._is_repaired:
             for buffer in self._buffers:
                 buffer.request_tail()
@@ -223,11 +226,11 @@ class Receiver:
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
-        # A stream that others watch goes on: what was missed meanwhile shows until a picture is healed.
-        self._damage = Damage(self._codec, lasts=self._built)
+        # A stream that others watch continues: what was missed meanwhile shows until a picture is healed.
+        self._damage = Damage(self._codec, is_damaged=self._built)
         self._built = True
         self._close_filter()
-        self._moved = (self._frames, time.monotonic())
+        self._progress = (self._frames, time.monotonic())
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
         self._next_picture = OneShot(self._sink.get_static_pad("sink"), self._on_frame)
@@ -240,11 +243,11 @@ class Receiver:
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
         if GObject.signal_lookup("select-stream", self._client):
-            take_feedback(self._client, self._on_profile)
+            prefer_feedback(self._client, self._on_profile)
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
-            VideoFile(self._video, self._name, "operator", _came, self._on_report).follow(pipeline)
+            VideoFile(self._video, self._name, "operator", _captured, self._on_report).follow(pipeline)
         received = pipeline.get_by_name("received").get_static_pad("src")
         received.add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
         if self._untimed and (depayloader := pipeline.get_by_name(self._untimed)):
@@ -254,8 +257,8 @@ class Receiver:
         return received
 
     def _on_progress(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
-        """The client is connecting and the server answers: over a slow link this takes time."""
-        self._moved = (self._moved[0], time.monotonic())
+        """The client is connecting and the server answers, which takes time over a slow link."""
+        self._progress = (self._progress[0], time.monotonic())
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         factory = element.get_factory().get_name() if element.get_factory() else ""
@@ -266,17 +269,17 @@ class Receiver:
             self._filter_senders(element)
 
     def _filter_senders(self, source: Gst.Element) -> None:
-        """Let a socket of the client accept only what the vehicle sends. From the client's thread."""
-        taken = source.get_property("used-socket")
-        if taken is None:
+        """Make a socket of the client accept packets from the vehicle only. From the client's thread."""
+        used_socket = source.get_property("used-socket")
+        if used_socket is None:
             return
         try:
             if self._filter is None:
                 location = self._client.get_property("location")
                 self._filter = SenderFilter(Gst.Uri.from_string(location).get_host())
-            self._filter.attach(taken.get_fd())
+            self._filter.attach(used_socket.get_fd())
         except OSError as error:
-            self._on_report(self._name, f"packets from other hosts than the vehicle are not dropped: {error}")
+            self._on_report(self._name, f"packets from hosts other than the vehicle are not dropped: {error}")
 
     def _close_filter(self) -> None:
         if self._filter:
@@ -312,7 +315,7 @@ class Receiver:
         return True
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """An access unit has arrived: page and log share its times; the vehicle receives them in a report."""
+        """An access unit has arrived; page, log and reception report share its times."""
         arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
         captured = capture_time(buffer)
         self._entered = (buffer.pts, monotonic)
@@ -324,7 +327,7 @@ class Receiver:
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         self._bytes += buffer.get_size()
-        self._frames += 1  # after its arrival: a sample has no frame without it
+        self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
         # The depayloader marks the very first unit, and each unit with missing packets.
         incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
         damaged = self._damage.add(incomplete, lambda: bytes(buffer.extract_dup(0, HEAD_BYTES)))
@@ -337,12 +340,12 @@ class Receiver:
         return Gst.PadProbeReturn.OK
 
     def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """Note the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
+        """Use the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
         self._media_clock.tick(int.from_bytes(info.get_buffer().extract_dup(4, 4), "big"))
         return Gst.PadProbeReturn.OK
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
-        """Arrivals since the last call, only of frames already counted; more may come meanwhile."""
+        """Arrivals since the last call, only of frames already counted: more may arrive meanwhile."""
         if self._arrivals is None:
             return ()
         new = tuple(self._arrivals.popleft() for _ in range(min(len(self._arrivals), frames - self._sampled)))
@@ -358,14 +361,14 @@ class Receiver:
         return Gst.FlowReturn.OK
 
 
-def _came(_pad: Gst.Pad, buffer: Gst.Buffer) -> float | None:
+def _captured(_pad: Gst.Pad, buffer: Gst.Buffer) -> float | None:
     return capture_time(buffer)
 
 
-def take_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:
-    """Let an RTSP client choose the profile with retransmission of lost packets (RFC 4585, 4588).
+def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:
+    """Make an RTSP client choose the profile with retransmission of lost packets (RFC 4585, 4588).
 
-    A server that offers both profiles lists the stream twice; by default the client takes the first, without feedback.
+    A server that offers both profiles lists the stream twice; by default the client uses the first, without feedback.
 
     on_profile  called with the profile chosen
     """
@@ -387,5 +390,5 @@ def capture_time(buffer: Gst.Buffer) -> float | None:
 
 
 def unix_s(reference_ns: int) -> float:
-    """A reference timestamp, s since 1970: those of RTP are of NTP's time."""
+    """A reference timestamp as s since 1970; those of RTP are in NTP time."""
     return float(reference_ns / Gst.SECOND - NTP_EPOCH_S)

@@ -1,4 +1,4 @@
-"""One camera recorded from its source into a file: every frame as it enters the pipeline, no loss unnoticed."""
+"""Records one camera from its source into a file: every frame as it enters the pipeline; all losses are counted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runner.graph import Plan
 from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
-from runner.gst.pipeline import counted
+from runner.gst.pipeline import passed_counts
 from runner.gst.source import fixed_rate, loop_clip
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 CHECK_MS = 100
 SILENT_S = 10.0  # a source that delivers nothing for this long has failed
 WRITE_S = 60.0  # an encoder or a disk that makes no progress for this long has failed
-LAST_S = 1.0  # each frame of this last period is checked, so that the file ends with the right one
+LAST_S = 1.0  # in this last period each frame is checked, so that the file ends with the right one
 
 
 class Stage(Enum):
@@ -35,14 +35,14 @@ class Stage(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What was recorded of one camera so far.
+    """Progress of one camera's recording.
 
     frames     frames kept
     seconds    from the first to the end of the last one, by their timestamps
-    missing    frames expected in this time that are absent; a bag is not expected to have any
+    missing    frames expected in this time but absent; 0 for a bag
     overruns   frames dropped at the full queue before the encoder, even after the end
     repeated   frames that the source repeated to keep its rate, not counted for a clip
-    left_out   frames that the source dropped to keep its rate, likewise
+    left_out   frames that the source dropped to keep its rate, not counted for a clip
     width, height  px, 0 before the first frame
     began      time of the first frame, s since 1970; 0 before it
     failure    what failed, or None
@@ -78,12 +78,12 @@ class Recorder:
         self._first = Gst.CLOCK_TIME_NONE  # ns of running time
         self._end: tuple[int, int] | None = None  # ns of running time at which the recording is cut, frames until then
         self._counting_down = self._finishing = False
-        self._moved = (0, time.monotonic())  # frames at the last change of the counter, and when
+        self._progress = (0, time.monotonic())  # frames at the last change of the counter, and when
         self._rated = fixed_rate(self._pipeline) if not plan.loops else []
         self._feed = self._read_bag() if plan.bag else None
 
     def _read_bag(self) -> BagFeed:
-        """A bag is recorded as fast as the encoder takes it: once, or again and again up to a given length."""
+        """Record a bag as fast as the encoder accepts it: once, or repeatedly up to a given length."""
         from runner.gst.bag_feed import read_bag
 
         assert self._plan.bag
@@ -93,12 +93,12 @@ class Recorder:
         return read_bag(source, self._plan.bag, self._plan.camera.fps, loop)
 
     def start(self) -> None:
-        """Begin; a recording that cannot begin is FAILED at the next check."""
-        if not self._feed:  # whose pictures wait
+        """Start; a recording that cannot start is FAILED at the next check."""
+        if not self._feed:  # a bag's feed waits for the queue
             self._queue.connect("overrun", self._on_overrun)
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
-            element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
+            element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         problem = log_in(self._pipeline, self._plan)
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)
@@ -106,7 +106,7 @@ class Recorder:
         bus.add_signal_watch()
         bus.connect("message::error", self._on_error)
         bus.connect("message::eos", self._on_eos)
-        self._moved = (0, time.monotonic())
+        self._progress = (0, time.monotonic())
         self._watching = GLib.timeout_add(CHECK_MS, self._watch)
         if problem:
             self._close(Stage.FAILED, problem)
@@ -114,24 +114,24 @@ class Recorder:
         self._pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
 
     def sample(self) -> Recorded:
-        """What was recorded so far."""
+        """Progress so far."""
         if self._recorded.stage is Stage.RECORDING:
             self._recorded = self._count()
         return self._recorded
 
     def finish(self) -> None:
-        """Keep what the source has delivered, and end the file; the stage soon becomes FINISHED."""
+        """Finish the file with all frames delivered so far; the stage soon becomes FINISHED."""
         if self._recorded.stage is not Stage.RECORDING or self._finishing:
             return
         if self._first == Gst.CLOCK_TIME_NONE:
             self._close(Stage.FAILED, "stopped before its first frame")
             return
-        self._finishing, self._moved = True, (0, time.monotonic())
+        self._finishing, self._progress = True, (0, time.monotonic())
         above = self._queue.get_static_pad("sink").get_peer()
         above.add_probe(Gst.PadProbeType.IDLE, self._end_stream)
 
     def stop(self) -> None:
-        """End at once; a file that is not FINISHED stays incomplete."""
+        """Stop immediately; a file that is not FINISHED stays incomplete."""
         if self._recorded.stage is Stage.RECORDING:
             self._close(Stage.FAILED, "stopped before its file was finished")
 
@@ -147,7 +147,7 @@ class Recorder:
         if self._first == Gst.CLOCK_TIME_NONE:
             return self._recorded
         # The counter is read last: a frame that passes meanwhile must not appear to be missing.
-        end, frames = self._end or (self._out.query_position(Gst.Format.TIME)[1], counted(self._counter)[0])
+        end, frames = self._end or (self._out.query_position(Gst.Format.TIME)[1], passed_counts(self._counter)[0])
         seconds = max(0, end - self._first) / Gst.SECOND
         picture = structure(self._out.get_current_caps())
         return Recorded(
@@ -169,7 +169,7 @@ class Recorder:
         return int(element.get_property("drop"))
 
     def _began(self) -> float:
-        """Wall-clock time of the first frame; of a bag's, when it was captured."""
+        """Wall-clock time of the first frame; for a bag, its capture time."""
         if self._feed and self._feed.first is not None:
             return float(self._feed.first / Gst.SECOND)
         clock = self._pipeline.get_clock()
@@ -183,9 +183,9 @@ class Recorder:
         """A few times a second: check that frames arrive, and whether the end is near."""
         now = self._count()
         self._recorded = replace(self._recorded, began=now.began)
-        if now.frames != self._moved[0] and not self._finishing:
-            self._moved = (now.frames, time.monotonic())
-        if why := self._stuck():
+        if now.frames != self._progress[0] and not self._finishing:
+            self._progress = (now.frames, time.monotonic())
+        if why := self._stall():
             self._close(Stage.FAILED, why)
             return False
         started = self._first != Gst.CLOCK_TIME_NONE
@@ -193,17 +193,17 @@ class Recorder:
             self._count_down()
         return True
 
-    def _stuck(self) -> str | None:
+    def _stall(self) -> str | None:
         """What has made no progress for too long, or None."""
-        still_s = time.monotonic() - self._moved[1]
+        stalled_s = time.monotonic() - self._progress[1]
         if self._finishing or self._end is not None:
-            return f"the file was not finished within {WRITE_S:g} s" if still_s > WRITE_S else None
+            return f"the file was not finished within {WRITE_S:g} s" if stalled_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
-            return f"frames wait, and none was encoded and written for {WRITE_S:g} s" if still_s > WRITE_S else None
-        return f"no frame for {SILENT_S:g} s" if still_s > SILENT_S else None
+            return f"frames are queued, but none was written for {WRITE_S:g} s" if stalled_s > WRITE_S else None
+        return f"no frame for {SILENT_S:g} s" if stalled_s > SILENT_S else None
 
     def _count_down(self) -> None:
-        """Check every frame from now on, to cut at the right one."""
+        """Start checking every frame, to cut at the right one."""
         if not self._counting_down:
             self._counting_down = True
             self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_late_frame)
@@ -216,7 +216,7 @@ class Recorder:
         if self._end is None and time_ns - self._first < self._duration_s * Gst.SECOND - frame / 2:
             return Gst.PadProbeReturn.OK
         if self._end is None:
-            self._end = (time_ns, counted(self._counter)[0] - 1)
+            self._end = (time_ns, passed_counts(self._counter)[0] - 1)
             pad.get_peer().send_event(Gst.Event.new_eos())
         return Gst.PadProbeReturn.DROP
 
@@ -226,7 +226,7 @@ class Recorder:
         return Gst.PadProbeReturn.REMOVE
 
     def _end_stream(self, pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """Between two frames, from any thread. The pad stays blocked: nothing comes after the end."""
+        """Between two frames, from any thread. The pad stays blocked, so nothing follows the end."""
         pad.get_peer().send_event(Gst.Event.new_eos())
         return Gst.PadProbeReturn.OK
 

@@ -1,4 +1,4 @@
-"""Check a plan against this machine's GStreamer registry: finds errors that would otherwise show only while driving."""
+"""Checks a plan against this machine's GStreamer registry, to find errors before they show while driving."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def check_plan(plan: Plan, parts: Collection[str] = PARTS) -> list[ModelError]:
 
     Known elements that are not installed are reported by `missing_plugins` and `missing_recorders`.
 
-    parts  of the plan; the plugins of the others are not loaded: a decoder takes 30 MB of a vehicle's memory
+    parts  to check; the plugins of the others are not loaded: a decoder takes 30 MB of a vehicle's memory
     """
     elements = [
         ("vehicle", "source.elements", plan.source),
@@ -85,12 +85,12 @@ def check_plan(plan: Plan, parts: Collection[str] = PARTS) -> list[ModelError]:
 
 
 def check_vehicle(plan: Plan) -> list[ModelError]:
-    """What `check_plan` finds in the vehicle's part, for the side that runs it alone."""
+    """`check_plan` of the vehicle's part, for the side that runs only that."""
     return check_plan(plan, ("vehicle",))
 
 
 def check_operator(plan: Plan) -> list[ModelError]:
-    """What `check_plan` finds in the operator's part, for the side that runs it alone."""
+    """`check_plan` of the operator's part, for the side that runs only that."""
     return check_plan(plan, ("operator",))
 
 
@@ -150,7 +150,7 @@ def _check_links(plan: Plan, parts: Collection[str]) -> list[ModelError]:
 def _lines(plan: Plan, parts: Collection[str]) -> Iterator[tuple[str, str]]:
     """The plan's pipelines as GStreamer parses them, except those with an element that this machine lacks.
 
-    After a filter all sources are alike: the source becomes one line, which many graphs share, and the rest another.
+    A source that ends in a filter becomes a line of its own, which many graphs share; the rest is another.
     """
     filtered = bool(plan.source) and plan.source[-1].factory == "capsfilter"
     rest = replace(plan, source=plan.source[-1:]) if filtered else plan
@@ -198,7 +198,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
 
 
 def _readable(kind: str, value: str) -> bool:
-    """Whether GStreamer parses a text as a property of that type; parsing it within a structure reports errors."""
+    """Whether GStreamer parses a text as a property of that type; only parsing within a structure reports errors."""
     quoted = value.replace("\\", "\\\\").replace('"', '\\"')
     for written in (value, f'"{quoted}"'):
         try:
@@ -224,7 +224,7 @@ def _template(factory: str) -> Gst.Element | None:
 
 
 def _factory_names(like: str) -> list[str]:
-    """Names that a misspelt one may stand for; a list of all would have a thousand."""
+    """Likely correct names for a misspelt one; a list of all would have a thousand."""
     every = Gst.Registry.get().get_feature_list(Gst.ElementFactory)
     from difflib import get_close_matches
 

@@ -1,4 +1,4 @@
-"""Repair of lost packets at the operator: requested soon, and waited for as long as a round trip takes."""
+"""Retransmission of lost packets on the operator's side: requested early, awaited as long as round trips take."""
 
 from __future__ import annotations
 
@@ -11,95 +11,96 @@ from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, read_packet
 from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.system.recent import RecentValue
 
-REORDER_MS = 5  # a packet that is missing for longer was lost, not overtaken
-ATTEMPTS = 3  # of retransmission that the buffer waits for
-FULL, CLEAR = 0.15, 0.05  # share of packets missing from which on nothing is sent again, and until when: a link that
-# drops so many is full, and what is sent again would fill it further
-MEMORY = 0.75  # of both numbers, from one look to the next
-UNKNOWN_MS = 100  # taken for the round trip until the first packet was sent again
-LONGEST_MS = 300  # a picture that is later is of no use for driving
+REORDER_MS = 5  # a packet that is missing for longer was lost, not reordered
+ATTEMPTS = 3  # retransmissions that the buffer waits for
+# Retransmission stops above the first share of missing packets and resumes below the second: a link that drops so many
+# is congested, and retransmissions would make it worse.
+CONGESTED, CLEAR = 0.15, 0.05
+DECAY = 0.75  # of both counts, from one update to the next
+INITIAL_RTT_MS = 100  # round trip assumed until the first retransmission
+LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
 FRAMES = 64  # whose end is remembered
 
 
 class RepairBuffer:
-    """An rtpjitterbuffer whose missing packets are sent again (RFC 4585, 4588).
+    """An rtpjitterbuffer with retransmission of missing packets (RFC 4585, 4588).
 
-    The buffer itself notices a loss when the next packet comes. After the last packet of a frame that is the next
-    frame's, up to 66 ms later; so a frame that does not end is noticed here by time.
+    The buffer itself detects a loss when the next packet arrives. After the last packet of a frame, that is up to 66 ms
+    later; so a frame whose end is missing is detected here by a timeout.
 
-    reorder_ms  how long it waits at least
+    reorder_ms  minimum wait
     """
 
     def __init__(self, buffer: Gst.Element, reorder_ms: int) -> None:
         self._buffer, self._reorder_ms = buffer, reorder_ms
-        # Frames come in bursts: the packet expected next belongs to the next frame and is not missing.
+        # Frames arrive in bursts: the next expected packet belongs to the next frame and is not missing.
         buffer.set_property("rtx-next-seqnum", False)
         buffer.set_property("rtx-delay", REORDER_MS)
         self._pad = buffer.get_static_pad("sink")
         self._probe = self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
         self.frames = ArrivingFrames()
-        self._asked = False  # the next packet was requested
-        self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames whose last packet came: stamp, when
+        self._tail_requested = False
+        self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames: timestamp, arrival of the last packet
         self._waited = RecentValue[float]()  # how long a frame waited here, ms
         self._passing = OneShot(buffer.get_static_pad("src"), self._on_passed)
-        self._counted = (0, 0)  # packets that came, and that were missing
-        self._recent: tuple[float, ...] = (0.0, 0.0)  # of these, lately
-        self._full = False  # nothing is requested
+        self._counted = (0, 0)  # packets received, and missing
+        self._recent: tuple[float, ...] = (0.0, 0.0)  # the same, decaying
+        self._congested = False  # no retransmission
 
     @property
     def lost(self) -> int:
-        """Packets missing for good."""
+        """Packets that were never recovered."""
         lost: int = self._buffer.get_property("stats").get_value("num-lost")
         return lost
 
     def adapt(self) -> int:
-        """Wait for missing packets as long as their retransmission takes; returns that, ms. A few times a second."""
-        round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or UNKNOWN_MS
-        self._look()
-        wait_ms = self._reorder_ms + (0 if self._full else round(ATTEMPTS * round_trip_ms))
+        """Adapt the wait for missing packets to the round trip; returns it, ms. A few times a second."""
+        round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or INITIAL_RTT_MS
+        self._update_congestion()
+        wait_ms = self._reorder_ms + (0 if self._congested else round(ATTEMPTS * round_trip_ms))
         wait_ms = max(self._reorder_ms, min(LONGEST_MS, wait_ms))
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
         return wait_ms
 
     def waited_ms(self) -> float | None:
-        """How long the end of a frame waited here lately; requests that of the next. A few times a second."""
+        """How long the end of a recent frame waited here; samples the next frame. A few times a second."""
         self._passing.arm()
         return self._waited.get()
 
     def close(self) -> None:
-        """Let go of a buffer whose pipeline has ended: its pads hold this object, which holds them, for ever."""
+        """Break the reference cycle between this object and the pads of a buffer whose pipeline has ended."""
         self._pad.remove_probe(self._probe)
 
     def _on_passed(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         now = time.monotonic()
         packet = read_packet(buffer.extract(0, HEADER_BYTES), buffer.size)
-        # A copy: the thread of arriving packets adds to it.
-        came = next((at for stamp, at in tuple(self._ends) if stamp == packet.stamp), None)
-        if not packet.last or came is None:
+        # A copy: the thread of arriving packets appends to it.
+        arrived = next((at for stamp, at in tuple(self._ends) if stamp == packet.stamp), None)
+        if not packet.last or arrived is None:
             return False
-        self._waited.set(1000 * (now - came))
+        self._waited.set(1000 * (now - arrived))
         return True
 
-    def _look(self) -> None:
-        """Whether the link is full."""
+    def _update_congestion(self) -> None:
+        """Stop or resume retransmission."""
         before, now = self._counted, (self.frames.received, self.frames.missing)
         if now != before:
             self._counted = now
             self._recent = tuple(
-                MEMORY * recent + new - old for recent, new, old in zip(self._recent, now, before, strict=True)
+                DECAY * recent + new - old for recent, new, old in zip(self._recent, now, before, strict=True)
             )
         received, missing = self._recent
-        self._full = missing > (CLEAR if self._full else FULL) * (received + missing)
-        if self._buffer.get_property("do-retransmission") is self._full:
-            self._buffer.set_property("do-retransmission", not self._full)
+        self._congested = missing > (CLEAR if self._congested else CONGESTED) * (received + missing)
+        if self._buffer.get_property("do-retransmission") is self._congested:
+            self._buffer.set_property("do-retransmission", not self._congested)
 
     def request_tail(self) -> None:
-        """Request the next packet of a frame that should have ended by now; to be called a hundred times a second."""
-        if self._asked or self._full or not self.frames.is_late(time.monotonic()):
+        """Request the next packet of an overdue frame; to be called a hundred times a second."""
+        if self._tail_requested or self._congested or not self.frames.is_late(time.monotonic()):
             return
-        self._asked = True
+        self._tail_requested = True
         request = Gst.Structure.new_empty("GstRTPRetransmissionRequest")
         request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, self.frames.next_number()))
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
@@ -107,12 +108,12 @@ class RepairBuffer:
     def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         buffer, now = info.get_buffer(), time.monotonic()
         packet = read_packet(buffer.extract_dup(0, HEADER_BYTES), buffer.get_size())
-        again = buffer.has_flags(RETRANSMITTED)
-        if not self.frames.add(packet, now, again=again):
+        retransmitted = buffer.has_flags(RETRANSMITTED)
+        if not self.frames.add(packet, now, retransmitted=retransmitted):
             return Gst.PadProbeReturn.OK
-        if self._asked and again:
-            buffer.unset_flags(RETRANSMITTED)  # the buffer drops those that it has not requested itself
+        if self._tail_requested and retransmitted:
+            buffer.unset_flags(RETRANSMITTED)  # the buffer drops retransmissions that it has not requested itself
         if packet.last:
             self._ends.append((packet.stamp, now))
-        self._asked = False
+        self._tail_requested = False
         return Gst.PadProbeReturn.OK

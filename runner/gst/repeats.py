@@ -1,4 +1,4 @@
-"""Recognises by content a source that repeats its last picture as new: a camera that hangs behind a working driver."""
+"""Detects by content a source that repeats its last picture as new: a camera that hangs behind a working driver."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from runner.gst.caps import structure
 from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.gst.outage import Outage
 
-SLICES, SLICE_BYTES = 16, 8192  # of a picture that are compared: the noise of a sensor is everywhere
-LOOKS = 4  # at which a picture is the same before it counts as repeated
+SLICES, SLICE_BYTES = 16, 8192  # compared parts of a picture: sensor noise is everywhere
+CHECKS = 4  # consecutive identical checks before a picture counts as repeated
 
 
-class RepeatedPicture:
-    """Compares parts of one picture in many: no Python runs for the others.
+class RepeatDetector:
+    """Compares parts of sampled pictures; no Python runs for the others.
 
-    pad        where raw pictures pass; others, and those outside the main memory, are not compared
-    after_s    for how long a picture has to be repeated; None: pictures are not compared
+    pad        where raw pictures pass; encoded ones, and those outside main memory, are not compared
+    after_s    how long a picture must repeat; None: pictures are not compared
     on_report  called with a sentence when repetition begins, and when it ends
     """
 
@@ -29,10 +29,10 @@ class RepeatedPicture:
         self._next = OneShot(pad, self._on_picture)
         self.outage = Outage(on_report)
         self._digest: int | None = None
-        self._since, self._looks = 0.0, 0
+        self._since, self._checks = 0.0, 0
 
-    def look(self) -> None:
-        """Request a look at the next picture; to be called a few times a second, from one thread."""
+    def check_next(self) -> None:
+        """Check the next picture; to be called a few times a second, from one thread."""
         if self._after_s is not None:
             self._next.arm()
 
@@ -42,12 +42,12 @@ class RepeatedPicture:
             return True
         digest = _digest(picture)
         if digest != self._digest:
-            self._digest, self._since, self._looks = digest, now, 1
-            self.outage.over(now)
+            self._digest, self._since, self._checks = digest, now, 1
+            self.outage.report_recovery(now)
         else:
-            self._looks += 1
-            if now - self._since >= (self._after_s or 0.0) and self._looks >= LOOKS:
-                self.outage.failed("source: repeats the same picture", self._since)
+            self._checks += 1
+            if now - self._since >= (self._after_s or 0.0) and self._checks >= CHECKS:
+                self.outage.report_failure("source: repeats the same picture", self._since)
         return True
 
 

@@ -1,7 +1,7 @@
 """Encryption and authentication of the streams: RTSP over TLS with SRTP, SRT with a passphrase.
 
-Peers are checked here and not by GLib: it knows no revocation lists, and a vehicle is known by its name, not by the
-address at which it happens to be reached.
+Peers are checked here and not by GLib, which does not support revocation lists. A vehicle is identified by its name,
+not by the address at which it is reached.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
 from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, rtsp_password, srt_passphrase
 
-VIEWER = "viewer"  # the role of the server library that may open and watch a camera
+VIEWER = "viewer"  # role in the server library that may open and watch a camera
 
 
 class PeerCheck:
-    """Decides which certificates are accepted: the authority's, in their term, and not revoked.
+    """Decides which certificates are accepted: issued by the authority, within their validity, and not revoked.
 
-    on_report  called with what is wrong with a new revocation list
+    on_report  called with the problem of a new revocation list
     """
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
@@ -31,16 +31,16 @@ class PeerCheck:
         self._revoked = keyring.watched_revoked(on_report)
 
     def verify(self, certificate: Gio.TlsCertificate | None) -> Holder | str:
-        """Whose certificate a new connection presents, or why it is not accepted."""
+        """The holder of the certificate that a new connection presents, or why it is not accepted."""
         if certificate is None:
             return "it has no certificate"
-        if wrong := certificate.verify(None, self._authority):
-            reasons = [nick for nick in wrong.value_nicks if nick != "no-flags"]
+        if errors := certificate.verify(None, self._authority):
+            reasons = [nick for nick in errors.value_nicks if nick != "no-flags"]
             return f"its certificate is not accepted: {', '.join(reasons)}"
         return self.holder(certificate)
 
     def holder(self, certificate: Gio.TlsCertificate) -> Holder | str:
-        """Whose certificate an open connection has, or why it must end; no longer whether it is in its term."""
+        """The holder of an open connection's certificate, or why it must end; expiry is not checked again."""
         read = x509.load_der_x509_certificate(bytes(certificate.props.certificate))
         if read.serial_number in self._revoked.get():
             return "its certificate is revoked"
@@ -66,7 +66,7 @@ class _Certificate(Gio.TlsInteraction):  # type: ignore[misc]
 
 
 def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
-    """raises RunError for files that do not fit together"""
+    """raises RunError if certificate and key do not match"""
     try:
         return Gio.TlsCertificate.new_from_files(str(keyring.certificate), str(keyring.key))
     except GLib.Error as error:
@@ -74,7 +74,7 @@ def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
 
 
 class StreamLogin:
-    """How an operator's receivers prove who they are, and know the vehicle.
+    """Mutual authentication of an operator's receivers and the vehicle.
 
     vehicle  its name
     """
@@ -82,12 +82,12 @@ class StreamLogin:
     def __init__(self, keyring: Keyring, vehicle: str, on_report: Callable[[str], None]) -> None:
         self._keyring, self._vehicle, self._expected = keyring, vehicle, Holder(vehicle, Role.VEHICLE)
         self._check = PeerCheck(keyring, on_report)
-        self._last: Gio.TlsCertificate | None = None  # that was accepted
+        self._accepted: Gio.TlsCertificate | None = None  # the last one
 
     def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> str | None:
-        """Set up a new pipeline and its client with the keys of now.
+        """Set up a new pipeline and its client with the current keys.
 
-        returns  why it cannot connect, as while new files are being copied; None if it can
+        returns  why it cannot connect, for example while new files are being copied; None if it can
         """
         try:
             if client.find_property("tls-interaction"):
@@ -101,29 +101,29 @@ class StreamLogin:
     def _prepare_rtsp(self, client: Gst.Element) -> None:
         keyring = self._keyring
         client.set_property("tls-interaction", _Certificate(own_certificate(keyring)))
-        # Nobody else's certificate is signed by this one: none is accepted without the signal.
+        # No certificate is signed by this one, so the signal decides about all of them.
         client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate.absolute())))
         client.set_property("user-id", keyring.holder.name)
         client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
         client.connect("accept-certificate", self._accept)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
-        self._last = certificate if self._check.verify(certificate) == self._expected else None
-        return self._last is not None
+        self._accepted = certificate if self._check.verify(certificate) == self._expected else None
+        return self._accepted is not None
 
     def is_withdrawn(self) -> bool:
         """Whether the certificate that the vehicle uses has been revoked."""
-        return self._last is not None and isinstance(self._check.holder(self._last), str)
+        return self._accepted is not None and isinstance(self._check.holder(self._accepted), str)
 
 
 class ViewerCheck:
-    """Who may watch: holders of an accepted certificate, with the password of the user that it names."""
+    """Decides who may watch: holders of an accepted certificate, with the password of the user that it names."""
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
         self._check = PeerCheck(keyring, on_report)
         self._people = keyring.watched_people(on_report)
         self._on_report = on_report
-        self._known: Mapping[str, str] = {}  # passwords given to the library, by user
+        self._known: Mapping[str, str] = {}  # by user, the password given to the library
         self._own, self._used = keyring.watched_certificate(on_report), b""
         self._keyring = keyring
         self.auth = GstRtspServer.RTSPAuth()
@@ -136,9 +136,9 @@ class ViewerCheck:
         self.refresh()
 
     def refresh(self) -> None:
-        """Let the library know the certificate and the users of now.
+        """Give the library the current certificate and users.
 
-        raises  RunError for a certificate and a key that do not fit together
+        raises  RunError if certificate and key do not match
         """
         if self._used != (own := self._own.get()):
             self.auth.set_tls_certificate(own_certificate(self._keyring))
@@ -154,7 +154,7 @@ class ViewerCheck:
         self._known = people
 
     def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
-        """The holder of a client's certificate; None if it may not watch any more."""
+        """The holder of a client's certificate; None if it may no longer watch."""
         connection = client.get_connection()  # None once it is closed
         tls = connection.get_tls() if connection else None
         certificate = tls.get_peer_certificate() if tls else None

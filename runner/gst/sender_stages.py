@@ -1,4 +1,4 @@
-"""How long a picture takes on the vehicle: from its capture into the encoder, and through it."""
+"""Latency of a picture on the vehicle: from its capture to the encoder, and through the encoder."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from runner.gst.clocks import captured_at
 from runner.gst.one_shot import OneShot, PassingBuffer
 from runner.system.recent import RecentValue
 
-SAME_S = 1e-4  # capture times of the same picture on both sides of the encoder differ by less
-PATIENCE = 100  # pictures that leave the encoder before the one that was awaited is given up
+SAME_S = 1e-4  # capture times of the same picture before and after the encoder differ by less
+MAX_PICTURES = 100  # pictures that leave the encoder before the awaited one is given up
 
 
 class SenderStages(NamedTuple):
-    """Of one picture, ms. capture: to the encoder's input, with conversion, cropping and scaling."""
+    """Latencies of one picture, ms. capture: to the encoder's input, including conversion, cropping and scaling."""
 
     capture_ms: float
     encode_ms: float
 
 
 class EncoderWatch:
-    """Measures one picture in many as it enters and leaves the encoder: no Python runs for the others.
+    """Measures sampled pictures as they enter and leave the encoder; no Python runs for the others.
 
-    elements  of the pipeline from gate to payloader; without an encoder among them nothing is measured
+    elements  of the pipeline from gate to payloader; nothing is measured unless one is an encoder
     """
 
     def __init__(self, elements: Iterable[Gst.Element]) -> None:
         encoder = next((element for element in elements if _is_encoder(element)), None)
         self._into = OneShot(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
         self._out = OneShot(encoder.get_static_pad("src"), self._on_coded) if encoder else None
-        self._left = 0
+        self._remaining = 0
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
         self._measured = RecentValue[SenderStages]()
 
     def take(self) -> SenderStages | None:
-        """The last figures, if they are recent; requests those of the next picture.
+        """The latest measurement, if recent; starts one of the next picture.
 
         To be called a few times a second, from one thread.
         """
@@ -49,7 +49,7 @@ class EncoderWatch:
     def _on_raw(self, pad: Gst.Pad, picture: PassingBuffer) -> bool:
         if picture.pts is None:
             return False
-        captured, self._left = captured_at(pad, picture.pts), PATIENCE
+        captured, self._remaining = captured_at(pad, picture.pts), MAX_PICTURES
         self._entered = (captured, 1000 * (time.time() - captured))
         assert self._out
         self._out.arm()
@@ -59,10 +59,10 @@ class EncoderWatch:
         now = time.time()
         captured, capture_ms = self._entered
         ahead_s = captured_at(pad, picture.pts or 0) - captured
-        self._left -= 1
-        if ahead_s < -SAME_S and self._left:
-            return False  # one that the encoder took earlier
-        if abs(ahead_s) < SAME_S:  # else the encoder has dropped the picture
+        self._remaining -= 1
+        if ahead_s < -SAME_S and self._remaining:
+            return False  # an earlier picture
+        if abs(ahead_s) < SAME_S:  # otherwise the encoder has dropped the picture
             self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
         return True
 

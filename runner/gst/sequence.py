@@ -1,4 +1,4 @@
-"""Format of a clip, read before anything is measured on it."""
+"""Reads the format of a clip before it is measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runner.gst.caps import structure
 from runner.system.files import file_problem
 
 TIMEOUT_S = 20
-# Caps of codecs that keep every sample, as far as caps alone show it.
+# Caps of lossless codecs, as far as caps alone show it.
 LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", "video/x-utvideo", "image/png")
 
 

@@ -1,7 +1,7 @@
 """The vehicle's RTSP server: one shared factory per camera, its settings rewritten whenever its pipeline is rebuilt.
 
-The server library runs each client in its own thread, so that one that waits does not delay the others. Its callbacks
-arrive from any of these threads, and all shared state is behind one lock.
+The server library runs each client in its own thread, so that a waiting client does not delay the others. Its
+callbacks run in any of these threads, and one lock guards all shared state.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 
-OPEN_S = 0.9  # a camera that has delivered nothing by then is answered 503; it continues to open for a later request
-HELD_S = 5.0  # how long an open camera waits for a later request
+OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
+HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
-GONE_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
-BACKLOG = 128  # connections that wait to be accepted; beyond the library's 5, a viewer's would be tried again after 1 s
-# Handshakes of TLS wait in a pool of ten threads, to which GLib adds slowly. Of clients that have made no request yet,
-# those are dropped that have been connected for so long; earlier if there are more of them than CROWD.
+TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
+BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
+# TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client without a request is dropped after
+# FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
-BLOCKED_S = 0.4  # a camera that sends nothing for that long, and three frame intervals, although it should
-LEFT_S = 10.0  # how long a camera that a viewer has left is looked after
+BLOCKED_S = 0.4  # a camera that should send but does not for this long and three frame intervals is blocked
+LEFT_S = 10.0  # how long a camera is monitored after a viewer has left
 SESSIONS_EVERY_S = 1.0
-GIVE_BACK_S = 10.0  # between two times that memory of ended pipelines, and of encoders of other sizes, is given back
+GIVE_BACK_S = 10.0  # interval at which memory of ended pipelines and of replaced encoders is returned to the system
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
 OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.OK,
@@ -56,7 +56,7 @@ OK, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
 )
 
-FAILS = "handle-message::error"  # of a media
+MEDIA_ERROR = "handle-message::error"  # signal of a media
 
 # From 1.24 on a factory returns its media locked. The same change of the library added this method.
 CONSTRUCTS_LOCKED = hasattr(GstRtspServer.RTSPMedia, "can_be_shared")
@@ -66,13 +66,13 @@ class _Stage(Enum):
     """State of a camera's pipeline."""
 
     NONE = auto()
-    BUILT = auto()  # but has delivered nothing yet
+    BUILT = auto()  # has delivered nothing yet
     OPEN = auto()
     ENDING = auto()
 
 
 class _Factory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
-    """A camera's factory. It has one media for every URL of the camera: another port, a trailing slash or a query."""
+    """A camera's factory, with one media for all URLs of the camera: another port, a trailing slash or a query."""
 
     def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
         return "media"
@@ -90,7 +90,7 @@ class _Opening:
 
 
 class _Camera:
-    """One mount point and its pipeline, if there is one."""
+    """One mount point and its pipeline, if built."""
 
     def __init__(self, plan: Plan, factory: _Factory, url: str) -> None:
         self.plan, self.factory = plan, factory
@@ -98,7 +98,7 @@ class _Camera:
         self.url = GstRtsp.RTSPUrl.parse(url)[1]
         self.media: GstRtspServer.RTSPMedia | None = None
         self.stage = _Stage.NONE
-        self.prepared = False  # the library has seen it deliver
+        self.prepared = False  # the library has received data from it
         self.bus: Gst.Bus | None = None
         self.opening: _Opening | None = None
 
@@ -112,7 +112,7 @@ class CameraServer:
 
     build      makes a `CameraPipeline` from each new pipeline
     on_report  called when pipelines start and stop, and when viewers are disconnected
-    keyring    of this vehicle; None: anybody may watch, and nothing is encrypted
+    keyring    of this vehicle; None: anyone may watch, and nothing is encrypted
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
@@ -127,7 +127,7 @@ class CameraServer:
     ) -> None:
         check_port_free(media)
         self._viewers: ViewerCheck | None = None
-        self._keys_fault = ""  # as reported
+        self._keys_fault = ""  # the last one reported
         if keyring:
             from runner.gst.secure import ViewerCheck
 
@@ -138,8 +138,8 @@ class CameraServer:
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
-        self._left: dict[str, float] = {}  # cameras that a viewer has left, and until when they are looked after
-        self._moved: dict[str, tuple[int, float]] = {}  # by such a camera, its frames, and since when it is so many
+        self._left: dict[str, float] = {}  # cameras that a viewer has left, and until when they are monitored
+        self._progress: dict[str, tuple[int, float]] = {}  # by such a camera, frame count and when it last changed
         self._stopped = threading.Event()
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(media.host)
@@ -164,8 +164,8 @@ class CameraServer:
     def stop(self) -> None:
         """Accept no more clients, and end every connection in its own thread.
 
-        `client_filter` would close them from this thread. In the middle of a request, the library (1.22) then reads
-        without end from a stream that no longer exists.
+        `client_filter` would close them from this thread. During a request, the library (1.22) then reads forever from
+        a stream that no longer exists.
         """
         self._stopped.set()
         GLib.source_remove(self._watch)
@@ -213,10 +213,10 @@ class CameraServer:
         with self._changed:
             camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
             self.pipelines[camera.name] = built
-        media.connect(FAILS, _on_failing, camera)
+        media.connect(MEDIA_ERROR, _on_media_error, camera)
         media.connect("prepared", self._on_prepared, camera)
         media.connect("target-state", self._on_target_state, camera)
-        # After the factory's own handler, which forgets the media: only then is another one built.
+        # After the factory's own handler, which drops the media: only then is another one built.
         media.connect_after("unprepared", self._on_unprepared, camera, built)
         self._on_report(camera.name, "pipeline built")
 
@@ -246,30 +246,30 @@ class CameraServer:
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
-            return  # this ends the file, not the stream
+            return  # only the file ends, not the stream
         self._on_report(camera.name, message.parse_error()[0].message)
         with self._changed:
             if camera.bus is bus:
                 camera.stage = _Stage.ENDING
-            concerned = [c for c in self._connections.values() if camera.name in (c.described, *c.cameras)]
-        # The library ends the pipeline when the last of them has left; until then no other is admitted.
-        for connection in concerned:
+            affected = [c for c in self._connections.values() if camera.name in (c.described, *c.cameras)]
+        # The library ends the pipeline when the last of them has left; until then no new viewer is admitted.
+        for connection in affected:
             connection.close()
 
     def _hold(self, client: GstRtspServer.RTSPClient, camera: _Camera) -> bool:
         """Keep a camera open for a client until its DESCRIBE is answered; False if it delivers nothing within OPEN_S.
 
         The library would open it in the client's thread and answer only after 20 s. Here it is opened in a separate
-        thread, so that a camera that is slow to start is open when the client asks again.
+        thread, so that a camera that is slow to start is open when the client retries.
         """
-        end = time.monotonic() + OPEN_S
+        deadline = time.monotonic() + OPEN_S
         while True:
             with self._changed:
                 if not camera.is_open and camera.opening is None:
                     camera.opening = _Opening()
                     threading.Thread(target=self._open, args=(camera, camera.opening), daemon=True).start()
                 opening = camera.opening
-                left = max(0.0, end - time.monotonic())
+                left = max(0.0, deadline - time.monotonic())
                 self._changed.wait_for(lambda o=opening: self._is_settled(camera, o), left)  # type: ignore[misc]
                 media = camera.media if camera.is_open else None
             if media is not None and media.prepare(None):
@@ -278,12 +278,12 @@ class CameraServer:
                 if opening:
                     opening.held.set()
                 return True
-            if (opening and opening.failed) or self._stopped.is_set() or time.monotonic() >= end:
+            if (opening and opening.failed) or self._stopped.is_set() or time.monotonic() >= deadline:
                 return False
             # Otherwise its last viewer has just left, and it is ending.
 
     def _is_settled(self, camera: _Camera, opening: _Opening | None) -> bool:
-        """Whether waiting for a camera to open makes no difference any more."""
+        """Whether waiting for a camera to open is over."""
         return camera.is_open or opening is None or opening.over or self._stopped.is_set()
 
     def _release(self, wanted: Callable[[float, GstRtspServer.RTSPClient], bool]) -> None:
@@ -298,7 +298,7 @@ class CameraServer:
         """Build a camera's pipeline, wait until it delivers, and keep it until a client holds it."""
         try:
             with self._changed:
-                self._changed.wait_for(lambda: camera.stage is not _Stage.ENDING, GONE_S)
+                self._changed.wait_for(lambda: camera.stage is not _Stage.ENDING, TEARDOWN_S)
             thread = self._threads.get_thread(GstRtspServer.RTSPThreadType.MEDIA, GstRtspServer.RTSPContext())
             media = camera.factory.construct(camera.url)
             if media is not None and CONSTRUCTS_LOCKED:
@@ -318,7 +318,7 @@ class CameraServer:
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
         try:
             connection = RtspConnection(client, self._media.session_timeout_s)
-        except OSError:  # the client is gone already, or there are no descriptors left: it may not watch
+        except OSError:  # the client has already disconnected, or there are no descriptors left: it may not watch
             return
         with self._changed:
             self._connections[client] = connection
@@ -340,7 +340,7 @@ class CameraServer:
             connection = self._connections.pop(client, None)
             if connection:
                 self._note_left(connection.cameras)
-                connection.forget()
+                connection.release()
                 self._changed.notify_all()
 
     def _on_session(self, _client: object, session: GstRtspServer.RTSPSession) -> None:
@@ -356,7 +356,7 @@ class CameraServer:
     ) -> GstRtsp.RTSPStatusCode:
         camera = self._cameras.get(_path(context))
         if camera is None:
-            return OK  # which the library answers with 404
+            return OK  # the library answers 404
         if _has_query(context):
             self._redirect(client, context)
             return MOVED
@@ -386,20 +386,20 @@ class CameraServer:
         """Admit a viewer, or refuse it if its copy of the stream would overload the uplink."""
         camera = next((c for c in self._cameras.values() if c.media is context.media), None)
         with self._changed:
-            newcomer = self._connections.get(client)
-            if camera is None or newcomer is None or not camera.is_open:
+            new_viewer = self._connections.get(client)
+            if camera is None or new_viewer is None or not camera.is_open:
                 return UNAVAILABLE
-            newcomer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
-            if camera.name in newcomer.cameras:
+            new_viewer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
+            if camera.name in new_viewer.cameras:
                 return OK
-            there = [c for c in self._connections.values() if camera.name in c.cameras]
-            leaving = admit([c.viewer for c in there], newcomer.viewer, self._media.max_viewers, self.controller)
+            current = [c for c in self._connections.values() if camera.name in c.cameras]
+            leaving = admit([c.viewer for c in current], new_viewer.viewer, self._media.max_viewers, self.controller)
             if leaving is None:
                 return REFUSED
-            newcomer.cameras[camera.name] = None
-        for connection in there:
+            new_viewer.cameras[camera.name] = None
+        for connection in current:
             if connection.viewer in leaving:
-                self._close(connection, f"the operator in control watches from {newcomer.viewer.address}")
+                self._close(connection, f"the operator in control watches from {new_viewer.viewer.address}")
         return OK
 
     def _on_set_up(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
@@ -414,33 +414,33 @@ class CameraServer:
         self._wake({_camera_name(context)})
 
     def _wake(self, cameras: Iterable[str]) -> None:
-        """Make the library check again which interleaved viewers are ready.
+        """Make the library recheck which interleaved viewers are ready.
 
-        It stops a camera's interleaved stream while none is, and checks again when one of them has accepted data.
-        Nothing makes it check when the viewer that it waits for leaves, or a ready one joins.
+        It stops a camera's interleaved stream while none is ready, and rechecks when one of them has accepted data, but
+        not when the viewer that it waits for leaves or a ready one joins.
         """
         for name in cameras:
             for connection in self._watching(name):
-                transport = connection.cameras.get(name)  # which its client's thread may have left in the meantime
+                transport = connection.cameras.get(name)  # None if its client's thread has meanwhile torn it down
                 if transport:
                     transport.message_sent()
 
     def _unblock(self, name: str, now: float) -> None:
-        """Let a camera stream on after its last interleaved viewer, whose next packet still waits and stops all others.
+        """Unblock a camera whose last interleaved viewer has left: its next packet still waits and blocks all others.
 
-        Only where nothing moves: a packet that the library is about to take must not be taken from it.
+        Only while nothing is sent: a packet that the library is about to send must not be dropped.
         """
         pipeline, watching = self.pipelines.get(name), self._watching(name)
         if not pipeline or not watching or any(connection.interleaved for connection in watching):
-            self._moved.pop(name, None)
+            self._progress.pop(name, None)
             return
         frames, since = pipeline.counters()[0], now
-        if self._moved.get(name, (-1, now))[0] == frames and not (pipeline.paused or pipeline.source_fault):
-            since = self._moved[name][1]
+        if self._progress.get(name, (-1, now))[0] == frames and not (pipeline.paused or pipeline.source_fault):
+            since = self._progress[name][1]
         if now - since > BLOCKED_S + 3 * pipeline.frame_s:
-            pipeline.drop_waiting()
+            pipeline.drop_queued_packet()
             since = now
-        self._moved[name] = (frames, since)
+        self._progress[name] = (frames, since)
 
     def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._connection(client)
@@ -461,7 +461,7 @@ class CameraServer:
             return [connection for connection in self._connections.values() if camera in connection.cameras]
 
     def copies(self) -> dict[str, int]:
-        """By camera, the viewers outside the vehicle; cameras without any are left out. From any thread."""
+        """By camera, the number of viewers outside the vehicle; cameras without any are omitted. From any thread."""
         with self._changed:
             watched = [c.cameras for c in self._connections.values() if over_uplink(c.viewer.address)]
             return dict(Counter(name for cameras in watched for name in tuple(cameras)))
@@ -472,7 +472,7 @@ class CameraServer:
         connection.close()
 
     def _watch_connections(self) -> bool:
-        """Close readers that lag, and connections on which no request is completed."""
+        """Close readers that lag, and connections without a complete request."""
         with self._changed:
             connections = list(self._connections.items())
             lags = {connection: self._lag(connection) for _, connection in connections if connection.interleaved}
@@ -487,7 +487,7 @@ class CameraServer:
             self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
             if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
-                self._close(connection, "its keys are not accepted any more")
+                self._close(connection, "its keys are no longer accepted")
             elif lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
@@ -495,14 +495,14 @@ class CameraServer:
         return True
 
     def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
-        """Close those whose client makes no request, so that others find a thread for their handshake."""
-        silent = [each for connection in connections if (each := (connection.keeps_waiting(now), connection))[0] > 0]
-        for waits_s, connection in silent:
-            if waits_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
+        """Close those whose client makes no request, to free threads for other handshakes."""
+        silent = [each for connection in connections if (each := (connection.unused_s(now), connection))[0] > 0]
+        for idle_s, connection in silent:
+            if idle_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
                 connection.close()
 
     def _refresh_keys(self) -> None:
-        """New files may come one by one."""
+        """Load new key files, which may arrive one by one."""
         assert self._viewers
         try:
             self._viewers.refresh()
@@ -512,8 +512,8 @@ class CameraServer:
             self._keys_fault = str(error)
 
     def _lag(self, connection: RtspConnection) -> float:
-        there = (other for other in self._connections.values() if other is not connection)
-        shared = any(other.cameras.keys() & connection.cameras.keys() for other in there)
+        others = (other for other in self._connections.values() if other is not connection)
+        shared = any(other.cameras.keys() & connection.cameras.keys() for other in others)
         pipelines = [pipeline for name in connection.cameras if (pipeline := self.pipelines.get(name))]
         return connection.lag(sum(pipeline.kbps for pipeline in pipelines), shared)
 
@@ -527,16 +527,16 @@ class CameraServer:
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_back()
                 given_back = time.monotonic()
-            self._keep_silent()
+            self._keep_paused_sessions()
             pool.cleanup()
-            # A DESCRIBE that is refused after all does not release its hold.
+            # A DESCRIBE that is refused later does not release its hold.
             old = time.monotonic() - OPEN_S
             self._release(lambda since, _, old=old: since < old)  # type: ignore[misc]
 
-    def _keep_silent(self) -> None:
+    def _keep_paused_sessions(self) -> None:
         """Keep sessions from expiring on a camera that is paused, or whose source is being replaced.
 
-        Nothing is sent there, and players such as ffmpeg send nothing in return. TCP detects viewers that have left.
+        Nothing is sent then, and players such as ffmpeg send nothing in return. TCP detects viewers that have left.
         """
         with self._changed:
             watching = [(client, list(connection.cameras)) for client, connection in self._connections.items()]
@@ -550,19 +550,19 @@ class CameraServer:
         return pipeline is not None and (pipeline.paused or bool(pipeline.source_fault))
 
 
-def _on_failing(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camera: _Camera) -> bool:
+def _on_media_error(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camera: _Camera) -> bool:
     """Let the library see only errors of a pipeline that is being opened, which then fails.
 
-    Of a later one it (1.22) would not remove the viewers' transports, and leave the stream's elements behind; and it
-    would end a second time what has ended meanwhile.
+    For a later error, it (1.22) would leave the viewers' transports and the stream's elements behind, and end a second
+    time what has ended meanwhile.
     """
     if camera.media is not media or camera.prepared:
-        GObject.signal_stop_emission_by_name(media, FAILS)
+        GObject.signal_stop_emission_by_name(media, MEDIA_ERROR)
     return True
 
 
 def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
-    """With feedback for retransmission, and without for players that do not know it (RFC 4585); as SRTP (RFC 5124)."""
+    """With feedback for retransmission, and without for players that lack it (RFC 4585); as SRTP (RFC 5124)."""
     plain, feedback = (
         (GstRtsp.RTSPProfile.SAVP, GstRtsp.RTSPProfile.SAVPF)
         if secure
@@ -613,8 +613,8 @@ def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:
 def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element) -> None:
     """Configure the elements that the server library adds around a pipeline."""
     if parent is pipeline and element.get_factory().get_name() == "queue":
-        # In front of its sinks, if it has several. One that takes nothing must not block the others. Not limited by
-        # time: the first packet after a pause would seem as old as the pause, and be dropped for the second.
+        # In front of its sinks, if it has several: a sink that accepts nothing must not block the others. Not limited
+        # by time: the first packet after a pause would seem as old as the pause, and be dropped for the second.
         element.set_property("leaky", "downstream")
         element.set_property("max-size-buffers", 0)
         element.set_property("max-size-time", 0)

@@ -1,4 +1,4 @@
-"""Pictures that another process has put into shared memory: pushed into an appsrc without a copy."""
+"""Pushes pictures from another process's shared memory into an appsrc, without a copy."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from runner.system.kernel_clock import ahead_of
 
 
 def push_shared(source: Gst.Element | None, picture: SharedPicture, fps: Fraction) -> bool:
-    """Push a picture with its capture time. Its memory is mapped as it is, and freed with the buffer.
+    """Push a picture with its capture time. Its memory is mapped without a copy, and freed with the buffer.
 
     source   an appsrc; None: it is being replaced
     fps      stated in the caps, Hz
-    returns  False if it was not taken: the picture is older than the pipeline, or nobody is watching
+    returns  False if it was not accepted: the picture is older than the pipeline, or nobody is watching
     """
     clock = source.get_clock() if source else None
-    # Capture times are by CLOCK_MONOTONIC, which a pipeline's clock need not be.
+    # Capture times use CLOCK_MONOTONIC; a pipeline's clock may differ.
     pts = picture.captured - ahead_of(clock.get_time, time.monotonic_ns) - source.get_base_time() if clock else -1  # type: ignore[union-attr]
     if pts < 0:
         os.close(picture.memory)

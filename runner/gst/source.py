@@ -1,4 +1,4 @@
-"""What a source needs beyond its elements: clips that loop without a gap, and correct capture times."""
+"""Makes clips loop without a gap, with correct capture times."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 
 CHECK_MS = 1000
-BEHIND_S = 0.3  # a longer lag of a clip is written off, not caught up
+BEHIND_S = 0.3  # a clip that lags by more skips the lag instead of catching up
 
-# Not by PyGObject: from GStreamer 1.26 on the reference that its own object holds makes a query immutable.
+# Not through PyGObject: from GStreamer 1.26 on, the reference held by its wrapper makes a query immutable.
 _set_latency = ctypes.CDLL("libgstreamer-1.0.so.0").gst_query_set_latency
 _set_latency.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_uint64, ctypes.c_uint64)  # query, live, min, max
 _set_latency.restype = None
@@ -29,7 +29,7 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     _Loop(pace.get_peer(), identity, float(plan.camera.fps))
     _report_no_latency(pace)
     clip = _Pace(identity, float(plan.camera.fps))
-    GLib.timeout_add(CHECK_MS, clip.keep)
+    GLib.timeout_add(CHECK_MS, clip.check)
 
 
 class _Loop:
@@ -37,18 +37,18 @@ class _Loop:
 
     def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
         self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
-        self._begins = True  # the next segment starts a round; it is not the current one with another offset
-        self._round: tuple[int, int] | None = None  # where this round began: running time in ns, frames before it
-        self._sought = self._flushed = False
+        self._starts_round = True  # the next segment starts a round, and is not the current one with another offset
+        self._round: tuple[int, int] | None = None  # start of this round: running time in ns, frames before it
+        self._seek_sent = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
         pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
 
     def _on_early_frame(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """Drop frames from before the first seek, which would otherwise come twice."""
+        """Drop frames from before the first seek, which would otherwise appear twice."""
         if self._flushed:
             return Gst.PadProbeReturn.REMOVE
-        if not self._sought:
-            self._sought = True
+        if not self._seek_sent:
+            self._seek_sent = True
             self._seek(Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT)
         return Gst.PadProbeReturn.DROP
 
@@ -57,26 +57,26 @@ class _Loop:
             case Gst.EventType.FLUSH_START:
                 return Gst.PadProbeReturn.DROP
             case Gst.EventType.FLUSH_STOP:
-                self._flushed = self._begins = True
+                self._flushed = self._starts_round = True
                 return Gst.PadProbeReturn.DROP
-            case Gst.EventType.SEGMENT if self._begins:
-                self._begins = False
-                self._make_room(info.get_event().parse_segment().base)
+            case Gst.EventType.SEGMENT if self._starts_round:
+                self._starts_round = False
+                self._extend_round(info.get_event().parse_segment().base)
             case Gst.EventType.SEGMENT_DONE | Gst.EventType.EOS:
-                self._begins = True
+                self._starts_round = True
                 self._seek(Gst.SeekFlags.SEGMENT)
                 return Gst.PadProbeReturn.DROP
         return Gst.PadProbeReturn.OK
 
-    def _make_room(self, base: int) -> None:
-        """Make a round last as long as its frames.
+    def _extend_round(self, base: int) -> None:
+        """Extend a round to the duration of its frames.
 
-        Demuxers end it at the start of its last frame, so that the next round's first frame coincides with that one.
+        Demuxers end it at the start of its last frame, where the next round's first frame would coincide with it.
         """
         identity = self._identity()
         if identity is None:
             return
-        base -= self._pad.get_offset()  # as stated by the demuxer
+        base -= self._pad.get_offset()  # the demuxer's own value
         frames = identity.get_property("stats").get_value("num-buffers")
         if self._round:
             began, before = self._round
@@ -86,21 +86,21 @@ class _Loop:
 
     def _seek(self, flags: Gst.SeekFlags) -> None:
         event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
-        # Not from the streaming thread, since the seek has to wait for it. A source pad accepts it from downstream.
+        # Not from the streaming thread, which the seek waits for. A source pad accepts it from downstream.
         threading.Thread(target=self._pad.send_event, args=(event,), daemon=True).start()
 
 
 class _Pace:
-    """Writes off the time by which a clip lags, as a camera loses frames.
+    """Skips the time by which a clip lags, as a camera loses frames.
 
-    Otherwise a machine that was overloaded for a while would play overdue frames at full speed, and stay overloaded.
+    Otherwise a machine after an overload would play overdue frames at full speed, and stay overloaded.
     """
 
     def __init__(self, identity: Gst.Element, fps: float) -> None:
         self._identity, self._fps = identity.weak_ref(), fps  # of the element, not of its Python wrapper
-        self._usual: float | None = None  # s between the clock and the frames released so far
+        self._base_lag: float | None = None  # s by which frames lag behind the clock without overload
 
-    def keep(self) -> bool:
+    def check(self) -> bool:
         """Once a second; ends with the pipeline."""
         identity = self._identity()
         if identity is None:
@@ -110,12 +110,12 @@ class _Pace:
         if identity.get_state(0).state != Gst.State.PLAYING or clock is None or not frames:
             return True
         behind = (clock.get_time() - identity.get_base_time()) / Gst.SECOND - frames / self._fps
-        if self._usual is None or behind < self._usual:
-            self._usual = behind
-        elif behind > self._usual + BEHIND_S:
-            lost = int((behind - self._usual) * Gst.SECOND)
+        if self._base_lag is None or behind < self._base_lag:
+            self._base_lag = behind
+        elif behind > self._base_lag + BEHIND_S:
+            lost = int((behind - self._base_lag) * Gst.SECOND)
             pad.get_peer().set_offset(pad.get_peer().get_offset() + lost)
-            self._usual = behind
+            self._base_lag = behind
         return True
 
 
@@ -126,7 +126,7 @@ def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:
 
 
 def _report_no_latency(pad: Gst.Pad) -> None:
-    """A frame of a clip counts as captured when it is released: decoding ahead of time is not latency."""
+    """Count a frame of a clip as captured when it is released: decoding ahead of time is not latency."""
 
     def on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         if info.get_query().type != Gst.QueryType.LATENCY:

@@ -1,4 +1,4 @@
-"""Presentation times as an MPEG-TS file states them. GStreamer's demuxer shortens gaps, taken for a new clock."""
+"""Presentation times stored in an MPEG-TS file. GStreamer's demuxer mistakes gaps for a new clock and shortens them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SECOND_NS, SAME_NS = 1_000_000_000, 1_000_000
 
 
 def stream_times(path: Path) -> list[int]:
-    """Presentation times of all video units of a file, in their order, ns since the first; empty if it is not MPEG-TS.
+    """Presentation times of all video units of a file, in order, ns since the first; empty if it is not MPEG-TS.
 
     raises  OSError
     """
@@ -42,7 +42,7 @@ def _time(packet: bytes) -> int | None:
 
 
 class RestoredTimes:
-    """Times of units as their file states them, found by the demuxer's, which are right but for gaps.
+    """Maps the demuxer's times, which are right except for gaps, to those stored in the file.
 
     stated  `stream_times`
     """
@@ -51,7 +51,7 @@ class RestoredTimes:
         self._stated, self._at, self._demuxed = stated, 0, 0
 
     def next(self, demuxed: int) -> int:
-        """The time of a unit that the demuxer gives so many ns after the first one."""
+        """The stored time of a unit that the demuxer places `demuxed` ns after the first one."""
         if demuxed == 0 or not self._stated:
             return demuxed
         wanted = self._stated[self._at] + demuxed - self._demuxed

@@ -10,23 +10,23 @@ from typing import Any
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
-from runner.gst.aside import HUNG, set_state_aside
+from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline, encrypt
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
-STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to end, whose port it needs
-STOPPING_MS = 20  # how often it looks
+STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to release its port
+STOPPING_MS = 20  # how often it checks
 WATCH_MS = 250  # how often a caller's acknowledgements are counted
-UNANSWERED_S = 1.5  # packets that nobody acknowledges for so long go nowhere; SRT itself takes 5 s to see it
-PATIENCE_S = 5.0  # the other side may start later: a waiting side reports nothing for this long
+UNACKNOWLEDGED_S = 1.5  # without an acknowledgement for this long, packets are not delivered; SRT itself needs 5 s
+PATIENCE_S = 5.0  # the other side may start later: until then a waiting side reports nothing
 
 
 class SupervisedPipeline:
     """A pipeline that is torn down and rebuilt when it fails or ends; it is never repaired in place.
 
-    All methods are called in the thread of GLib's main loop. State changes run in separate threads: an element that
-    deadlocks does not delay the others.
+    All methods are called in the thread of GLib's main loop. State changes run in separate threads, so that an element
+    that deadlocks does not delay the others.
 
     on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
     on_report  called once with each reason, until the pipeline works again
@@ -41,8 +41,8 @@ class SupervisedPipeline:
         self._change: threading.Thread | None = None  # the last state change of the last pipeline
         self._retry = 0
         self._attempt = 0
-        self._begun = self._ended = time.monotonic()  # of the last attempt, its start and its end
-        self._lost = self._begun  # since when nothing has worked
+        self._begun = self._ended = time.monotonic()  # start and end of the last attempt
+        self._lost = self._begun  # when a pipeline last worked
         self._works = self._worked = False  # this pipeline, any pipeline
         self._outage = Outage(on_report)
         self.rebuilt = 0
@@ -59,7 +59,7 @@ class SupervisedPipeline:
         bus.connect("message::error", self._on_failed)
         bus.connect("message::eos", self._on_failed)
         self._on_built(pipeline).add_probe(Gst.PadProbeType.BUFFER, self._on_first_buffer, self._attempt)
-        self._change = set_state_aside(pipeline, Gst.State.PLAYING)
+        self._change = set_state_in_thread(pipeline, Gst.State.PLAYING)
 
     def stop(self) -> None:
         if self._retry:
@@ -67,7 +67,9 @@ class SupervisedPipeline:
             self._retry = 0
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
-            self._change = set_state_aside(self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change)
+            self._change = set_state_in_thread(
+                self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change
+            )
             self._pipeline = None
 
     def restart(self, why: str) -> None:
@@ -79,13 +81,13 @@ class SupervisedPipeline:
             self.rebuilt += 1
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
-            self._outage.failed(why, self._lost)
+            self._outage.report_failure(why, self._lost)
         self.stop()
-        self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._again)
+        self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._retry_start)
 
-    def _again(self) -> bool:
+    def _retry_start(self) -> bool:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
-            self._retry = GLib.timeout_add(STOPPING_MS, self._again)
+            self._retry = GLib.timeout_add(STOPPING_MS, self._retry_start)
             return False
         self._retry = 0
         self.start()
@@ -103,33 +105,33 @@ class SupervisedPipeline:
     def _on_working(self, attempt: int) -> bool:
         if attempt == self._attempt and self._pipeline is not None:
             self._works = self._worked = True
-            self._outage.over(time.monotonic())
+            self._outage.report_recovery(time.monotonic())
         return False
 
 
-class _Acknowledged:
-    """Whether what a caller sends is acknowledged, by the statistics of an SRT element; any other is not watched.
+class _AcknowledgementWatch:
+    """Checks the statistics of an SRT caller for acknowledgements; other elements are not watched.
 
-    When the vehicle's address changes, or what a NAT has mapped it to, the peer drops the packets of a connection that
-    SRT (1.5) takes for alive until sixteen timers of 0.3 s have expired, whatever `peeridletimeo` says.
+    When the vehicle's address or its NAT mapping changes, the peer drops the packets, but SRT (1.5) considers the
+    connection alive until sixteen timers of 0.3 s have expired, whatever `peeridletimeo` says.
     """
 
     def __init__(self, element: Gst.Element) -> None:
         self._element = element
         self._watched = element.find_property("stats") is not None
-        self._answers = self._answered = 0  # acknowledgements, and packets that had been sent when the last one came
-        self._since = time.monotonic()  # the last acknowledgement, or the last time there was nothing to acknowledge
+        self._acks = self._sent = 0  # acknowledgements, and packets sent when the last one arrived
+        self._since = time.monotonic()  # time of the last acknowledgement, or when there was nothing to acknowledge
 
-    def is_missing(self, now: float) -> bool:
-        """Whether packets went out and none was acknowledged for UNANSWERED_S; a few times a second."""
-        sent, answers = self._counts()
-        if answers != self._answers or sent <= self._answered:
-            self._answers, self._answered, self._since = answers, sent, now
-        return now - self._since > UNANSWERED_S
+    def are_missing(self, now: float) -> bool:
+        """Whether packets were sent and none was acknowledged for UNACKNOWLEDGED_S; a few times a second."""
+        sent, acks = self._counts()
+        if acks != self._acks or sent <= self._sent:
+            self._acks, self._sent, self._since = acks, sent, now
+        return now - self._since > UNACKNOWLEDGED_S
 
     def _counts(self) -> tuple[int, int]:
         stats = self._element.get_property("stats") if self._watched else None
-        if stats is None or not stats.has_field("packet-ack-received"):  # it has no connection yet
+        if stats is None or not stats.has_field("packet-ack-received"):  # not connected yet
             return 0, 0
         return stats.get_value("packets-sent"), stats.get_value("packet-ack-received")
 
@@ -151,16 +153,16 @@ class CameraCaller:
 
     def start(self) -> None:
         self._supervised.start()
-        self._watch = GLib.timeout_add(WATCH_MS, self._look)
+        self._watch = GLib.timeout_add(WATCH_MS, self._check_acknowledgements)
 
     def stop(self) -> None:
         GLib.source_remove(self._watch)
         self.pipeline = None
         self._supervised.stop()
 
-    def _look(self) -> bool:
-        if self._acknowledged.is_missing(time.monotonic()):
-            self._supervised.restart(f"nothing was acknowledged for {UNANSWERED_S:g} s")
+    def _check_acknowledgements(self) -> bool:
+        if self._acknowledgements.are_missing(time.monotonic()):
+            self._supervised.restart(f"nothing was acknowledged for {UNACKNOWLEDGED_S:g} s")
         return True
 
     def _on_built(self, pipeline: Any) -> Gst.Pad:
@@ -168,5 +170,5 @@ class CameraCaller:
             encrypt(pipeline, self._passphrase)
         self.pipeline = self._build(pipeline, self._plan)
         caller = pipeline.get_by_name(self._plan.vehicle[-1].name)
-        self._acknowledged = _Acknowledged(caller)
+        self._acknowledgements = _AcknowledgementWatch(caller)
         return caller.get_static_pad("sink")

@@ -12,7 +12,7 @@ from pathlib import Path
 from gi.repository import Gst
 
 DIRECTORY = "video"  # below the drive's directory
-SHIFT_S = 0.0005  # by which times of the file may be off
+SHIFT_S = 0.0005  # tolerance for times in the file
 NO_TIME: int = Gst.CLOCK_TIME_NONE  # the largest number
 _MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
@@ -21,9 +21,9 @@ Captured = Callable[[Gst.Pad, Gst.Buffer], float | None]  # when a frame was cap
 
 @dataclass(frozen=True, slots=True)
 class VideoFiles:
-    """Where the video of the cameras is kept.
+    """Where the video of the cameras is stored.
 
-    directory  the drive's; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counts the pipelines with a frame
+    directory  of the drive; the files are DIRECTORY/video/CAMERA.SIDE.N.ts, N counts the pipelines with a frame
     on_video   called when a file has its first frame, from another thread: camera, name of the file relative to the
                directory, capture time of that frame in s since 1970
     on_shift   called when the offset between capture times and times in the file changes at a frame: camera, name of
@@ -51,10 +51,10 @@ class VideoFile:
     ) -> None:
         self._files, self._camera, self._side = files, camera, side
         self._captured, self._on_report = captured, on_report
-        self._came: dict[int, float] = {}  # until the file begins, by stream time, ns: the capture time
+        self._capture_times: dict[int, float] = {}  # by stream time, ns, until the file begins
         self._file, self._first = "", 0  # its name, and the stream time of its first frame
-        self._ahead = 0.0  # s since 1970, of capture times over times in the file
-        self._begun = self._failed = self._late = False
+        self._ahead = 0.0  # s by which capture times exceed times in the file
+        self._begun = self._failed = self._overran = False
 
     def follow(self, pipeline: Gst.Bin) -> None:
         """Watch a newly built pipeline of a plan with `video`."""
@@ -72,7 +72,7 @@ class VideoFile:
         buffer = info.get_buffer()
         captured = self._captured(pad, buffer)
         if not self._begun:
-            self._came[buffer.pts] = time.time() if captured is None else captured
+            self._capture_times[buffer.pts] = time.time() if captured is None else captured
         elif captured is not None and self._file and not self._failed and self._first <= buffer.pts < NO_TIME:
             after_s = (buffer.pts - self._first) / Gst.SECOND
             if abs(captured - after_s - self._ahead) > SHIFT_S:
@@ -84,8 +84,8 @@ class VideoFile:
         """From the queue's thread: open the file, just before its first frame."""
         self._begun = True
         first = info.get_buffer().pts
-        captured = self._came.get(first) or max(self._came.values(), default=time.time())
-        self._came.clear()
+        captured = self._capture_times.get(first) or max(self._capture_times.values(), default=time.time())
+        self._capture_times.clear()
         parts = pad.get_parent_element().get_parent()
         try:
             path = _new_file(self._files.directory / DIRECTORY, self._camera, self._side)
@@ -95,23 +95,23 @@ class VideoFile:
         sink = parts.get_by_name(f"{_MARK}file")
         sink.set_property("location", str(path))
         sink.set_locked_state(False)
-        if sink.sync_state_with_parent():  # otherwise an error was posted
+        if sink.sync_state_with_parent():  # otherwise it has posted an error
             self._file, self._first = str(path.relative_to(self._files.directory)), first
             self._ahead = captured
             self._files.on_video(self._camera, self._file, captured)
         return Gst.PadProbeReturn.REMOVE
 
     def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:
-        """From any thread, before the pipeline receives it."""
+        """From any thread, before the pipeline handles it."""
         if message.type != Gst.MessageType.ERROR or not concerns_file(message):
             return Gst.BusSyncReply.PASS
-        # A bin that fails to start resets all its elements, locked ones too, and a file without a name refuses that.
+        # A bin that fails to start resets all elements, even locked ones; a file sink without a name then fails.
         if self._begun or message.src.get_name() != f"{_MARK}file":
             self._fail(message.src.get_parent(), message.parse_error()[0].message)
         return Gst.BusSyncReply.DROP
 
     def _fail(self, parts: Gst.Bin, why: str) -> None:
-        """Close the gate. It discards all further frames, and also hides the failure of the frame in flight."""
+        """Close the gate, which discards all further frames and hides the failure of the frame in flight."""
         parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
         if not self._failed:
             self._failed = True
@@ -120,8 +120,8 @@ class VideoFile:
     def _on_overrun(self, queue: Gst.Element) -> None:
         """From the stream's thread, when the queue is full for the first time."""
         queue.set_property("silent", True)  # once is enough
-        if not (self._late or self._failed):
-            self._late = True
+        if not (self._overran or self._failed):
+            self._overran = True
             self._on_report(self._camera, "the disk is too slow: frames are missing in the video file")
 
 
@@ -152,10 +152,10 @@ def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     Otherwise an encoder would choose the format that the file prefers, and the sink of the stream would hold packets
     back until the slowest branch is ready.
     """
-    asked = info.get_query().type
-    if asked == Gst.QueryType.CAPS:
+    query = info.get_query().type
+    if query == Gst.QueryType.CAPS:
         return Gst.PadProbeReturn.DROP  # without an answer the element assumes no limit
-    if asked == Gst.QueryType.LATENCY:
+    if query == Gst.QueryType.LATENCY:
         return Gst.PadProbeReturn.HANDLED  # answered unchanged: no latency
     return Gst.PadProbeReturn.OK
 

@@ -39,7 +39,7 @@ class Unit(NamedTuple):
 def read_video(path: Path) -> Iterator[Unit]:
     """Yield all readable units, in order.
 
-    raises  RunError if the path names no file or the file is damaged; units already yielded stay valid
+    raises  RunError if there is no such file or it is damaged; units already yielded stay valid
     """
     if not path.is_file():
         raise RunError(f"{path}: {file_problem(path)}")
@@ -61,7 +61,7 @@ def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     """The demuxer has found the stream: insert the parser for its codec before the sink. Not called per frame."""
     codec = structure(pad.get_current_caps()).get_name().removeprefix("video/x-")
     if codec not in _PARSED or out.get_static_pad("sink").is_linked():
-        return  # the waiting consumer gets no units
+        return  # no units are output
     parse = Gst.parse_bin_from_description(_PARSED[codec], True)
     out.get_parent().add(parse)
     parse.link(out)

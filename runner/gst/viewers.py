@@ -1,6 +1,6 @@
-"""Who may watch a camera over the uplink: each copy of its stream that leaves the vehicle costs the same bitrate again.
+"""Decides who may watch a camera over the uplink: each copy of its stream costs the full bitrate again.
 
-A viewer on the vehicle itself (loopback) costs no uplink; it is always admitted and never counted. The controller, the
+A viewer on the vehicle itself (loopback) uses no uplink; it is always admitted and never counted. The controller, the
 operator in control, is always admitted. RTSP has no field for an operator, so an operator's RTSP client states its id
 as User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
 name, not a proof; nothing on either link is authenticated yet.
@@ -18,8 +18,8 @@ _PRODUCT = "tod-runner/"
 class StreamViewer(NamedTuple):
     """One viewer of one camera.
 
-    address   IP address that its requests come from
-    operator  id of the operator that it belongs to, "" if it states none
+    address   IP address of the client
+    operator  id of its operator, "" if it states none
     since     monotonic time at which it connected, s; distinguishes viewers from one address
     """
 
@@ -48,13 +48,13 @@ def over_uplink(address: str) -> bool:
 def admit(
     viewers: Sequence[StreamViewer], new_viewer: StreamViewer, limit: int, controller: str
 ) -> list[StreamViewer] | None:
-    """Which viewers of a camera have to leave for a newcomer, or None if the newcomer is refused.
+    """The viewers of a camera to disconnect for a new one; None if the new one is refused.
 
     viewers     of this camera, in order of arrival
     limit       viewers over the uplink at once, at least 1
     controller  id of the operator in control, "" for none
-    returns     for the controller the newest of the others; if all are the controller's own, the oldest: the one left
-                behind by an operator whose address changed
+    returns     for the controller, the newest viewers of others; if all are the controller's own, the oldest: a
+                leftover of an operator whose address has changed
     """
     if not over_uplink(new_viewer.address):
         return []

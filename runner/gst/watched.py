@@ -9,25 +9,25 @@ from collections.abc import Callable
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
-from runner.gst.aside import HUNG, set_state_aside
+from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.source import fixed_rate
 
 CHECK_MS = 100
-FIRST_FRAME_S = 10.0  # UDP may fail only after 5 s, and the first keyframe may come late
+FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
 
 class WatchedSource(Gst.Bin):  # type: ignore[misc]
-    """Takes the place of a source's elements and holds them as its child.
+    """Replaces the elements of a source in its pipeline, and contains them as a child bin.
 
     A source that delivers no frame for `Plan.frozen_s` while the pipeline plays, fails or ends is removed and rebuilt.
     Downstream elements only see a pause: clock and running time continue, and the source's errors, its EOS and its
     asynchronous state changes do not leave this bin. Frames are counted in C before the gate, so a camera that is
     paused or off counts as working.
 
-    Until the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
+    Before the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
     on_report  called with what happened
     """
@@ -43,15 +43,17 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
         self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
-        self._lock = threading.Lock()  # of the child: the server's threads start and stop it, GLib's thread replaces it
+        self._lock = (
+            threading.Lock()
+        )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
         self._timer = 0
-        self._failed: str | None = None  # the source's own error, set from its threads
-        self._moved = (0, 0.0)  # frames at the last change of the counter, and when
-        self._attempts = 0  # of this outage
-        self._tried = (0, 0.0)  # frames when the last attempt began, and when
+        self._error: str | None = None  # the source's own error, set from its threads
+        self._progress = (0, 0.0)  # frames at the last change of the counter, and when
+        self._attempts = 0  # in this outage
+        self._last_attempt = (0, 0.0)  # frames when the last attempt began, and when
 
-    def take_place(self, pipeline: Gst.Bin, plan: Plan) -> None:
+    def install(self, pipeline: Gst.Bin, plan: Plan) -> None:
         """Replace the plain elements of the source in a newly built pipeline."""
         for element in plan.source:
             pipeline.remove(pipeline.get_by_name(element.name))
@@ -63,83 +65,85 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def do_change_state(self, transition: Gst.StateChange) -> Gst.StateChangeReturn:
         if transition == Gst.StateChange.READY_TO_PAUSED:
             with self._lock:
-                self._fill()
-            self._moved = (self._frames(), time.monotonic())
+                self._add_child()
+            self._progress = (self._frames(), time.monotonic())
             self._timer = GLib.timeout_add(CHECK_MS, self._watch)
         elif transition == Gst.StateChange.PAUSED_TO_READY:
             with self._lock:
                 GLib.source_remove(self._timer)
                 self._timer = 0
-                self._empty()
+                self._remove_child()
                 self.outage, self._attempts = Outage(self._on_report), 0
         return Gst.Bin.do_change_state(self, transition)
 
     def do_handle_message(self, message: Gst.Message) -> None:
         if self._frames():
             if message.type == Gst.MessageType.ERROR:
-                self._failed = message.parse_error()[0].message
+                self._error = message.parse_error()[0].message
                 return
             if message.type in (Gst.MessageType.ASYNC_START, Gst.MessageType.ASYNC_DONE):
                 return
         Gst.Bin.do_handle_message(self, message)
 
     def has_ended(self) -> bool:
-        """The source sends no more. Returns whether that stays inside this bin."""
+        """The source sends no more. Returns whether this bin handles that."""
         if not self._frames():
             return False
-        self._failed = "the stream ended"
+        self._error = "the stream ended"
         return True
 
     # --- in GLib's thread ---------------------------------------------------------------------------------------------
 
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
-        if frames != self._moved[0] or not self._plays():
-            self._moved, self._failed = (frames, now), None  # an error that stops no frames is not the video's
+        if frames != self._progress[0] or not self._is_playing():
+            self._progress, self._error = (frames, now), None  # an error that does not stop frames is not the video's
         if not frames:
             return True
         if not self._attempts:
-            self._look(now)
-        elif frames > self._tried[0]:
+            self._check_source(now)
+        elif frames > self._last_attempt[0]:
             self._attempts = 0
-            self.outage.over(now)
+            self.outage.report_recovery(now)
         else:
-            self._look_again(now)
+            self._check_attempt(now)
         return True
 
-    def _look(self, now: float) -> None:
+    def _check_source(self, now: float) -> None:
         """During normal operation."""
-        if now - self._moved[1] <= self._frozen_s:
+        if now - self._progress[1] <= self._frozen_s:
             return
-        if self._idle():
-            self.outage.failed(f"source: {self._failed or f'no frame for {self._frozen_s:g} s'}", self._moved[1])
+        if self._is_idle():
+            self.outage.report_failure(
+                f"source: {self._error or f'no frame for {self._frozen_s:g} s'}", self._progress[1]
+            )
             self._replace(now)
         else:
-            self._moved = (self._moved[0], now)  # its next frame follows once this one has passed
+            self._progress = (self._progress[0], now)  # its next frame follows once this one has passed
 
-    def _look_again(self, now: float) -> None:
+    def _check_attempt(self, now: float) -> None:
         """After an attempt that has not delivered a frame yet."""
-        if self._failed:
-            self.outage.failed(f"source: {self._failed}", self._moved[1])
+        if self._error:
+            self.outage.report_failure(f"source: {self._error}", self._progress[1])
         first, longest = BACKOFF_S
         pause = min(first * 2 ** (self._attempts - 1), longest)
-        if now - self._tried[1] > (pause if self._failed else max(pause, FIRST_FRAME_S)):
+        if now - self._last_attempt[1] > (pause if self._error else max(pause, FIRST_FRAME_S)):
             self._replace(now)
 
     def _replace(self, now: float) -> None:
-        self._tried = (self._moved[0], now)
+        self._last_attempt = (self._progress[0], now)
         self._attempts += 1
         with self._lock:
             if not self._timer:
                 return
-            self._empty()
-            self._failed = None
-            child = self._fill()
+            self._remove_child()
+            self._error = None
+            child = self._add_child()
         child.sync_state_with_parent()
 
     # --- the child, under its lock ------------------------------------------------------------------------------------
 
-    def _fill(self) -> Gst.Bin:
+    def _add_child(self) -> Gst.Bin:
         child = Gst.parse_bin_from_description(self._launch, ghost_unlinked_pads=False)
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
         if problem := log_in(child, self._plan):
@@ -149,17 +153,17 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
             play_bag(child, self._plan, self._plan.bag, self._on_report)
         for element in fixed_rate(child):
-            element.set_property("skip-to-first", True)  # or the first frame is repeated for the time before it
+            element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         self.add(child)
         child.link(self._counter)
         self._child = child
         return child
 
-    def _empty(self) -> None:
+    def _remove_child(self) -> None:
         child, self._child = self._child, None
         if child is not None:
             self.remove(child)
-            set_state_aside(child, Gst.State.NULL, lambda: self._on_report(f"source: {HUNG}"))
+            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(f"source: {HUNG}"))
 
     # ------------------------------------------------------------------------------------------------------------------
 
@@ -167,26 +171,26 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         frames: int = self._counter.get_property("stats").get_value("num-buffers")
         return frames
 
-    def _plays(self) -> bool:
+    def _is_playing(self) -> bool:
         return bool(self._counter.get_state(0).state == Gst.State.PLAYING)
 
-    def _idle(self) -> bool:
+    def _is_idle(self) -> bool:
         """Whether no frame is blocked downstream of the source, for example by a sink that is reconnecting."""
         pad = self._counter.get_static_pad("src")
-        here: list[bool] = []
-        probe = pad.add_probe(Gst.PadProbeType.IDLE, _remember, here)
-        if not here:
+        called: list[bool] = []
+        probe = pad.add_probe(Gst.PadProbeType.IDLE, _on_idle, called)
+        if not called:
             pad.remove_probe(probe)
-        return bool(here)
+        return bool(called)
 
 
 def _on_event(pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """Not a method: the pad would keep the bin alive that it is part of, for good."""
+    """Not a method: the pad would keep its own bin alive forever."""
     if info.get_event().type == Gst.EventType.EOS and pad.get_parent_element().get_parent().has_ended():
         return Gst.PadProbeReturn.DROP
     return Gst.PadProbeReturn.OK
 
 
-def _remember(_pad: Gst.Pad, _info: Gst.PadProbeInfo, here: list[bool]) -> Gst.PadProbeReturn:
-    here.append(True)
+def _on_idle(_pad: Gst.Pad, _info: Gst.PadProbeInfo, called: list[bool]) -> Gst.PadProbeReturn:
+    called.append(True)
     return Gst.PadProbeReturn.REMOVE

@@ -1,4 +1,4 @@
-"""Access units on their way to a viewer, and the units that a late viewer must decode first. Pure."""
+"""Access units for viewers, and the units that a late-joining viewer must decode first. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from runner.h264.keyframe import Bits, grey_idr
 SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
-PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, wherever the first one began
+PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, whenever it began
 CODECS = ("h264", "h265")
 LATE = 4  # factor by which a wave may take longer than stated
 LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh period is unknown
@@ -20,12 +20,12 @@ LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh per
 class AccessUnit(NamedTuple):
     """One encoded picture, H.264 or H.265, Annex B.
 
-    captured  capture time, s since 1970 by the vehicle's clock, on the page by this machine's; None if it is unknown
+    captured  capture time, s since 1970 by the vehicle's clock, on the page by this machine's; None if unknown
     arrived   arrival time, s since 1970 by this machine's clock
-    key       whether a decoder can start with it (IDR; of H.265 any IRAP picture)
+    key       whether a decoder can start with it (H.264: IDR picture; H.265: any IRAP picture)
     recovery  frames after which a decoder that starts here is exact, if a refresh wave begins here; otherwise None
     exact     False: the decoded picture still shows content that was never sent
-    damaged   the decoded picture still shows that earlier packets were lost
+    damaged   whether the decoded picture still shows earlier packet loss
     """
 
     data: bytes
@@ -45,7 +45,7 @@ def read_unit(
     damaged  packets of it were lost
     codec    h264 or h265
     returns  None for a useless one: browsers' decoders fail on an incomplete picture, but tolerate a missing one.
-             An incomplete IDR picture of H.264 becomes a grey one, over which the next refresh wave paints.
+             An incomplete H.264 IDR picture is replaced by a grey one, which the next refresh wave overwrites.
 
     Parameter sets do not identify an IDR picture: encoders repeat them at every wave.
     """
@@ -65,7 +65,7 @@ def read_unit(
 
 
 def starts(data: bytes, codec: str) -> tuple[bool, int | None]:
-    """Whether a decoder can start with an access unit; and recovery_frame_cnt, where a refresh wave begins."""
+    """Whether a decoder can start with an access unit, and its recovery_frame_cnt if a refresh wave begins there."""
     unit = read_unit(data, None, 0.0, codec=codec)
     return (unit.key, unit.recovery) if unit else (False, None)
 
@@ -79,7 +79,7 @@ def coded_picture(data: bytes, codec: str) -> bytes:
 
 
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
-    """As `read_unit`. Recovery points are ignored: a viewer that joins waits for the next IRAP picture."""
+    """`read_unit` for H.265. Recovery points are ignored: a late viewer waits for the next IRAP picture."""
     for header, _ in _nal_units(data):
         kind = header >> 1 & 0x3F
         if kind in H265_VCL:
@@ -100,12 +100,12 @@ def _recovery(message: bytes) -> int | None:
     return Bits(message[2:]).ue() if len(message) > 2 and message[0] == RECOVERY_POINT else None
 
 
-class Recent:
+class RecentUnits:
     """The units of one camera that a late decoder needs: the last IDR, and the units since or of the last periods.
 
-    With intra-refresh an IDR comes only when the picture changes its size. Starting from it alone mixes an old picture
+    With intra-refresh, an IDR is sent only when the picture size changes. Starting from it alone mixes an old picture
     with new changes; after two refresh periods, or one whole wave that the stream announces, the old picture is gone.
-    A stream that others already watch has no IDR for a viewer that joins: it starts from a grey one.
+    A stream that others already watch sends no IDR for a late viewer, who starts from a grey one.
 
     refresh_s  length of a refresh wave or keyframe interval, s; None if the graph does not state it
     codec      h264 or h265; an H.265 stream that others already watch starts with its next IRAP picture
@@ -119,7 +119,7 @@ class Recent:
         self._exact_from = 0.0  # after a grey start: when two periods have passed
 
     def add(self, unit: AccessUnit) -> AccessUnit:
-        """Keep a newly received unit; returns it with `exact` set for a decoder that starts from the kept units."""
+        """Store a received unit; returns it with `exact` set for a decoder that starts from the stored units."""
         if unit.key:
             self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
             self._since.clear()
@@ -138,7 +138,7 @@ class Recent:
         return unit
 
     def _forget(self, now: float) -> None:
-        """Drop units older than the window; waves that take longer, because frames come late, are kept whole."""
+        """Drop units older than the window, but keep waves whole that take longer because frames are late."""
         if any(unit.recovery is not None for unit in self._since):
             spare, oldest = self._wave() or 0, now - LATE * self._window
         else:
@@ -148,14 +148,14 @@ class Recent:
             spare -= 1
 
     def burst(self) -> list[AccessUnit]:
-        """Units to decode, in order, the newest last; empty until there is one to start with."""
+        """Units to decode, in order, the newest last; empty until a decoder can start."""
         if self._key is None:
             return []
         units = list(self._since)
         return [self._key, *units[self._wave() or 0 :]]
 
     def _wave(self) -> int | None:
-        """Index where the last completed wave began; None if there is none."""
+        """Index of the first unit of the last completed wave; None if there is none."""
         for at in range(len(self._since) - 1, -1, -1):
             recovery = self._since[at].recovery
             if recovery is not None and len(self._since) - 1 - at >= recovery:

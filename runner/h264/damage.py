@@ -1,4 +1,4 @@
-"""How long the loss of packets shows in the decoded pictures of a stream. Pure."""
+"""Tracks how long packet loss shows in the decoded pictures of a stream. Pure."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ HEAD_BYTES = 2048  # of an access unit: parameter sets, SEI and the header of it
 
 
 class Damage:
-    """Follows the access units of a stream: those that depend on lost packets are damaged until the picture is healed.
+    """Tracks damage by packet loss: access units are damaged until the picture is healed.
 
     A picture is healed by an IDR picture (of H.265: IRAP), or after a whole refresh wave: `recovery_frame_cnt` frames
-    after a recovery point (ITU-T H.264, D.2.8). A loss within the wave damages what the wave has already painted.
-    Of other codecs it is unknown what heals; only incomplete units count as damaged.
+    after a recovery point (ITU-T H.264, D.2.8). A loss within the wave damages the part that is already refreshed.
+    For other codecs healing is unknown; only incomplete units count as damaged.
 
-    lasts  whether units before the first were missed
+    is_damaged  whether units before the first one were missed
     """
 
-    def __init__(self, codec: str, *, lasts: bool = False) -> None:
+    def __init__(self, codec: str, *, is_damaged: bool = False) -> None:
         self._codec = codec
-        self.lasts = lasts and codec in CODECS  # until the picture is healed
-        self._left: int | None = None  # frames of the wave that heals; None: none has begun since the loss
+        self.is_damaged = is_damaged and codec in CODECS  # until the picture is healed
+        self._left: int | None = None  # remaining frames of the healing wave; None: none has begun since the loss
 
     def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:
-        """Whether the picture of the next access unit is damaged.
+        """Add the next access unit; returns whether its picture is damaged.
 
-        incomplete  packets of it, or between it and the one before, were lost
+        incomplete  packets of it, or between it and the previous one, were lost
         head        returns its first HEAD_BYTES; called only while the picture is damaged
         """
         if incomplete:
-            self.lasts, self._left = self._codec in CODECS, None
+            self.is_damaged, self._left = self._codec in CODECS, None
             return True
-        if self.lasts and self._heals(head()):
-            self.lasts, self._left = False, None
-        return self.lasts
+        if self.is_damaged and self._heals(head()):
+            self.is_damaged, self._left = False, None
+        return self.is_damaged
 
     def _heals(self, head: bytes) -> bool:
         key, recovery = starts(head, self._codec)

@@ -1,7 +1,7 @@
 """A grey IDR picture, for a decoder that joins a running stream and must start with an IDR. Pure.
 
-With intra-refresh a stream that is joined late never has an IDR: its pictures become exact by refresh waves alone. The
-picture under a wave does not matter, so any IDR of the right size will do. ITU-T H.264 (08/2021), clause 7.3.
+With intra-refresh, a late viewer never receives an IDR: pictures become exact by refresh waves alone. The picture under
+a wave does not matter, so any IDR of the right size will do. ITU-T H.264 (08/2021), clause 7.3.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _Sps(NamedTuple):
 def grey_idr(unit: bytes) -> bytes | None:
     """An access unit in Annex B with the parameter sets of a given one, and an all-grey picture.
 
-    It repeats all parameter sets, since the units that follow may have none.
+    It repeats all parameter sets, since the following units may have none.
 
     unit     an access unit in Annex B
     returns  None if it has no sequence parameter set, or an unsupported one (scaling lists, 4:4:4, fields)
@@ -52,7 +52,7 @@ def _parse(payload: bytes) -> _Sps | None:
     identity = read.ue()
     if profile in _HIGH_PROFILES:
         chroma_format = read.ue()
-        if chroma_format != 1 or read.ue() or read.ue():  # 4:2:0 with 8 bits is what browsers decode
+        if chroma_format != 1 or read.ue() or read.ue():  # browsers decode 4:2:0 with 8 bits
             return None
         read.u(1)
         if read.u(1):

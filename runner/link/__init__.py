@@ -1,6 +1,6 @@
 """A limited link between the vehicle's and the operator's process, whose rate follows a trace.
 
-Arrivals, losses and delays are then measured, not assumed. Two kinds: `netns` (root; any packet of any protocol between
+Arrivals, losses and delays are thus measured, not assumed. Two kinds: `netns` (root; packets of any protocol between
 two network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
 vehicle to the operator in one queue, and all traffic back in another, if that is limited.
 
@@ -28,14 +28,14 @@ __all__ = ["KINDS", "Limit", "LimitedLink", "check_possible", "limited_link"]
 
 KINDS = {"netns": netns.namespaced, "relay": relayed}
 LOG_S = 0.1  # between two lines of the log
-LOOK_S = 0.02  # how late a rate change may be
+POLL_S = 0.02  # how late a rate change may be
 STOP_S = 0.5  # how long the last line of the log may take
 
 OnLinkSample = Callable[[LinkSample], None]
 
 
 class LimitedLink:
-    """A link that is set up. Its rate is the initial one until `start` sets the beginning of the drive.
+    """A link that is set up. Its rate is the initial one until `start` sets the start of the drive.
 
     on_sample  called with each sample, from a thread of the link
 
@@ -57,7 +57,7 @@ class LimitedLink:
         began  the drive's time 0, s since 1970
         """
         assert self._thread is None, "a link starts once"
-        zero = time.monotonic() - (time.time() - began)  # the system clock may be set while driving
+        zero = time.monotonic() - (time.time() - began)  # the system clock may change while driving
         self._thread = threading.Thread(target=self._run, args=(zero,), name="link", daemon=True)
         self._thread.start()
 
@@ -73,7 +73,7 @@ class LimitedLink:
         """Write the last line of the log; the rate stays."""
         self._stopped.set()
         if self._thread:
-            self._thread.join(STOP_S)  # a thread that waits for an answer ends with the child that should give it
+            self._thread.join(STOP_S)  # a thread that waits for an answer ends with its child
 
     def _run(self, zero: float) -> None:
         try:
@@ -85,7 +85,7 @@ class LimitedLink:
         in_force, line = self._limit.rates(0), 0
         ended = False
         while not ended:
-            ended = self._stopped.wait(LOOK_S)
+            ended = self._stopped.wait(POLL_S)
             t = time.monotonic() - zero
             rates, logs = self._limit.rates(t), t >= line * LOG_S or (ended and t >= 0)
             if rates != in_force or logs:
@@ -109,7 +109,7 @@ def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
 
 
 def check_possible(kind: str) -> None:
-    """raises RunError if this machine or its user cannot make a link of that kind"""
+    """raises RunError if this machine or its user cannot set up a link of that kind"""
     if kind == "netns":
         netns.check_possible()
 
@@ -124,7 +124,7 @@ def limited_link(
     limit           its rate, queue and delay
     media, control  RTSP server and broker as configured
     on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
-                    since the link was made
+                    since the link was set up
     dials           whether the vehicle dials the operator for media, as with SRT; kind netns
     raises          RunError if it cannot be set up, with the remedy; at the end, if it has failed meanwhile
     """

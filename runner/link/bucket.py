@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Bucket(Generic[T]):
-    """Packets wait until the bucket holds as many tokens (bytes) as they are long; at a rate of 0 they stay.
+    """Packets wait until the bucket has as many tokens (bytes) as they are long; at a rate of 0 they stay.
 
     Departures are computed, not observed: a late caller gets every packet with its departure time, and a late
     scheduler costs no rate. Times are seconds of any monotonic clock.
@@ -23,7 +23,7 @@ class Bucket(Generic[T]):
         self._items: deque[tuple[int, T]] = deque()
         self._left: deque[tuple[float, T]] = deque()  # with departure times
         self._backlog = 0  # bytes
-        self._at = now  # the time for which `_tokens` holds
+        self._at = now  # time of `_tokens`
         self._passed = self._packets = self._dropped = 0
         self._set(kbps)
         self._tokens: float = self._burst
@@ -33,7 +33,7 @@ class Bucket(Generic[T]):
         self._burst, self._limit = burst_bytes(kbps), queue_bytes(kbps, self._queue_ms)
 
     def set_rate(self, kbps: float, now: float) -> None:
-        """From now on. Queued packets stay, even if they now wait longer than queue_ms."""
+        """Change the rate. Queued packets stay, even if they now wait longer than queue_ms."""
         self._advance(now)
         self._fill(now)
         self._set(kbps)
@@ -53,7 +53,7 @@ class Bucket(Generic[T]):
         self._backlog += size
 
     def due(self) -> float | None:
-        """When the next packet departs, or has departed; None: the queue is empty."""
+        """Departure time of the next packet, which may be in the past; None: the queue is empty."""
         return self._left[0][0] if self._left else self._next()
 
     def take(self, now: float) -> Iterator[tuple[float, T]]:
@@ -77,18 +77,18 @@ class Bucket(Generic[T]):
         return self._at + (missing / self._rate if missing else 0.0)
 
     def _advance(self, now: float) -> None:
-        """Let packets depart that are due by now."""
+        """Let all packets depart that are due."""
         while (when := self._next()) is not None and when <= now:
             self._fill(when)
             size, item = self._items.popleft()
             self._tokens -= size
             self._backlog -= size
             self._passed += size
-            self._packets += size > 0  # the end of a connection waits its turn, too
+            self._packets += size > 0  # the end of a connection is queued as well, without a packet
             self._left.append((when, item))
 
     def _fill(self, now: float) -> None:
-        # A packet longer than the bucket also gets the tokens that it needs.
+        # A packet longer than the bucket gets the tokens that it needs, too.
         most = max(self._burst, self._items[0][0]) if self._items else self._burst
         self._tokens = min(most, self._tokens + max(0.0, now - self._at) * self._rate)
         self._at = max(self._at, now)

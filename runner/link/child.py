@@ -17,20 +17,20 @@ from runner.system import children, signals
 
 ANSWER_S = 5.0  # a child that has not answered by then never will
 END_S = 0.5  # how long it may take to end once its input is closed
-LOOK_MS = 50  # how soon a signal to this process is noticed
+POLL_MS = 50  # how soon a signal to this process is noticed
 
 
 class Child:
     """Takes requests on its standard input; every output line that is not JSON is an error.
 
     name     for messages
-    command  ends when its standard input does; it is killed with the thread that creates this
+    command  must end with its standard input; it is killed with the thread that creates this object
     """
 
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self._name = name
         pipe = subprocess.PIPE
-        # Its own session: Ctrl-C ends the parent, not the child, which counts until the end.
+        # In its own session, so that Ctrl-C ends the parent but not the child, which counts until the end.
         self._process = subprocess.Popen(
             children.bound(command),
             stdin=pipe,
@@ -80,7 +80,7 @@ class Child:
     def end(self) -> None:
         """End it, by force if necessary."""
         assert self._process.stdin and self._process.stdout
-        with suppress(OSError):  # it is gone, and unwritten input is lost
+        with suppress(OSError):  # it has ended; unwritten input is lost
             self._process.stdin.close()
         children.end(self._process, END_S)
         self._process.stdout.close()
@@ -90,14 +90,14 @@ class Child:
 
         raises  RunError if it neither answers nor ends
         """
-        until, ready = time.monotonic() + ANSWER_S, select.poll()
+        deadline, ready = time.monotonic() + ANSWER_S, select.poll()
         ready.register(self._out, select.POLLIN)
-        while time.monotonic() < until:
+        while time.monotonic() < deadline:
             while b"\n" in self._rest:
                 line, _, self._rest = self._rest.partition(b"\n")
                 yield line.decode(errors="replace")
             signals.check()
-            if ready.poll(LOOK_MS):
+            if ready.poll(POLL_MS):
                 data = os.read(self._out, 65_536)
                 if not data:
                     break
@@ -109,18 +109,18 @@ class Child:
 
 
 class ChildShaper:
-    """A child that passes packets on, and reads rates by `runner.link.direction.take_rates`.
+    """A child that forwards packets, and reads rates with `runner.link.direction.take_rates`.
 
-    tcp  sends competing TCP flows, from the first rates on; None: there are none
+    tcp  child that sends competing TCP flows, started with the first rates; None: no such flows
     """
 
     def __init__(self, child: Child, tcp: Child | None = None) -> None:
         self._child, self._tcp = child, tcp
-        self._sends = False
+        self._tcp_started = False
 
     def limit(self, rates: Rates) -> LinkCounters:
-        if self._tcp and not self._sends:
-            self._sends = True
+        if self._tcp and not self._tcp_started:
+            self._tcp_started = True
             self._tcp.ask("start")
         return LinkCounters(**self._child.ask(" ".join(str(kbps) for kbps in rates if kbps is not None)))
 

@@ -1,4 +1,4 @@
-"""What a process that passes packets on does to them: a limited queue, losses and a delay in each direction."""
+"""Effects of a forwarding process on packets: a limited queue, losses and a delay in each direction."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ Delivery = Callable[[], object]
 UNLIMITED = {"kbps": 1e7, "queue_ms": 1000, "delay_ms": 0}
 
 
-class Lottery:
-    """Which packets are lost: the two states of Gilbert's model (Bell System Technical Journal, 1960).
+class LossModel:
+    """Decides which packets are lost: Gilbert's two-state model (Bell System Technical Journal, 1960).
 
     loss   share of all packets
     burst  mean number lost in a row; 1: each independently
     """
 
     def __init__(self, loss: float, burst: float, seed: int = 1) -> None:
-        self._ends = min(1 / burst, 1 - loss)  # by chance some follow each other, too
-        self._begins = 1.0 if loss >= 1 else loss * self._ends / (1 - loss)
-        self._chance = random.Random(seed)  # the same losses in every run
+        self._end_probability = min(1 / burst, 1 - loss)  # bursts may follow each other by chance
+        self._start_probability = 1.0 if loss >= 1 else loss * self._end_probability / (1 - loss)
+        self._random = random.Random(seed)  # the same losses in every run
         self._losing = False
 
     def draw(self) -> bool:
-        """Whether the next packet is lost."""
-        if self._begins:
-            changes = self._ends if self._losing else self._begins
-            self._losing ^= self._chance.random() < changes
+        """Draw whether the next packet is lost."""
+        if self._start_probability:
+            change = self._end_probability if self._losing else self._start_probability
+            self._losing ^= self._random.random() < change
         return self._losing
 
 
 class Direction:
-    """Everything from one side to the other: one queue with one rate, then losses and the delay."""
+    """All traffic from one side to the other: one queue with one rate, then losses and the delay."""
 
     def __init__(self, kbps: float, queue_ms: float, delay_ms: float, loss: float = 0.0, burst: float = 1.0) -> None:
         self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
         self._delay_s = delay_ms / 1000
-        self._lottery, self._lost = Lottery(loss, burst), 0
+        self._losses, self._lost = LossModel(loss, burst), 0
         self._delayed: deque[tuple[float, Delivery]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
 
     def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
-        """Queue a packet of that many bytes; without `keep` it may be dropped or lost. `delivery`: on arrival."""
-        if not keep and self._lottery.draw():
+        """Queue a packet of `size` bytes; without `keep` it may be dropped or lost. `delivery` is called on arrival."""
+        if not keep and self._losses.draw():
             delivery = self._lose
         self._bucket.put(size, delivery, time.monotonic(), keep=keep)
         self._deliver()
@@ -69,13 +69,13 @@ class Direction:
         self._lost += 1
 
     async def room(self, size: int) -> None:
-        """Wait until the queue has room for so many bytes."""
+        """Wait until the queue has room for `size` bytes."""
         while not self._bucket.has_room(size):
             self._departed.clear()
             await self._departed.wait()
 
     def _deliver(self) -> None:
-        """Deliver what has been queued and delayed long enough, and set a timer for the rest."""
+        """Deliver all packets that are due, and set a timer for the rest."""
         now = time.monotonic()
         for left, delivery in self._bucket.take(now):
             self._delayed.append((left + self._delay_s, delivery))
@@ -102,7 +102,7 @@ class Link(NamedTuple):
 
 
 async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -> None:
-    """Set rates from standard input until it ends: in each line those of both directions, kbit/s, or of the first one.
+    """Set rates from standard input until it ends: each line has those of both directions or of the first one, kbit/s.
 
     Each line is answered with the counters of the first direction.
 
@@ -118,5 +118,5 @@ async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -
 
 
 def exact_loop() -> asyncio.AbstractEventLoop:
-    """An event loop whose waits are exact to 0.1 ms (select), not to 1 ms (epoll)."""
+    """An event loop with timers accurate to 0.1 ms (select), not to 1 ms (epoll)."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())

@@ -13,9 +13,9 @@ class Ends:
     """How to start both sides so that traffic from vehicle to operator passes the link.
 
     vehicle_command     prefix of the vehicle's command line
-    vehicle_overrides   where the vehicle's RTSP server listens and where it finds the broker
-    operator_overrides  where the operator finds both
-    broker              where the broker has to listen
+    vehicle_overrides   addresses at which the vehicle's RTSP server listens and it reaches the broker
+    operator_overrides  addresses at which the operator reaches both
+    broker              address at which the broker must listen
     shaper              sets the rates and counts
     notes               for the user
     """

@@ -1,4 +1,4 @@
-"""What a limited link does to packets, defined once for both kinds of link. Pure. Sizes are bytes of IP packets."""
+"""Effect of a limited link on packets, defined once for both kinds of link. Pure. Sizes are bytes of IP packets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 PACKET_BYTES = 1500  # the largest IP packet on Ethernet
-BURST_S = 0.002  # of data that an idle link passes at once; with less, late timers on a busy machine would cost rate
+BURST_S = 0.002  # of data that an idle link passes in a burst; with less, late timers on a busy machine would cost rate
 
 
 class Rates(NamedTuple):
@@ -33,7 +33,7 @@ class TcpFlows:
     """TCP flows from vehicle to operator that compete with the cameras.
 
     flows    how many at a time
-    size     bytes of a transfer, uniformly distributed between two bounds; None: one that does not end
+    size     bytes of a transfer, uniformly distributed between two bounds; None: one endless transfer
     pause_s  mean time between two transfers of a flow, exponentially distributed
     start_s  when the first transfers begin, s after the start of the drive
     """
@@ -46,15 +46,15 @@ class TcpFlows:
 
 @dataclass(frozen=True)
 class Limit:
-    """What the link does to all traffic from the vehicle to the operator.
+    """Effect of the link on all traffic from the vehicle to the operator.
 
     kbps_at   rate in force t seconds after the start of the drive; 0: nothing passes
     queue_ms  packets that would wait longer are dropped
     delay_ms  one way, in addition to the wait
-    loss      share of packets that are lost after the queue; of a relay, of UDP packets
-    burst     mean number of packets that are lost in a row
-    reverse   what it does to traffic from the operator to the vehicle; None: nothing
-    tcp       what else is sent from vehicle to operator; None: nothing
+    loss      share of packets lost after the queue; with a relay, of UDP packets
+    burst     mean number of packets lost in a row
+    reverse   effect on traffic from the operator to the vehicle; None: none
+    tcp       competing traffic from vehicle to operator; None: none
     """
 
     kbps_at: Callable[[float], float]
@@ -71,7 +71,7 @@ class Limit:
         return Rates(float(self.kbps_at(at)), float(self.reverse.kbps_at(at)) if self.reverse else None)
 
     def settings(self) -> dict[str, Any]:
-        """Both directions at the start, for a process that passes packets on (`runner.link.direction`)."""
+        """Both directions at the start, for a forwarding process (`runner.link.direction`)."""
         rates = self.rates(0)
         back = None if self.reverse is None else _direction(self.reverse, rates.down)
         return {"up": _direction(self, rates.up), "down": back}
@@ -105,10 +105,10 @@ class Shaper(Protocol):
     """Sets rates and reads counters."""
 
     def limit(self, rates: Rates) -> LinkCounters:
-        """Set the rates; returns the counters. raises RunError if the link is gone"""
+        """Set the rates; returns the counters. raises RunError if the link has failed"""
 
     def check(self) -> None:
-        """raises RunError if the link is gone"""
+        """raises RunError if the link has failed"""
 
 
 def burst_bytes(kbps: float) -> int:

@@ -1,10 +1,9 @@
-"""A link through the kernel: the vehicle in a network namespace of its own.
+"""A link through the kernel: the vehicle in its own network namespace.
 
     vehicle's namespace link0 ---- runner.link.tunnel ---- tod-N this machine's namespace
 
-Both devices are TUN devices of one process, which limits, delays and loses what leaves either of them: any packet of
-any protocol, in both directions. Sizes are those of IP packets. The operator, its page and the broker stay in this
-machine's namespace.
+Both devices are TUN devices of one process, which limits, delays and drops packets of any protocol in both directions.
+Sizes are those of IP packets. The operator, its page and the broker stay in this machine's namespace.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ LINK = "link0"  # the vehicle's device
 RUN = Path("/run/netns")  # where ip keeps namespaces by name
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
 COMMAND_S = 10.0  # how long a command of iproute2 may take
-OTHERWISE = "or choose link=relay"
+ALTERNATIVE = "or choose link=relay"
 
 
 @contextmanager
@@ -50,7 +49,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
     raises          RunError with the remedy
     """
     ip = check_possible()
-    with _claimed(ip) as (name, network), urgent(lambda: _remove(ip, name)):
+    with _claimed_network(ip) as (name, network), urgent(lambda: _remove(ip, name)):
         machine, vehicle = map(str, network.hosts())
         devices = (name, f"{name}-far")
         inside = (ip, "netns", "exec", name)
@@ -60,9 +59,9 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
                 port = tunnel.answer()["port"]
                 _connect(ip, devices, (machine, vehicle))
                 broker = Endpoint(machine, control.port)
-                # A namespace of this process's own is as private as loopback.
+                # A private namespace is as safe as loopback.
                 both = (*overrides(Endpoint(machine if dials else vehicle, media.port), broker), "insecure=true")
-                with _competing(limit.tcp, (machine, port), inside) as (tcp, notes):
+                with _competing_flows(limit.tcp, (machine, port), inside) as (tcp, notes):
                     yield Ends(inside, both, both, broker, ChildShaper(tunnel, tcp), notes)
         finally:
             _remove(ip, name)
@@ -80,10 +79,10 @@ def _child(module: str, settings: Mapping[str, Any], before: Sequence[str] = ())
 
 
 @contextmanager
-def _competing(
+def _competing_flows(
     flows: TcpFlows | None, to: tuple[str, int], inside: Sequence[str]
 ) -> Iterator[tuple[Child | None, tuple[str, ...]]]:
-    """The TCP flows from the vehicle's namespace, if there are any, and what to note about them."""
+    """The TCP flows from the vehicle's namespace, if any, and notes about them."""
     if flows is None:
         yield None, ()
         return
@@ -98,24 +97,24 @@ def _competing(
 def _connect(ip: str, devices: tuple[str, str], addresses: tuple[str, str]) -> None:
     """Create the namespace, and set up this machine's device and the vehicle's, which moves there."""
     (name, far), (machine, vehicle) = devices, addresses
-    there = (ip, "-netns", name)
+    in_namespace = (ip, "-netns", name)
     _run(ip, "netns", "add", name)
-    _run(*there, "link", "set", "dev", "lo", "up")
+    _run(*in_namespace, "link", "set", "dev", "lo", "up")
     _run(ip, "link", "set", "dev", far, "netns", name, "name", LINK)
-    for command, device, own, peer in (((ip,), name, machine, vehicle), (there, LINK, vehicle, machine)):
-        with suppress(RunError):  # a kernel without IPv6 has no such setting, and sends nothing unprompted
+    for command, device, own, peer in (((ip,), name, machine, vehicle), (in_namespace, LINK, vehicle, machine)):
+        with suppress(RunError):  # a kernel without IPv6 lacks this setting, and sends nothing unprompted
             _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
         _run(*command, "addr", "add", own, "peer", peer, "dev", device)
         _run(*command, "link", "set", "dev", device, "up")
 
 
 def _remove(ip: str, name: str) -> None:
-    """Remove a namespace, if there is one, and kill the processes still running in it."""
+    """Remove a namespace, if it exists, and kill the processes still running in it."""
     try:
         identity = (RUN / name).stat().st_ino
     except FileNotFoundError:
         return
-    _output_of(ip, "netns", "delete", name)  # first, so that no process can enter any more
+    _output_of(ip, "netns", "delete", name)  # first, so that no more processes can enter
     for pid in _inside(identity):
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -132,11 +131,11 @@ def _inside(identity: int) -> Iterator[int]:
 
 
 @contextmanager
-def _claimed(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
+def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     """A name and addresses that are not in use elsewhere.
 
-    The search begins anywhere: connections of an earlier link, whose other end no longer exists, send to its addresses
-    for minutes, and would enter a new link that has the same ones.
+    The search starts at random: connections of an earlier link whose other end no longer exists send to its addresses
+    for minutes, and would enter a new link with the same ones.
     """
     networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=30))}
     _remove_left_behind(ip, networks)
@@ -147,11 +146,11 @@ def _claimed(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
             if is_free and not any(address in networks[name] for address in _addresses(ip)):
                 yield name, networks[name]
                 return
-    raise RunError(f"link=netns: every address of {NETWORK} is in use; end other runs, {OTHERWISE}")
+    raise RunError(f"link=netns: every address of {NETWORK} is in use; end other runs, {ALTERNATIVE}")
 
 
 def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) -> None:
-    """Remove the namespaces of runs that were killed: those that bear a name which nobody claims."""
+    """Remove the namespaces of runs that were killed: those whose name is not claimed."""
     for name in networks.keys() & {path.name for path in RUN.glob("tod-*")}:
         with _claim(networks[name]) as is_free:
             if is_free:
@@ -160,7 +159,7 @@ def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) 
 
 @contextmanager
 def _claim(network: ipaddress.IPv4Network) -> Iterator[bool]:
-    """Claim addresses, and the name that belongs to them, for all processes; whether nobody else had.
+    """Claim addresses and the corresponding name machine-wide; yields whether they were free.
 
     The claim is a bound abstract socket, which the kernel releases with the process.
     """
@@ -183,7 +182,7 @@ def _addresses(ip: str) -> list[ipaddress.IPv4Address]:
 
 
 def check_possible() -> str:
-    """raises RunError if this machine or its user cannot make such a link; returns the path of ip"""
+    """raises RunError if this machine or its user cannot set up such a link; returns the path of ip"""
     ip = _find("ip")
     _check_allowed()
     return ip
@@ -193,7 +192,7 @@ def _find(program: str) -> str:
     """Path of a program of iproute2, which Debian installs in a directory that is only in root's PATH."""
     path = shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if path is None:
-        raise RunError(f"link=netns needs {program}; on Debian: apt-get install iproute2, {OTHERWISE}")
+        raise RunError(f"link=netns needs {program}; on Debian: apt-get install iproute2, {ALTERNATIVE}")
     return path
 
 
@@ -202,7 +201,7 @@ def _check_allowed() -> None:
     effective = next(int(line.split()[1], 16) for line in status.splitlines() if line.startswith("CapEff:"))
     if not all(effective >> capability & 1 for capability in (CAP_NET_ADMIN, CAP_SYS_ADMIN)):
         rule = "run as root (CAP_NET_ADMIN and CAP_SYS_ADMIN)"
-        raise RunError(f"link=netns may not make a network namespace: {rule}, {OTHERWISE}")
+        raise RunError(f"link=netns may not make a network namespace: {rule}, {ALTERNATIVE}")
 
 
 def _run(*command: str) -> str:
@@ -210,7 +209,7 @@ def _run(*command: str) -> str:
     done = _done(command)
     if done.returncode:
         message = " ".join(done.stderr.split()) or f"status {done.returncode}"
-        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {message}; {OTHERWISE[3:]}")
+        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {message}; {ALTERNATIVE[3:]}")
     return done.stdout
 
 

@@ -3,12 +3,12 @@
 The process between vehicle and operator. It listens on two ports of its own, named in its first line of output:
 `media` for the operator's RTSP, forwarded to the vehicle's server, and `control` for the vehicle's MQTT, forwarded to
 the broker. In RTSP's SETUP it replaces both sides' UDP ports with its own, so that RTP and RTCP pass through it.
-Traffic from vehicle to operator shares one `Bucket`; UDP that finds it full is dropped, TCP waits before it. Packets
+Traffic from vehicle to operator shares one `Bucket`; UDP packets that find it full are dropped, TCP waits. Packets
 count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP messages and interleaved
 packets are never split. The other direction has a `Bucket` of its own if `down` is given, otherwise it is unlimited.
 Losses and delay follow the queue; only UDP packets are lost.
 
-Each line of input gives the rates in force, see `take_rates`; at the end of its input the relay ends.
+Each line of input sets the rates, see `take_rates`; the relay ends with its input.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from runner.link.direction import Delivery, Direction, Link, exact_loop, take_ra
 UDP_HEADERS = 28  # bytes of IPv4 and UDP
 TCP_HEADERS = 52  # bytes of IPv4 and TCP with time stamps
 SEGMENT = 1448  # bytes of TCP payload in one packet of 1500
-WINDOW = 32_768  # bytes that TCP may hold here before the limit; the rest waits at the sender, as on a real link
-DATAGRAMS_PER_TURN = 64  # datagrams that are read before other sockets get their turn
+WINDOW = 32_768  # bytes of TCP buffered here in front of the limit; the rest waits at the sender, as on a real link
+DATAGRAMS_PER_TURN = 64  # datagrams read before other sockets get their turn
 PAIR_TRIES = 200
 WAIT_S = 0.5  # for a server to accept
 
@@ -40,9 +40,9 @@ Serve = Callable[["Link", SocketAddress, socket.socket, SocketAddress], Coroutin
 
 
 async def join(link: Link, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
-    """Pass bytes between two connections until one ends.
+    """Forward bytes between two connections until one ends.
 
-    up, down  cut the bytes of each direction into units that are never split
+    up, down  divide the bytes of each direction into units that are never split
     """
     upwards: asyncio.Queue[bytes] = asyncio.Queue()
     downwards: asyncio.Queue[bytes] = asyncio.Queue()
@@ -69,14 +69,14 @@ async def _pass(direction: Direction, source: socket.socket, arrived: asyncio.Qu
     loop = asyncio.get_running_loop()
     with suppress(OSError, ValueError):
         while True:
-            await arrived.join()  # a receiver that does not read is not sent more
+            await arrived.join()  # a receiver that does not read is sent no more
             await direction.room(SEGMENT + TCP_HEADERS)
             if not (data := await loop.sock_recv(source, SEGMENT)):
                 break
             for unit in cut(data):
                 size = len(unit) + TCP_HEADERS * -(-len(unit) // SEGMENT)
                 direction.put(size, partial(arrived.put_nowait, unit), keep=True)
-    direction.put(0, partial(arrived.put_nowait, b""), keep=True)  # what was sent before still passes
+    direction.put(0, partial(arrived.put_nowait, b""), keep=True)  # after all earlier data
 
 
 async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
@@ -92,7 +92,7 @@ class Ports:
     """Two UDP sockets between both sides' RTP and RTCP ports.
 
     operator  address of the operator's RTP
-    server    host of the vehicle's server; its ports are known once it has answered
+    server    host of the vehicle's server; its ports are known from its reply
     """
 
     def __init__(self, link: Link, host: str, operator: SocketAddress, server: str) -> None:
@@ -108,8 +108,8 @@ class Ports:
     def operator_port(self) -> int:
         return self._operator[1]
 
-    def as_the_operator_knows(self, reply: bytes) -> bytes:
-        """The server's reply with the operator's own ports, and these as the server's."""
+    def translated(self, reply: bytes) -> bytes:
+        """The server's reply with the operator's own ports as the client's, and these as the server's."""
         reply = rtsp.with_ports(reply, "server_port", lambda _: self.port)
         return rtsp.with_ports(reply, "client_port", lambda _: self.operator_port)
 
@@ -147,7 +147,7 @@ class Rtsp:
         self._link, self._operator = link, operator
         self._host, self._server = far.getsockname()[0], server
         self._ports: list[Ports] = []
-        self._requests, self._replies = rtsp.Units(), rtsp.Units()
+        self._requests, self._replies = rtsp.Splitter(), rtsp.Splitter()
 
     def requests(self, data: bytes) -> Iterable[bytes]:
         for unit in self._requests.feed(data):
@@ -155,14 +155,14 @@ class Rtsp:
 
     def replies(self, data: bytes) -> Iterable[bytes]:
         for unit in self._replies.feed(data):
-            agreed, answering = rtsp.ports(unit, "client_port"), rtsp.ports(unit, "server_port")
-            found = [ports for ports in self._ports if ports.port in agreed]
-            if not (found and answering):
+            client, server = rtsp.ports(unit, "client_port"), rtsp.ports(unit, "server_port")
+            found = [ports for ports in self._ports if ports.port in client]
+            if not (found and server):
                 yield unit
                 continue
             ports = found[0]
-            ports.server_port = answering[0]
-            yield ports.as_the_operator_knows(unit)
+            ports.server_port = server[0]
+            yield ports.translated(unit)
 
     def close(self) -> None:
         for ports in self._ports:
@@ -222,7 +222,7 @@ async def serve_control(link: Link, broker: SocketAddress, near: socket.socket, 
 
 @asynccontextmanager
 async def connected(address: SocketAddress) -> AsyncIterator[socket.socket | None]:
-    """None if nothing listens there: the client then sees its own connection end, and tries again."""
+    """A connection; None if nothing listens there: the client's own connection then ends, and it retries."""
     with socket.socket() as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
         sock.setblocking(False)

@@ -29,9 +29,9 @@ def relayed(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = Fals
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
     relay = Child("relay", command, children.environment())
     try:
-        listens = relay.answer()
-        for_operator = overrides(Endpoint(media.host, listens["media"]), control)
-        for_vehicle = overrides(media, Endpoint(control.host, listens["control"]))
+        ports = relay.answer()
+        for_operator = overrides(Endpoint(media.host, ports["media"]), control)
+        for_vehicle = overrides(media, Endpoint(control.host, ports["control"]))
         yield Ends((), for_vehicle, for_operator, control, ChildShaper(relay))
     finally:
         relay.end()

@@ -1,4 +1,4 @@
-"""RTSP as far as the relay parses it (RFC 2326): where messages end, and which UDP ports they agree on. Pure."""
+"""The part of RTSP that the relay parses (RFC 2326): ends of messages and the negotiated UDP ports. Pure."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _LENGTH = re.compile(rb"^content-length:\s*(\d+)", re.IGNORECASE | re.MULTILINE)
 _TRANSPORT = re.compile(rb"^transport:[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 
 
-class Units:
-    """Cuts one direction of a connection into messages and interleaved packets ('$', section 10.12)."""
+class Splitter:
+    """Splits one direction of a connection into messages and interleaved packets ('$', section 10.12)."""
 
     def __init__(self) -> None:
         self._data = b""
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Whole units, in order; the rest is kept for the next call.
+        """Complete units, in order; the rest is buffered for the next call.
 
         raises  ValueError if the bytes are not RTSP
         """
@@ -29,7 +29,7 @@ class Units:
             yield unit
 
     def _length(self) -> int:
-        """Bytes of the first unit; 0: not known yet."""
+        """Length of the first unit; 0: not known yet."""
         data = self._data
         if data[:1] == b"$":
             return 4 + int.from_bytes(data[2:4], "big") if len(data) >= 4 else 0
@@ -51,7 +51,7 @@ def ports(message: bytes, name: str) -> list[int]:
 
 
 def with_ports(message: bytes, name: str, replace: Callable[[int], int]) -> bytes:
-    """The message with other pairs of ports under that name; nothing else changes."""
+    """The message with the pairs of ports under that name replaced; nothing else changes."""
 
     def pair(match: re.Match[bytes]) -> bytes:
         port = replace(int(match[1]))

@@ -1,8 +1,8 @@
 """usage: python -m runner.link.tcp '{"to": [HOST, PORT], "flows": 1, "size": null, "pause_s": 10, "start_s": 0}'
 
-TCP flows that compete with cameras (`runner.link.limit.TcpFlows`), under cubic, whatever the machine's default is. Its
-first line of output names the congestion control in force. Transfers begin `start_s` after the first line of its input,
-which is answered by an empty object; at the end of its input it ends.
+TCP flows that compete with cameras (`runner.link.limit.TcpFlows`), with CUBIC, whatever the machine's default is. The
+first line of output names the congestion control in use. Transfers begin `start_s` after the first line of input, which
+is answered by an empty object; the process ends with its input.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 CONGESTION = b"cubic"
 CHUNK = bytes(16_384)
-AGAIN_S = 0.5  # before a flow whose connection failed tries again
+RETRY_S = 0.5  # before a flow whose connection failed retries
 
 
 def connection() -> socket.socket:
@@ -27,7 +27,7 @@ def connection() -> socket.socket:
     return sock
 
 
-def in_force() -> str:
+def congestion_control() -> str:
     """The congestion control of a connection; ends the process if cubic cannot be set."""
     try:
         with connection() as sock:
@@ -37,7 +37,7 @@ def in_force() -> str:
 
 
 async def transfer(to: tuple[str, int], size: float) -> None:
-    """Send so many bytes through a connection of its own."""
+    """Send `size` bytes through a new connection."""
     loop = asyncio.get_running_loop()
     with connection() as sock:
         await loop.sock_connect(sock, to)
@@ -48,21 +48,21 @@ async def transfer(to: tuple[str, int], size: float) -> None:
 
 async def flow(number: int, settings: dict[str, Any]) -> None:
     """One transfer after the other, forever; the same sizes and pauses in each run."""
-    chance, to = random.Random(number), tuple(settings["to"])
+    generator, to = random.Random(number), tuple(settings["to"])
     await asyncio.sleep(settings["start_s"])
     while True:
-        size = chance.randint(*settings["size"]) if settings["size"] else float("inf")
+        size = generator.randint(*settings["size"]) if settings["size"] else float("inf")
         try:
             await transfer((to[0], to[1]), size)
         except OSError:
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_S)
             continue
-        await asyncio.sleep(chance.expovariate(1 / settings["pause_s"]) if settings["pause_s"] else 0)
+        await asyncio.sleep(generator.expovariate(1 / settings["pause_s"]) if settings["pause_s"] else 0)
 
 
 async def main() -> None:
     settings = json.loads(sys.argv[1])
-    print(json.dumps({"congestion": in_force()}), flush=True)
+    print(json.dumps({"congestion": congestion_control()}), flush=True)
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     if not await lines.readline():

@@ -1,11 +1,10 @@
 """usage: python -m runner.link.tunnel '{"devices": [HERE, FAR], "host": HOST, "up": {...}, "down": null}'
 
-The process between two TUN devices, which it creates: IP packets that leave one are limited, delayed and lost by
-`runner.link.direction`, and then enter the other. `up` is the way from the second device to the first.
+Creates two TUN devices and forwards IP packets between them, limited, delayed and dropped by `runner.link.direction`.
+`up` is the direction from the second device to the first.
 
-Its first line of output says that both exist, and names the port of a TCP server on `host`, which takes what anybody
-sends. Each line of input gives the rates in force, see `take_rates`; at the end of its input it ends, and the devices
-with it.
+The first line of output shows that both exist, and names the port of a TCP server on `host`, which accepts and discards
+all data. Each line of input sets the rates, see `take_rates`; the process ends with its input, and the devices with it.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from runner.link.direction import Direction, Link, exact_loop, take_rates
 TUN = "/dev/net/tun"
 IFF_TUN, IFF_NO_PI, TUNSETIFF = 0x0001, 0x1000, 0x400454CA  # linux/if_tun.h
 IP_FREEBIND = 15  # linux/in.h
-PACKETS_PER_TURN = 64  # that are read before the other device gets its turn
+PACKETS_PER_TURN = 64  # read before the other device gets its turn
 
 
 def create(name: str) -> int:
@@ -42,7 +41,7 @@ def create(name: str) -> int:
 
 
 def read(source: int, direction: Direction, sink: int) -> None:
-    """Take what waits at one device; ends the process if the device is gone."""
+    """Read the waiting packets of a device; ends the process if the device is gone."""
     for _ in range(PACKETS_PER_TURN):
         try:
             packet = os.read(source, 65_536)
@@ -59,16 +58,16 @@ def write(sink: int, packet: bytes) -> None:
 
 
 class Sink(asyncio.Protocol):
-    """Takes what is sent, and counts it for all connections."""
+    """Discards received data, and counts it for all connections."""
 
-    taken = 0
+    received = 0
 
     def data_received(self, data: bytes) -> None:
-        Sink.taken += len(data)
+        Sink.received += len(data)
 
 
 async def serve(host: str) -> int:
-    """A server at an address that a device will have later. Returns its port."""
+    """Start a server at an address that a device will get later. Returns its port."""
     sock = socket.socket()
     sock.setsockopt(socket.SOL_IP, IP_FREEBIND, 1)
     sock.bind((host, 0))
@@ -87,7 +86,7 @@ async def main() -> None:
     loop = asyncio.get_running_loop()
     for source, direction, sink in ((far, link.up, here), (here, link.down, far)):
         loop.add_reader(source, read, source, direction, sink)
-    await take_rates(link, lambda: {"tcp": Sink.taken})
+    await take_rates(link, lambda: {"tcp": Sink.received})
 
 
 if __name__ == "__main__":

@@ -21,13 +21,13 @@ from runner.system import children, signals
 from runner.system.ports import check_port_free
 
 START_S = 5.0
-END_S = 0.3  # the broker stores nothing that would take time to write
+END_S = 0.3  # the broker has nothing to write to disk
 KEPT_LINES = 20
 OPEN = ("allow_anonymous true", "persistence false", "set_tcp_nodelay true")
 # Log errors only: otherwise each connection adds a line.
 SETTINGS = (
     "connection_messages false",
-    "user root",  # when started by root: after a change of user the kernel no longer ends it with this process
+    "user root",  # if started by root: after a change of user, the kernel would not end it with this process
     "log_type error",
     "log_timestamp false",
 )
@@ -36,7 +36,7 @@ SETTINGS = (
 class Broker:
     """mosquitto as a child process that ends with this one.
 
-    keys  the broker's directory of keys; None: it serves anybody
+    keys  the broker's directory of keys; None: no authentication
     """
 
     def __init__(self, endpoint: Endpoint, keys: Path | None = None) -> None:
@@ -60,7 +60,7 @@ class Broker:
                 text=True,
                 errors="replace",
                 pass_fds=[file],
-                start_new_session=True,  # Ctrl-C is for this process, and both sides sign off first
+                start_new_session=True,  # Ctrl-C must end only this process: both sides sign off at the broker first
             )
         finally:
             os.close(file)
@@ -89,7 +89,7 @@ class Broker:
         raise RunError(f"mosquitto does not start on {self._where}: {message}; choose another control.port")
 
     def reload(self) -> None:
-        """Read passwords and revocation list again; whoever is not accepted any more is disconnected."""
+        """Reload passwords and revocation list; clients that are no longer accepted are disconnected."""
         self._process.send_signal(signal.SIGHUP)
 
     def end(self) -> None:
@@ -111,7 +111,7 @@ class Broker:
 def private_broker(endpoint: Endpoint, keys: Path | None = None) -> Iterator[Broker]:
     """mosquitto on one address, without persistence, for the duration of the block.
 
-    keys    the broker's directory of keys; None: it serves anybody
+    keys    the broker's directory of keys; None: no authentication
     raises  RunError if mosquitto is missing or does not start
     """
     check_port_free(endpoint)

@@ -1,4 +1,4 @@
-"""One side's connection to the MQTT broker: kept alive, re-established after a loss, robust against its errors."""
+"""One side's connection to the MQTT broker: kept alive, re-established when lost, robust against broker errors."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
 
 CONNECT_S = 1.0  # one attempt to connect
-RETRY_S = (0.25, 1.0)  # between attempts, at first and at most
+RETRY_S = (0.25, 1.0)  # between attempts, initially and at most
 STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
 FAULTS = 100  # distinct message faults that are reported; further ones are only counted
-LONGEST_FAULT = 1000  # characters of why
-REPEATED = {"telemetry", "reception", "clock", "advice", "steering"}  # the next comes soon: without acknowledgement
-SUPERSEDED = REPEATED | {"state"}  # by a later message, and so not sent ...
-UNSENT_BYTES = 4096  # ... while this much waits: after an outage of the link it would delay what is current
+LONGEST_FAULT = 1000  # characters of a fault's reason
+PERIODIC = {"telemetry", "reception", "clock", "advice", "steering"}  # the next one follows soon: QoS 0
+SUPERSEDED = PERIODIC | {"state"}  # replaced by a later message, and so not sent ...
+UNSENT_BYTES = 4096  # ... while this much is queued: after an outage it would delay current messages
 RETAINED = ("state", "telemetry", "configuration")
 
 
 class _Client(Client):
     """A client whose loop survives a broker that violates the protocol.
 
-    on_broken  called with what was wrong
+    on_broken  called with the violation
     """
 
     on_broken: Callable[[Exception], None]
 
     def loop_forever(self, timeout: float = LOOP_S, retry_first_connection: bool = False) -> MQTTErrorCode:
-        """Runs in the thread that `loop_start` starts."""
+        """Run in the thread started by `loop_start`."""
         while True:
             try:
                 return super().loop_forever(timeout, retry_first_connection)
@@ -59,11 +59,11 @@ class _Client(Client):
 class ControlLink:
     """One side's connection to the broker, kept alive until it is closed. Callbacks run in the link's own thread.
 
-    will          topic and message that the broker publishes when this side is lost
+    will          topic and message that the broker publishes when this side disappears
     listen        by topic filter, the callback for its messages
-    on_connected  called with True when messages for this side will reach it, with False when the connection is lost
-    on_report     called with one line when the broker cannot be reached, once for each reason, and when it can again
-    login         how to prove who this side is; None: to a broker that does not ask
+    on_connected  called with True once this side receives its messages, with False when the connection is lost
+    on_report     called with one line when the broker is unreachable, once per reason, and when it is back
+    login         credentials of this side; None: the broker does not authenticate
 
     A message whose callback raises is reported and counted in `dropped`; the link continues.
     """
@@ -87,23 +87,23 @@ class ControlLink:
         self._client = self._new_client()
 
     def connect(self) -> None:
-        """Connect, and from then on stay connected; returns at once."""
+        """Connect, and stay connected; returns immediately."""
         self._client.connect_async(self._broker.host, self._broker.port, KEEPALIVE_S)
         self._client.loop_start()
 
     def wait_connected(self, seconds: float) -> bool:
-        """Wait until messages for this side will reach it; returns whether they do."""
+        """Wait until this side receives its messages; returns whether it does."""
         return self._listening.wait(seconds)
 
     def publish(self, topic: str, message: JsonObject, *, behind: bool = False) -> bool:
         """Send a message; the broker keeps state, telemetry and configuration for late subscribers.
 
         Without a connection nothing is sent or queued: after a reconnection only current values count. Messages with
-        acknowledgement that were on their way when the connection was lost are sent again. What a later message
+        acknowledgement that were in flight when the connection was lost are resent. A message that a later one
         supersedes is not sent while earlier ones wait for the link.
 
-        behind   send it though earlier ones wait
-        returns  False if it was not sent because others wait
+        behind   send it although earlier ones wait
+        returns  False if it was not sent because earlier ones wait
         """
         if not self._listening.is_set():
             return True
@@ -116,7 +116,7 @@ class ControlLink:
         return True
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
-        """Disconnect, after sending final messages such as the last will would contain."""
+        """Disconnect after sending final messages, such as that of the last will."""
         self._closing.set()
         for topic, message in goodbye if self._listening.is_set() else ():
             with suppress(ValueError, RuntimeError):  # the connection has just been lost
@@ -127,7 +127,7 @@ class ControlLink:
         ending.join(CLOSE_S)
 
     def is_behind(self) -> bool:
-        """Whether the kernel holds UNSENT_BYTES or more that it could not send yet."""
+        """Whether the kernel has UNSENT_BYTES or more queued for sending."""
         poll, sock = select.poll(), self._client.socket()
         try:
             poll.register(sock, select.POLLOUT)  # type: ignore[arg-type]  # None is a TypeError
@@ -136,9 +136,9 @@ class ControlLink:
             return False
 
     def _has_moved(self) -> bool:
-        """Whether this machine has given up the address that the connection uses, as a modem that roams does.
+        """Whether this machine no longer has the local address of the connection, for example after roaming.
 
-        Its packets go nowhere then, which TCP would notice after STALLED_S only.
+        Its packets are then lost, which TCP would notice only after STALLED_S.
         """
         sock = self._client.socket()
         try:
@@ -152,46 +152,46 @@ class ControlLink:
             return error.errno == errno.EADDRNOTAVAIL
 
     def _drop_connection(self) -> None:
-        """The loop then connects again."""
+        """Shut the connection down; the loop reconnects."""
         with suppress(OSError, AttributeError):  # it has just been lost
             self._client.socket().shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
 
     def _new_client(self) -> _Client:
-        # With an id of its own, a new connection ends the old one, whose will the broker would publish later otherwise.
+        # With a fixed id, a new connection ends the old one, whose will the broker would otherwise publish later.
         client = _Client(CallbackAPIVersion.VERSION2, client_id=f"tod{uuid.uuid4().hex[:20]}")
         client.on_broken = self._on_broken
         client.connect_timeout = CONNECT_S
         client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
         topic, message = self._will
-        client.will_set(topic, json.dumps(message), qos=1, retain=_kept(topic))
-        client.on_socket_open = _settle
+        client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
+        client.on_socket_open = _configure_socket
         if self._login:
             client.tls_set_context(self._login.context)
             client.on_pre_connect = self._log_in
             client.on_socket_open = self._check_broker
         client.on_connect_fail = lambda *_: self._failed_to_connect(sys.exception())
-        client.on_connect = self._connected
-        client.on_subscribe = self._subscribed
-        client.on_disconnect = lambda *_: self._disconnected()
-        for wanted, function in self._listen.items():
-            client.message_callback_add(wanted, self._guarded(function))
+        client.on_connect = self._on_connect
+        client.on_subscribe = self._on_subscribe
+        client.on_disconnect = lambda *_: self._on_disconnect()
+        for topic_filter, function in self._listen.items():
+            client.message_callback_add(topic_filter, self._guarded(function))
         return client
 
     def _log_in(self, client: Client, _data: object) -> None:
-        """Keys may have been replaced since the last connection."""
+        """Use the current keys, which may have been replaced since the last connection."""
         assert self._login
         client.username_pw_set(self._login.user, self._login.refresh())
 
     def _check_broker(self, client: Client, data: object, sock: Any) -> None:
         assert self._login
         self._login.check(sock)
-        _settle(client, data, sock)
+        _configure_socket(client, data, sock)
 
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
             try:
                 function(MqttMessage(message.topic, bytes(message.payload), message.retain))
-            except ValueError as error:  # from the reader of a message: the message is invalid
+            except ValueError as error:  # from the parser: the message is invalid
                 self._drop(message, str(error))
             except Exception as error:
                 self._drop(message, f"{type(error).__name__}: {error}")
@@ -206,24 +206,24 @@ class ControlLink:
             self._on_report(fault)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
-        qos = 0 if _is_one_of(REPEATED, topic) else 1
-        return self._client.publish(topic, json.dumps(message), qos=qos, retain=_kept(topic))
+        qos = 0 if _is_one_of(PERIODIC, topic) else 1
+        return self._client.publish(topic, json.dumps(message), qos=qos, retain=_is_retained(topic))
 
-    def _connected(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+    def _on_connect(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
             self._failed_to_connect(RunError(f"refused: {code}".lower()))
         else:
             self._subscribe()
 
     def _subscribe(self) -> None:
-        self._client.subscribe([(wanted, 1) for wanted in self._listen])
+        self._client.subscribe([(topic_filter, 1) for topic_filter in self._listen])
 
-    def _subscribed(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
-        if refused := [wanted for wanted, code in zip(self._listen, codes, strict=False) if code.is_failure]:
+    def _on_subscribe(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
+        if refused := [each for each, code in zip(self._listen, codes, strict=False) if code.is_failure]:
             self._failed_to_connect(RunError(f"refused to subscribe to {', '.join(refused)}"))
-            again = threading.Timer(RETRY_S[-1], self._subscribe)
-            again.daemon = True
-            again.start()
+            retry = threading.Timer(RETRY_S[-1], self._subscribe)
+            retry.daemon = True
+            retry.start()
             return
         if self._connection_fault:
             self._connection_fault = None
@@ -231,34 +231,34 @@ class ControlLink:
         self._listening.set()
         self._on_connected(True)
 
-    def _disconnected(self) -> None:
+    def _on_disconnect(self) -> None:
         if self._listening.is_set():
             self._listening.clear()
             self._on_connected(False)
 
     def _on_broken(self, error: Exception) -> None:
-        self._disconnected()
+        self._on_disconnect()
         self._failed_to_connect(error)
 
     def _failed_to_connect(self, error: BaseException | None) -> None:
         why = str(getattr(error, "strerror", None) or error).lower()
         if why != self._connection_fault and not self._closing.is_set():
             self._connection_fault = why
-            self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; trying again")
+            self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; retrying")
 
 
 def _is_one_of(kinds: set[str], topic: str) -> bool:
     return bool(kinds.intersection(topic.split("/")[2:3]))
 
 
-def _kept(topic: str) -> bool:
+def _is_retained(topic: str) -> bool:
     return topic.split("/")[2:] in [[name] for name in RETAINED]
 
 
-def _settle(_client: object, _data: object, sock: Any) -> None:
+def _configure_socket(_client: object, _data: object, sock: Any) -> None:
     if isinstance(sock, socket.socket):
-        # Without this, small messages are held back for 20 ms (Nagle's algorithm).
+        # Otherwise small messages are delayed by 20 ms (Nagle's algorithm).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STALLED_S))
-        # A socket that is behind is writable again when half of this is left.
+        # A socket that is behind becomes writable again when half of this is left.
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * UNSENT_BYTES)

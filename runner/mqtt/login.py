@@ -1,4 +1,4 @@
-"""How one side proves to the broker who it is, and how it knows the broker."""
+"""Mutual authentication of one side and the MQTT broker."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from runner.security.keyring import Keyring, mqtt_password
 
 
 class Login:
-    """User name, password and TLS settings of a holder of keys. The files are read again for each connection.
+    """User name, password and TLS settings of a holder of keys. The files are reread for each connection.
 
-    on_report  called with what is wrong with new files
+    on_report  called with the problem of new files
     """
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
         self._keyring = keyring
         self._revoked = keyring.watched_revoked(on_report)
         self._own = keyring.watched_certificate(on_report)
-        self._broker, self._used = 0, b""  # serial number of the broker's certificate, own certificate, in use
+        self._broker, self._used = 0, b""  # in use: serial number of the broker's certificate, own certificate
         self.user = keyring.holder.name
         self.context = ssl.create_default_context(cafile=keyring.authority)
         self.context.check_hostname = False  # see `check`
@@ -30,7 +30,7 @@ class Login:
         self.refresh()
 
     def refresh(self) -> str:
-        """Load certificate, key and revocation list as they are now; returns the password.
+        """Load the current certificate, key and revocation list; returns the password.
 
         raises  OSError, ssl.SSLError, UserError for files that cannot be used
         """
@@ -40,16 +40,16 @@ class Login:
         return mqtt_password(self._keyring.secret)
 
     def check(self, connection: ssl.SSLSocket) -> None:
-        """The broker is known by its role in a certificate of the authority, whatever address it is reached at.
+        """Identify the broker by the role in its certificate, whatever its address.
 
         raises  RunError, before the password is sent
         """
         certificate: dict[str, Any] = dict(connection.getpeercert() or {})
         subject = dict(pair for entry in certificate.get("subject", ()) for pair in entry)
         if subject.get("organizationalUnitName") != Role.BROKER:
-            raise RunError("what answers there is not the broker: its certificate is of another role")
+            raise RunError("the peer is not the broker: its certificate is of another role")
         self._broker = int(certificate["serialNumber"], 16)
 
     def has_changed(self) -> bool:
-        """Whether the connection has to be made anew: the broker's keys were withdrawn, or there are new ones."""
+        """Whether to reconnect: the broker's certificate is revoked, or there are new keys."""
         return self._broker in self._revoked.get() or self._used != self._own.get()

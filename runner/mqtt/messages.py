@@ -6,10 +6,10 @@ Topics of a vehicle, below tod/<vehicle>/:
                          retained. The vehicle stamps it on receipt.
     reply/<operator>     to that operator: the same id, and applied (read back from the elements), refused, expired or
                          timed out
-    reception/<operator> to the vehicle, 25 times a second: what has arrived of every camera; never retained
-    clock/<operator>     to that operator, five times a second: when a report came, by the vehicle's clock
+    reception/<operator> to the vehicle, 25 times a second: what has arrived from every camera; never retained
+    clock/<operator>     to that operator, five times a second: when a report arrived, by the vehicle's clock
     advice               from the vehicle, ten times a second, if it knows `latency.fixed_ms`: speed by latency
-    steering             from the vehicle, up to 20 times a second: the steering angle that was reported to it
+    steering             from the vehicle, up to 20 times a second: the reported steering angle
     state, telemetry     from the vehicle, retained, so that late subscribers receive them
     configuration        from the vehicle, retained: what both sides must agree on
 
@@ -38,14 +38,14 @@ from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
-OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # it is shown to operators and logged
+OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
-SLACK_S = 0.5  # extra time for the vehicle's answer to a request carried out at the last moment
-MAX_ROUND_TRIP_S = 0.5  # a longer round trip does not excuse an old request: it is too long for driving
+SLACK_S = 0.5  # extra time for the answer to a request that was executed at the last moment
+MAX_ROUND_TRIP_S = 0.5  # allowed for an old request; a longer round trip is too long for driving
 
 JsonObject = Mapping[str, Any]
 
@@ -56,7 +56,7 @@ def topic(vehicle: str, *parts: str) -> str:
 
 
 def answer_s(expires_s: float) -> float:
-    """How long the vehicle's answer to a request may take, s: by then it has timed out.
+    """Timeout for the vehicle's answer to a request, s.
 
     expires_s  age from which the vehicle drops a request
     """
@@ -66,7 +66,7 @@ def answer_s(expires_s: float) -> float:
 class MqttMessage(NamedTuple):
     """A message as received.
 
-    retained  whether the broker had stored it
+    retained  whether it is the broker's stored copy
     """
 
     topic: str

@@ -1,11 +1,11 @@
 """Decoded pictures for programs: numpy arrays with the camera's name and the time of capture.
 
     with live_frames(["vehicle=delivery_robot"], cameras=["front"]) as frames:
-        for frame in frames:                          # waits for the next; ends when the with block is left
+        for frame in frames:                          # waits for the next one
             detect(frame.image, frame.captured)       # uint8, height x width x 3, RGB
 
-Runs alone, or beside an operator as a viewer like any other (`media.max_viewers`). A program that is slower than the
-cameras gets the newest picture of each and misses others; nothing queues up.
+Runs alone, or in addition to an operator as a viewer like any other (`media.max_viewers`). A program that is slower
+than the cameras gets the newest picture of each and misses others; nothing is queued.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from runner.plans import compile_plans
 from runner.security.exposure import viewer_keyring
 
 CHECK_S = 0.25  # how often cameras are checked for silence
-# A camera that has delivered FEW frames may be off: of each SELDOM_S it is expected for BRISK_S, and rebuilt meanwhile.
-FEW, BRISK_S, SELDOM_S = 5, 5.0, 30.0
+# A camera that delivers at most FEW frames may be off: it is expected, and rebuilt, only for RETRY_S of each PERIOD_S.
+FEW, RETRY_S, PERIOD_S = 5, 5.0, 30.0
 STOP_S = 1.0  # how long the last check may take
 
 
@@ -86,12 +86,12 @@ def live_frames(
 ) -> Iterator[Frames]:
     """Receive and decode cameras of a streaming vehicle; pipelines that fail or fall silent are rebuilt.
 
-    Those of cameras that stay silent, since they may be off, are rebuilt seldom.
+    A camera that stays silent may be off; its pipeline is rebuilt less often.
 
     overrides  Hydra overrides, as on the command line
     cameras    names; None: all
     report     called with camera and what happened to it
-    raises     ConfigError, UserError for an unknown camera, and for keys that are missing
+    raises     ConfigError; UserError for an unknown camera or missing keys
     """
     from runner import apply
 
@@ -113,9 +113,9 @@ def live_frames(
                 for name, received in side.sample(expected).items():
                     if received.frames - delivered[name] > FEW:
                         delivered[name], since[name] = received.frames, now
-                    expected[name] = (now - since[name]) % SELDOM_S < BRISK_S
+                    expected[name] = (now - since[name]) % PERIOD_S < RETRY_S
         finally:
-            frames.close()  # nothing waits for pictures of a side that has failed
+            frames.close()  # release a caller that waits for pictures of a failed side
 
     watcher = threading.Thread(target=watch, name="watch", daemon=True)
     watcher.start()

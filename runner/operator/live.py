@@ -1,4 +1,4 @@
-"""A running operator's side: control link, receivers and log together. The verb `operator` uses it; so may a program.
+"""A running operator's side: control link, receivers and log together. For the verb `operator` and for programs.
 
 with live_operator(["vehicle=delivery_robot"]) as operator:
     operator.station.listeners.append(mine)       # a runner.operator.station.Listener
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
-CONTROL_FIRST_S, LOOK_S = 1.0, 0.01  # how long the streams wait for the vehicle, and how often they look for it
+CONTROL_FIRST_S, POLL_S = 1.0, 0.01  # how long the streams wait for the vehicle, and how often they check
 STUCK_S = 2.0  # a side that samples nothing for this long hangs
 END_S = 1.0  # how long the last sample may take
 
@@ -50,7 +50,7 @@ class LiveOperator:
     vehicle  as this side's configuration describes it
     station  this end of the control link; its listeners must be added before `start`
 
-    requests  sent at their times since the vehicle came online, in the order of their times
+    requests  in order of time; each is sent at its time since the vehicle came online
     """
 
     def __init__(
@@ -90,13 +90,13 @@ class LiveOperator:
         notify("READY=1")
 
     def _await_vehicle(self) -> None:
-        """The vehicle should know of this operator before its cameras begin to fill the link."""
-        end = time.monotonic() + CONTROL_FIRST_S
-        while not self.station.state and time.monotonic() < end and not self._stopped.wait(LOOK_S):
+        """Let the vehicle learn of this operator before its cameras start to fill the link."""
+        deadline = time.monotonic() + CONTROL_FIRST_S
+        while not self.station.state and time.monotonic() < deadline and not self._stopped.wait(POLL_S):
             pass
 
     def runs(self, wait_s: float = 0.0) -> bool:
-        """Whether it still samples after a time; returns at once if it does not.
+        """Whether it is still sampling after a time; returns immediately if not.
 
         raises  RunError if it has ended early because of an error
         """
@@ -122,7 +122,7 @@ class LiveOperator:
         self._log.close()
 
     def problem(self) -> str | None:
-        """Why this side does not work; None: it does."""
+        """Why this side does not work; None if it works."""
         silent = time.monotonic() - self._sampled
         return f"nothing was sampled for {silent:.1f} s" if silent > STUCK_S else None
 
@@ -132,11 +132,11 @@ class LiveOperator:
         assert side
         try:
             self._repeat("sample", SAMPLE_S, lambda: self._sample(side))
-        except RunError as error:  # GStreamer hangs; kept for the main thread
+        except RunError as error:  # GStreamer hangs; the main thread raises it
             self._failure = error
 
     def _report(self) -> None:
-        """In its own thread, since a sample waits for GLib: the vehicle takes a missing report for a bad link."""
+        """In its own thread, since a sample waits for GLib: to the vehicle a missing report means a bad link."""
         side = self._side
         assert side
         self._repeat("reception report", REPORT_S, lambda: self._report_reception(side))
@@ -146,25 +146,25 @@ class LiveOperator:
             self.station.report_reception(side.take_arrivals())
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
-        """Do a piece of work until stopped; an exception in it must not end the operator's view of a moving vehicle.
+        """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.
 
         raises  RunError
         """
-        noted = ""
-        while not self._stopped.wait(every_s) and self._driven_s() < self._duration_s:
+        last_fault = ""
+        while not self._stopped.wait(every_s) and self._elapsed_s() < self._duration_s:
             try:
                 work()
             except RunError:
                 raise
             except Exception as error:
-                if noted != (noted := f"a {what} failed: {type(error).__name__}: {error}"):
-                    self.station.note(noted)
+                if last_fault != (last_fault := f"a {what} failed: {type(error).__name__}: {error}"):
+                    self.station.note(last_fault)
 
     def _sample(self, side: OperatorSide) -> None:
         self.station.take(side.sample(self.station.sending()))
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")
-        while self._requests and self._driven_s() >= self._requests[0].at_s:
+        while self._requests and self._elapsed_s() >= self._requests[0].at_s:
             request = self._requests.popleft()
             self.station.ask(request.event, partial(self._note_reply, request))
 
@@ -172,8 +172,8 @@ class LiveOperator:
         if reply.result != "applied":
             self.station.note(f"the request at {request.at_s:g} s was not applied: {reply.result}, {reply.reason}")
 
-    def _driven_s(self) -> float:
-        """Time since the vehicle came online, however slowly it started; below 0 before."""
+    def _elapsed_s(self) -> float:
+        """Time since the vehicle came online; negative before."""
         now = time.monotonic()
         if self._online_at is None:
             if not self.station.state and now < self._latest_start:
@@ -182,8 +182,8 @@ class LiveOperator:
         return now - self._online_at
 
 
-class _Measured(Listener):
-    """Passes news on to the metrics."""
+class _MetricsListener(Listener):
+    """Updates the metrics."""
 
     def __init__(self, metrics: SideMetrics) -> None:
         self._metrics = metrics
@@ -196,7 +196,7 @@ class _Measured(Listener):
 
 
 def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
-    """The node of ROS that publishes decoded pictures; None: none does.
+    """The ROS node that publishes decoded pictures; None if they are not published.
 
     raises  UserError
     """
@@ -211,7 +211,7 @@ def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
 def live_operator(
     overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
 ) -> Iterator[LiveOperator]:
-    """Everything that an operator's side needs; at the end it signs off from the vehicle and stops.
+    """Run an operator's side; at the end it signs off from the vehicle and stops.
 
     overrides  Hydra overrides, as on the command line
     log        directory that the drive is recorded to
@@ -253,7 +253,7 @@ def live_operator(
 
     operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)
     metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port)
-    station.listeners.append(_Measured(metrics))
+    station.listeners.append(_MetricsListener(metrics))
     try:
         if pictures:
             pictures.start()

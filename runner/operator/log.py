@@ -1,4 +1,4 @@
-"""The operator's log of a drive: the vehicle's messages, and the reception of each camera."""
+"""The operator's log of a drive: the vehicle's messages and the reception of each camera."""
 
 from __future__ import annotations
 
@@ -36,6 +36,6 @@ class DriveLog(Listener):
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
         clock = self._station.clock
         known = captured is not None and clock is not None and not self._station.untimed(name)
-        # Below 0 where the bound allows it: a reader gets the capture time back.
+        # May be negative within the bound, so that a reader can recover the capture time.
         ms = round(1000 * (arrived + clock.ahead_s - captured), 2) if known else None  # type: ignore[union-attr, operator]
         return round(arrived - self._log.time, 4), ms

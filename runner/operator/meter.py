@@ -9,7 +9,7 @@ from statistics import median
 from typing import Protocol
 
 WINDOW_S = 1.0
-SETTLE_S = 1.5  # a window counts for the comparison only if the decision is older than window and rate control
+SETTLE_S = 1.5  # a window is compared only if the decision is older: window length plus settling of the rate control
 
 
 class StreamCounters(Protocol):
@@ -75,7 +75,7 @@ class ReceptionMeter:
     followed: list[float] = field(default_factory=list)
     latencies_ms: list[float] = field(default_factory=list)
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that were received, with counts
-    short: int = 0  # settled windows with fewer frames than the camera's rate asks for
+    short: int = 0  # settled windows with too few frames for the camera's rate
     windows: int = 0
     _past: deque[tuple[float, StreamCounters]] = field(default_factory=deque)
     _decided: tuple[object, ...] | None = None
@@ -83,10 +83,10 @@ class ReceptionMeter:
     _counted: float = 0.0
 
     def add(self, t: float, counters: StreamCounters, decided: DecidedSetting | None) -> MeasuredRates:
-        """Take a sample of the counters at time t, s; a few times a second."""
-        settled_for = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
-        if settled_for != self._decided:
-            self._decided, self._since = settled_for, t
+        """Add a sample of the counters at time t, s; a few times a second."""
+        target = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
+        if target != self._decided:
+            self._decided, self._since = target, t
         self._past.append((t, counters))
         while len(self._past) > 2 and self._past[1][0] <= t - WINDOW_S:
             self._past.popleft()
@@ -117,7 +117,7 @@ class ReceptionMeter:
 
 
 def percentile(values: Iterable[float], share: float) -> float | None:
-    """The value below which a share of all lie; None if there are none."""
+    """The value below which a share of all values are; None if there are none."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from runner.records import CameraState, VehicleState
 
-# How a note begins, by the event that the decision follows; the fields are those of `runner.core.events.describe`.
+# First words of a note, by the event that caused the decision; fields as in `runner.core.events.describe`.
 CAUSES = {
     "bitrate_predicted": "Prediction {kbps} kbit/s",
     "mode_selected": "Mode {mode}",
@@ -44,19 +44,20 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
         return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s"
     reasons = [cameras[name].reason for name in changed]
     if len(changed) > 1:
-        each = [reason.split("; ")[1:] for reason in reasons]  # after the camera's own, those of the whole decision
-        shared = [part for part in each[0] if all(part in others for others in each)]
+        # Each has the camera's own reason first, then those of the whole decision.
+        common = [reason.split("; ")[1:] for reason in reasons]
+        shared = [part for part in common[0] if all(part in parts for parts in common)]
         total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
         reasons = ["; ".join([total, *shared])]
-    alike: dict[str, list[str]] = {}
+    names_by_change: dict[str, list[str]] = {}
     for name, change in changed.items():
-        alike.setdefault(change, []).append(name)
-    listed = "; ".join(f"{', '.join(names)} {change}" for change, names in alike.items())
+        names_by_change.setdefault(change, []).append(name)
+    listed = "; ".join(f"{', '.join(names)} {change}" for change, names in names_by_change.items())
     return f"{cause}: {listed} ({reasons[0]})"
 
 
 def _cause(described: str) -> str:
-    """The event's phrase; its unchanged text if this side does not know the event."""
+    """The event's phrase; its unchanged text if the event is unknown."""
     event, *words = described.split(" ")
     try:
         return CAUSES[event].format_map(dict(zip(words[::2], words[1::2], strict=False)))
@@ -65,7 +66,7 @@ def _cause(described: str) -> str:
 
 
 def _change(was: CameraState, now: CameraState) -> str:
-    """What changes for one camera; "" for nothing."""
+    """The change of one camera; "" if none."""
     factors = [_factor(was), _factor(now)]
     parts = [" -> ".join(factors)] if factors[0] != factors[1] else []
     if was.roi != (roi := now.roi):

@@ -1,4 +1,4 @@
-"""The state of the operator's side: the vehicle's messages and the reception of each camera. Feeds table and page."""
+"""State of the operator's side: the vehicle's messages and the reception of each camera, for table and page."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S
 
 CLOCK_S = 0.2  # between two comparisons of the clocks
-READINGS = 8  # latencies of a camera that may still turn out to be right
-MOST_VEHICLES = 100  # whose names are remembered
-UNHEARD_S = 10.0  # for so long it may still hear this side: an outage of one direction must not end its streams
-FOUND_S = 2.0  # a vehicle still unknown to the broker by then is probably misspelt
+READINGS = 8  # latencies of a camera that may still be confirmed
+MAX_VEHICLES = 100  # whose names are remembered
+ONE_WAY_S = 10.0  # how long a silent vehicle may still receive: an outage of one direction must not end its streams
+FOUND_S = 2.0  # a vehicle that the broker does not know after this time is probably misspelt
 
 OnReply = Callable[[Outcome], None]
 
 
 class Listener:
-    """Called, from any thread, with news; a subclass overrides the methods it needs. Times are s since 1970."""
+    """Called, from any thread, with updates; a subclass overrides the methods it needs. Times are s since 1970."""
 
     def on_state(self, state: VehicleState | None) -> None:
         """The vehicle's state; None: it is offline."""
@@ -71,14 +71,14 @@ class Listener:
         """The reception of all cameras, a few times a second."""
 
     def on_steering(self, at: float, rad: float) -> None:
-        """The steering angle that was reported to the vehicle at a time by this machine's clock."""
+        """The steering angle reported to the vehicle; `at` is by this machine's clock."""
 
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
 
 
 class CameraRow(NamedTuple):
-    """One camera: its rates and counters, and the vehicle's state of it, if known."""
+    """One camera: its rates and counters, and its state on the vehicle, if known."""
 
     name: str
     rates: MeasuredRates
@@ -95,8 +95,8 @@ class _PendingRequest(NamedTuple):
 class Station:
     """One operator's end of the control link, and the measurements of reception.
 
-    settings   those that the vehicle's configuration must agree with, see `runner.configuration.agreement`
-    keyring    of this operator; None: for a broker that does not ask, under an id of its own
+    settings   those that must agree with the vehicle's configuration, see `runner.configuration.agreement`
+    keyring    of this operator; None: no authentication, under a random id
     listeners  must be added before `connect`
 
     Requests go out through `ask`; samples of the cameras' counters come in through `take`.
@@ -110,9 +110,9 @@ class Station:
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
-        self.attention: Attention | None = None  # of the person who drives, as the page knows it
+        self.attention: Attention | None = None  # of the driver, as the page detects it
         self._telemetry: Telemetry | None = None
-        self._signed_off = False  # by itself, or by its last will
+        self._signed_off = False  # the vehicle, by itself or through its last will
         self._vehicle_time = (0.0, 0.0)  # the vehicle's time in the newest telemetry, and when it arrived
         self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name, for those known to the broker: whether online
@@ -123,13 +123,13 @@ class Station:
         self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
         self.clock: ClockDifference | None = None  # the vehicle's against this machine's; None: unknown
         self._clocks = ClockComparison()
-        self._clock_asked: deque[float] = deque(maxlen=round(KEPT_S / CLOCK_S))  # `sent` of reports without an answer
-        self._clock_due = 0.0  # time.monotonic of the next
-        # By camera, latencies by both clocks, and when each was read: right once a later exchange shows that no clock
-        # was set meanwhile.
+        self._clock_requests: deque[float] = deque(maxlen=round(KEPT_S / CLOCK_S))  # `sent` of unanswered reports
+        self._clock_due = 0.0  # time.monotonic of the next request
+        # By camera, time and value of latencies by both clocks: valid once a later exchange shows that no clock was set
+        # meanwhile.
         self._readings: dict[str, deque[tuple[float, float]]] = {name: deque(maxlen=READINGS) for name in self.meters}
         self._wall_ahead_s = 0.0  # of the monotonic clock, at the newest exchange
-        self._set_back = float("-inf")  # when a capture time went back: the vehicle's clock had been set
+        self._set_back = float("-inf")  # when a capture time went backwards: the vehicle's clock was set
         self.samples: Mapping[str, StreamCounters] = {}
         self._rates: dict[str, MeasuredRates] = {}
         self._newest: Mapping[str, Arrival] = {}  # by camera
@@ -150,11 +150,11 @@ class Station:
         )
 
     def connect(self) -> None:
-        """Connect to the broker, and stay connected; returns at once."""
+        """Connect to the broker, and stay connected; returns immediately."""
         self._link.connect()
 
     def close(self) -> None:
-        self.state = None  # signing off is not a loss
+        self.state = None  # so that signing off is not reported as a loss
         self._link.close((self._requests, OPERATOR_GONE))
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
@@ -172,10 +172,10 @@ class Station:
         self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
 
     def _announce(self, now: float) -> None:
-        """State that this operator is present, also to a vehicle that is not heard for a moment."""
+        """Announce this operator as present, also to a vehicle that is temporarily silent."""
         if self.state is not None:
             self.ask(self._presence())
-        elif self._may_be_heard(now):
+        elif self._may_reach_vehicle(now):
             event = {**self._presence(), "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
             self._link.publish(self._requests, event)
 
@@ -183,14 +183,14 @@ class Station:
         attention = self.attention  # another thread may replace it
         return {"event": "operator_connected", **({"attention": attention} if attention else {})}
 
-    def _may_be_heard(self, now: float) -> bool:
-        """Whether the vehicle may hear this side: it was heard lately and did not sign off."""
-        return not self._signed_off and 0 < now - self._vehicle_time[1] <= UNHEARD_S and self._vehicle_time[0] > 0
+    def _may_reach_vehicle(self, now: float) -> bool:
+        """Whether the vehicle may still receive from this side: it sent recently and did not sign off."""
+        return not self._signed_off and 0 < now - self._vehicle_time[1] <= ONE_WAY_S and self._vehicle_time[0] > 0
 
     def _vehicle_now(self, now: float) -> float:
         """The vehicle's time in the newest telemetry, plus the time since."""
-        t, came = self._vehicle_time
-        return round(t + now - came, 6)
+        t, arrived = self._vehicle_time
+        return round(t + now - arrived, 6)
 
     def note(self, text: str) -> None:
         note = Note(time.time(), text)
@@ -202,16 +202,16 @@ class Station:
         self.note(f"{camera}: {what}")
 
     def captured_here(self, name: str, captured: float | None) -> float | None:
-        """A camera's capture time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
-        return None if captured is None or self.untimed(name) else self._here(captured)
+        """Convert a camera's capture time, s since 1970, from the vehicle's clock to this machine's; None: unknown."""
+        return None if captured is None or self.untimed(name) else self._to_own_clock(captured)
 
-    def _here(self, at: float) -> float | None:
-        """A past time by the vehicle's clock, s since 1970, by this machine's; None: unknown."""
+    def _to_own_clock(self, at: float) -> float | None:
+        """Convert a past time, s since 1970, from the vehicle's clock to this machine's; None: unknown."""
         clock = self.clock  # another thread may replace it
         if clock is None or self._was_set():
             return None
         here = at - clock.ahead_s
-        return here if here <= time.time() + clock.bound_s else None  # of the future: a clock has been set
+        return here if here <= time.time() + clock.bound_s else None  # in the future: a clock was set
 
     def untimed(self, name: str) -> bool:
         """Whether the vehicle does not know when a camera's pictures are captured."""
@@ -221,18 +221,18 @@ class Station:
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
 
-        One whose source is being replaced sends nothing, and its session is kept.
+        A camera whose source is being replaced sends nothing, but keeps its session.
         """
         cameras = self.state.cameras if self.state else {}
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
-        """A sample of every camera's counters; to be called a few times a second, since it also checks timeouts."""
+        """Process a sample of all counters; to be called a few times a second, since it also checks timeouts."""
         now = time.monotonic()
         if self.state and now - self._last_message > SILENT_S:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
-        self._look_for_vehicle(now)
+        self._check_vehicle_name(now)
         self._announce(now)  # the heartbeat
         self._compare_clocks(now)
         samples = {name: self._with_latency(name, received, now) for name, received in samples.items()}
@@ -244,13 +244,13 @@ class Station:
             listener.on_sample(sample)
 
     def may_report(self) -> bool:
-        """Whether a report would be sent at once. While earlier ones wait, what arrives is kept for the next."""
+        """Whether a report would be sent immediately. While earlier ones wait, arrivals accumulate for the next."""
         return not self._link.is_behind()
 
     def report_reception(self, arrivals: Arrivals) -> None:
-        """Report to the vehicle what has arrived since the last report; to be called every REPORT_S, by one thread."""
+        """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread."""
         now = time.monotonic()
-        self._look_at_captures(arrivals.newest, now)
+        self._check_capture_times(arrivals.newest, now)
         frames = sorted((frame.arrived, name, frame) for name, some in arrivals.frames.items() for frame in some)
         if frames and self._delay_s is None:
             self._delay_s = frames[0][2].arrived - frames[0][2].captured
@@ -259,7 +259,7 @@ class Station:
             UnitReceived(name, round(now - at, 4), round(at - frame.captured - base, 4), frame.bytes, frame.whole)
             for at, name, frame in frames
         )
-        if not self._may_be_heard(now):
+        if not self._may_reach_vehicle(now):
             return
         report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, arrivals.packets, arrivals.lost)
         if arrivals.damaged:
@@ -270,15 +270,15 @@ class Station:
             self._clock_due = now + CLOCK_S
             sent = time.time()
             with self._lock:
-                self._clock_asked.append(sent)
+                self._clock_requests.append(sent)
             report = replace(report, sent=sent)
-        self._link.publish(self._receptions, to_json(report), behind=True)  # what it holds has been taken
+        self._link.publish(self._receptions, to_json(report), behind=True)  # its arrivals are in no other report
 
     def _worst_latency_ms(self, now: float) -> float | None:
-        """Latency of the slowest picture on show, at most, ms; None: unknown, or nothing is to be shown.
+        """Upper bound of the latency of the slowest displayed picture, ms; None: unknown, or nothing is displayed.
 
-        Unknown as soon as the source of one has a fault. Of each camera the greater of its newest access unit's to
-        arrival and the last sampled one's to decoding; and by how much the next one is overdue.
+        Unknown if any source has a fault. For each camera it is the greater of the newest access unit's latency to
+        arrival and the last sampled one's to decoding, plus the time by which the next one is overdue.
         """
         clock, state, found = self.clock, self.state, []
         if self._was_set():
@@ -287,7 +287,7 @@ class Station:
         for name, camera in (state.cameras if state else {}).items():
             if not camera.sending:
                 continue
-            if camera.fault or self.untimed(name):  # it may repeat a picture: the age of what arrives says nothing
+            if camera.fault or self.untimed(name):  # it may repeat a picture, whose age is unknown
                 return None
             sampled, newest = self.samples.get(name), self._newest.get(name)
             if not clock or not newest or not sampled or sampled.latency_ms is None or now - self._sampled > CURRENT_S:
@@ -321,7 +321,7 @@ class Station:
             self.note(f"{why}: latencies are unknown")
 
     def _with_latency(self, name: str, received: Any, now: float) -> StreamCounters:
-        """Counters whose latency is by both clocks, made one by this machine's; None if their difference is unknown."""
+        """Counters with the latency corrected for the clock difference; None if that is unknown."""
         readings = self._readings[name]
         if received.latency_ms is not None and (not readings or readings[-1][0] != received.latency_at):
             readings.append((received.latency_at, received.latency_ms))
@@ -330,17 +330,17 @@ class Station:
         return counters
 
     def _latency_ms(self, readings: Iterable[tuple[float, float]], now: float) -> float | None:
-        """The newest that is right; without the control link, which tells of clocks that were set, just the newest."""
+        """The newest confirmed one; without the control link, which reveals that clocks were set, the newest."""
         silent = now - self._clocks.last_sent > CURRENT_S
-        recent = [(at, apart_ms) for at, apart_ms in readings if now - at <= CURRENT_S]
-        for at, apart_ms in reversed(recent):
-            latency_ms = latency(apart_ms, self.clock)
+        recent = [(at, raw_ms) for at, raw_ms in readings if now - at <= CURRENT_S]
+        for at, raw_ms in reversed(recent):
+            latency_ms = latency(raw_ms, self.clock)
             if latency_ms is not None and (silent or self._clocks.held(at - latency_ms / 1000, at)):
                 return latency_ms
         return None
 
-    def _look_at_captures(self, newest: Mapping[str, Arrival], now: float) -> None:
-        """Notice a vehicle's clock that was set back before the next exchange shows it."""
+    def _check_capture_times(self, newest: Mapping[str, Arrival], now: float) -> None:
+        """Detect that the vehicle's clock was set back, before the next exchange shows it."""
         before, self._newest = self._newest, newest
         if any(name in before and arrival.captured < before[name].captured for name, arrival in newest.items()):
             self._set_back = now
@@ -372,9 +372,9 @@ class Station:
         return self.state.cameras.get(name) if self.state else None
 
     def _on_any_state(self, message: MqttMessage) -> None:
-        """The state of any vehicle at the broker: of another one only the name is used."""
+        """The state of any vehicle at the broker; of other vehicles only the name is used."""
         name, state = message.topic.split("/")[1], read_state(message.payload)
-        if len(self._vehicles) < MOST_VEHICLES or name in self._vehicles:
+        if len(self._vehicles) < MAX_VEHICLES or name in self._vehicles:
             self._vehicles[name] = state is not None
         if name != self._vehicle.name:
             return
@@ -406,15 +406,17 @@ class Station:
             listener.on_state(state)
 
     def _note_changes(self, before: VehicleState, state: VehicleState) -> None:
-        """One note of a decision, and one when the rules fail or work again."""
+        """A note about a decision, and one when the rules fail or recover."""
         if state.fault != before.fault:
-            self.note(f"{state.fault}; the decision before stays in force" if state.fault else "the rules decide again")
+            self.note(
+                f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
+            )
         if text := decision_note(before, state):
             self.note(text)
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
-        if message.retained:  # published before: no heartbeat, and not the vehicle's current time
+        if message.retained:  # old: no heartbeat, and not the vehicle's current time
             return
         self._vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
@@ -422,7 +424,7 @@ class Station:
 
     def _on_steering(self, message: MqttMessage) -> None:
         steering = read_steering(message.payload)
-        at = None if message.retained else self._here(steering.at)
+        at = None if message.retained else self._to_own_clock(steering.at)
         if at is not None:
             for listener in self.listeners:
                 listener.on_steering(at, steering.rad)
@@ -433,8 +435,8 @@ class Station:
         own_s = clock_error_s()
         errors_s = None if own_s is None or answer.error_s is None else own_s + answer.error_s
         with self._lock:
-            if not message.retained and answer.sent in self._clock_asked:
-                self._clock_asked.remove(answer.sent)
+            if not message.retained and answer.sent in self._clock_requests:
+                self._clock_requests.remove(answer.sent)
                 set_s = (own_set_s, answer.set_s)
                 self._clocks.add(
                     now, Exchange(answer.sent, answer.received, answer.answered, returned, set_s, errors_s)
@@ -442,46 +444,46 @@ class Station:
                 self._wall_ahead_s = own_set_s
 
     def _on_configuration(self, message: MqttMessage) -> None:
-        """Report where the vehicle's configuration differs from this side's; the vehicle's decisions are shown here."""
+        """Report where the vehicle's configuration differs from this side's."""
         differences = agreement.differences(self._settings, read_settings(message.payload).settings)
         if differences and differences != self._differences:
             self.note(f"the vehicle has another configuration: {differences}")
         self._differences = differences
 
-    def _look_for_vehicle(self, now: float) -> None:
-        """Report once which vehicles the broker knows, if this one is not among them."""
+    def _check_vehicle_name(self, now: float) -> None:
+        """Report once which vehicles are online, if this one is unknown to the broker."""
         if self._connected_at is None or now - self._connected_at < FOUND_S:
             return
         self._connected_at = None
         if self._vehicle.name not in self._vehicles:
             online = sorted(name for name, is_online in self._vehicles.items() if is_online)
-            known = f"online are {', '.join(online)}" if online else "no vehicle is online"
-            self.note(f"the broker knows no vehicle named {self._vehicle.name}, {known}")
+            known = f"online: {', '.join(online)}" if online else "no vehicle is online"
+            self.note(f"the broker knows no vehicle named {self._vehicle.name}; {known}")
 
     def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)
         with self._lock:
-            asked = self._pending.pop(reply.id, None)
-        if asked is None:
+            pending = self._pending.pop(reply.id, None)
+        if pending is None:
             return
-        if asked.on_reply:
-            asked.on_reply(reply)
+        if pending.on_reply:
+            pending.on_reply(reply)
         elif reply.result == "refused":
-            self.note(f"{asked.event} refused: {reply.reason}")
+            self.note(f"{pending.event} refused: {reply.reason}")
 
     def _time_out(self, now: float) -> None:
         with self._lock:
-            late = {identity: asked for identity, asked in self._pending.items() if now > asked.until}
-            for identity in late:
+            expired = {identity: each for identity, each in self._pending.items() if now > each.until}
+            for identity in expired:
                 del self._pending[identity]
-        for asked in late.values():
-            if asked.on_reply:
+        for pending in expired.values():
+            if pending.on_reply:
                 reason = f"no answer from the vehicle within {self.answer_s:g} s"
-                asked.on_reply(Outcome(self._vehicle_now(now), "timed out", reason))
+                pending.on_reply(Outcome(self._vehicle_now(now), "timed out", reason))
 
-    def _on_connected(self, here: bool) -> None:
-        self._connected_at = time.monotonic() if here else None
-        if not here:
+    def _on_connected(self, connected: bool) -> None:
+        self._connected_at = time.monotonic() if connected else None
+        if not connected:
             self._published = None
             self._vehicle_lost("the control link is lost")
 
@@ -515,7 +517,7 @@ def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSa
 
 
 def _stages(received: StreamCounters, measured: CameraTelemetry | None) -> LatencyStages:
-    """The parts of a camera's latency: those that each side has measured, and the link as what they leave over."""
+    """The parts of a camera's latency: those that each side has measured, and the link as the remainder."""
     capture, encode = (measured.capture_ms, measured.encode_ms) if measured else (None, None)
     buffer, decode, total = received.waited_ms, received.decode_ms, received.latency_ms
     parts = [part for part in (capture, encode, buffer, decode) if part is not None]

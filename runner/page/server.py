@@ -25,7 +25,7 @@ from runner.core.events import Attention
 from runner.core.model import Camera, Vehicle, plain
 from runner.errors import ConfigError, RunError, UserError
 from runner.graph import video_codec
-from runner.h264.access_unit import AccessUnit, Recent
+from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
 from runner.operator.station import Listener, Station
 from runner.page.control import Control, combined_attention, page_of
@@ -466,9 +466,9 @@ class PageServer(Listener):
         answer("refused" if problem else "applied", problem)
 
 
-def _recent(camera: Camera) -> Recent:
+def _recent(camera: Camera) -> RecentUnits:
     period = camera.graph.settings.get("key_interval_s")
-    return Recent(None if period is None else float(period), video_codec(camera.graph))
+    return RecentUnits(None if period is None else float(period), video_codec(camera.graph))
 
 
 class _FaultHandler(logging.Handler):

@@ -1,4 +1,4 @@
-"""Who may request what of this vehicle, by its keys."""
+"""Access control: who may request what of this vehicle, according to its keys."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from runner.security.keyring import Keyring, Person, Watched
 
 
 class Access:
-    """Answers for each request. Without keys anybody may request anything: nobody can prove who it is.
+    """Decides about each request. Without keys, anyone may request anything.
 
-    on_report  called with what is wrong with a new list of people
+    on_report  called with the problem of a new list of people
     """
 
     def __init__(self, keyring: Keyring | None = None, on_report: Callable[[str], None] = print) -> None:

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 from runner.records import Outcome, ReceptionReport
 
-WAITING = 64  # queued requests of one sender; further ones are refused
+MAX_QUEUED = 64  # requests of one sender; further ones are refused
 ROUND_S = 0.1
-TAKEN = 32  # requests taken from one sender per round: a flood leaves CPU time to others
-SENDERS = 64  # senders with queued requests; requests of further senders are refused
+MAX_PER_ROUND = 32  # requests processed per sender and round: a flood leaves CPU time for others
+MAX_SENDERS = 64  # senders with queued requests; requests of further senders are refused
 MODE_CHANGING = "mode_selected"
 MEASUREMENTS = (
     "position_reported",
@@ -29,7 +29,7 @@ class Request(NamedTuple):
     """An event as JSON without `t`, and how to answer it.
 
     sender  operator's id from the topic; "" for this process
-    as_of   see `runner.vehicle.operators`; None for a sender that need not state it: this process
+    as_of   see `runner.vehicle.operators`; None for this process, which need not state it
     """
 
     sender: str
@@ -52,10 +52,10 @@ class Request(NamedTuple):
         return self.document.get("event") == MODE_CHANGING
 
 
-class Reported(NamedTuple):
-    """A reception report of an operator. None supersedes another: each holds what arrived since the one before.
+class QueuedReport(NamedTuple):
+    """A reception report of an operator. Reports do not supersede each other: each covers the time since the last.
 
-    state_clock  states the vehicle's clock to the operator; None: it did not ask
+    state_clock  sends the vehicle's clock to the operator; None: it was not requested
     """
 
     sender: str
@@ -64,7 +64,7 @@ class Reported(NamedTuple):
 
     @property
     def queue(self) -> str:
-        """Reports do not take the place of the sender's requests."""
+        """Its own queue, so that reports do not displace the sender's requests."""
         return f"{self.sender}/reception"
 
     @property
@@ -76,11 +76,11 @@ class Reported(NamedTuple):
         return False
 
 
-Item = Request | Reported
+Item = Request | QueuedReport
 
 
 class Inbox:
-    """Requests of all senders, one of each in turn. May be used from any thread.
+    """Requests of all senders, served round-robin. May be used from any thread.
 
     Requests are never merged or reordered, except that a measurement replaces an older one of the same quantity,
     unless a request in between changes the mode.
@@ -94,15 +94,15 @@ class Inbox:
         self._round_ends = 0.0
 
     def put(self, request: Item) -> Item | None:
-        """Queue a request; returns the one that is refused as a result: itself, an older measurement, or None."""
+        """Queue a request; returns the one that is dropped as a result: itself, an older measurement, or None."""
         with self._filled:
             waiting = self._waiting.get(request.queue)
             if waiting is None:
-                if len(self._waiting) >= SENDERS:
+                if len(self._waiting) >= MAX_SENDERS:
                     return request
                 waiting = self._waiting[request.queue] = deque()
             older = _superseded(waiting, request)
-            if older is None and len(waiting) >= WAITING:
+            if older is None and len(waiting) >= MAX_QUEUED:
                 return request
             superseded = None if older is None else waiting[older]
             if older is not None:
@@ -118,20 +118,20 @@ class Inbox:
             self._filled.notify()
 
     def senders(self) -> frozenset[str]:
-        """Those whose requests or reports are waiting."""
+        """Senders with queued requests or reports."""
         with self._filled:
             return frozenset(waiting[0].sender for waiting in self._waiting.values())
 
-    def full(self, sender: str) -> bool:
-        """Whether a further request of a sender would probably be refused."""
-        return len(self._waiting.get(sender, ())) >= WAITING
+    def is_full(self, sender: str) -> bool:
+        """Whether another request of a sender would probably be refused."""
+        return len(self._waiting.get(sender, ())) >= MAX_QUEUED
 
     def get(self, until: float) -> Item | None:
         """The next request, as soon as there is one; None once woken or after `until`, by `time.monotonic()`."""
         with self._filled:
             while True:
                 now = time.monotonic()
-                sender = self._turn(now)
+                sender = self._next_sender(now)
                 if sender is not None or self._woken or now >= until:
                     break
                 self._filled.wait(min(until, self._round_ends if self._waiting else until) - now)
@@ -141,16 +141,16 @@ class Inbox:
             waiting = self._waiting.pop(sender)
             request = waiting.popleft()
             if waiting:
-                self._waiting[sender] = waiting  # behind all others
+                self._waiting[sender] = waiting  # after all others
             self._taken[sender] = self._taken.get(sender, 0) + 1
             return request
 
-    def _turn(self, now: float) -> str | None:
+    def _next_sender(self, now: float) -> str | None:
         """The sender whose turn it is."""
         if now >= self._round_ends:
             self._taken.clear()
             self._round_ends = now + ROUND_S
-        return next((sender for sender in self._waiting if self._taken.get(sender, 0) < TAKEN), None)
+        return next((sender for sender in self._waiting if self._taken.get(sender, 0) < MAX_PER_ROUND), None)
 
 
 def _superseded(waiting: deque[Item], newer: Item) -> int | None:

@@ -1,4 +1,4 @@
-"""A streaming vehicle: cameras, loop and control link together. The verb `vehicle` uses it; so may a program.
+"""A streaming vehicle: cameras, loop and control link together. For the verb `vehicle` and for programs.
 
 with live_vehicle(["source=appsrc"]) as vehicle:
     vehicle.start()                               # the loop runs in its own thread
@@ -54,7 +54,7 @@ from runner.security.keyring import Keyring
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
-from runner.vehicle.inbox import Reported, Request
+from runner.vehicle.inbox import QueuedReport, Request
 from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 STUCK_S = 2.0  # a loop that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
-NAME_CHECK_S = 0.5  # telemetry comes five times a second; if none has come by then, the name is free
+NAME_CHECK_S = 0.5  # telemetry is sent five times a second; without any within this time, the name is free
 CONSOLE_LINES = 1000
 TOPICS = {
     VehicleState: "state",
@@ -80,7 +80,7 @@ class LiveVehicle:
 
     side     the cameras
     loop     events in, commands out; `loop.post` takes events from any thread
-    failure  why the vehicle had to end; None: it runs, or was stopped
+    failure  why the vehicle had to end; None: it is running, or was stopped
     """
 
     def __init__(self, side: VehicleSide, loop: ControlLoop) -> None:
@@ -96,7 +96,7 @@ class LiveVehicle:
         self._thread.start()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Run the loop here, until `stop` or for a given time.
+        """Run the loop in this thread, until `stop` or for a given time.
 
         raises  RunError if the vehicle had to end, for example because another one has its name
         """
@@ -148,14 +148,14 @@ class LiveVehicle:
                 notify("WATCHDOG=1")
 
     def problem(self) -> str | None:
-        """Why the vehicle does not work; None: it does."""
+        """Why the vehicle does not work; None if it works."""
         if time.monotonic() - self.loop.beat <= STUCK_S:
             return None
         return f"the control loop hangs in {self.loop.busy_with or 'nothing'}"
 
 
 class _Console:
-    """Passes lines on in its own thread, so that a stopped terminal (Ctrl-S) blocks nothing else."""
+    """Prints lines in a separate thread, so that a stopped terminal (Ctrl-S) blocks nothing else."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -180,7 +180,7 @@ class _Console:
 class _VehicleControl:
     """The vehicle's end of the control link: requests in, replies, state, telemetry and configuration out.
 
-    Nothing is published until it is known that no other vehicle of this name is at the broker.
+    Nothing is published until it is certain that no other vehicle of this name is connected to the broker.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class _VehicleControl:
         self._name, self._on_report = vehicle.name, on_report
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
-        self._alone = threading.Event()
+        self._is_name_free = threading.Event()
         self._announce_timer: threading.Timer | None = None
         listen = {
             self._topic("request", "+"): self._on_request,
@@ -211,21 +211,21 @@ class _VehicleControl:
         self._link.connect()
 
     def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice | SteeringAngle) -> bool:
-        """Returns False if it has to wait, since the link is behind."""
-        return not self._alone.is_set() or self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
+        """Publish a record; returns False if it has to wait because the link is behind."""
+        return not self._is_name_free.is_set() or self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
     def close(self) -> None:
         if self._announce_timer:
             self._announce_timer.cancel()
-        self._link.close(*([(self._topic("state"), OFFLINE)] if self._alone.is_set() else []))
+        self._link.close(*([(self._topic("state"), OFFLINE)] if self._is_name_free.is_set() else []))
 
     def _topic(self, *parts: str) -> str:
         return topic(self._name, *parts)
 
-    def _on_connected(self, here: bool) -> None:
-        if here and self._alone.is_set():
+    def _on_connected(self, connected: bool) -> None:
+        if connected and self._is_name_free.is_set():
             self._announce()
-        elif here:
+        elif connected:
             self._announce_timer = threading.Timer(NAME_CHECK_S, self._announce)
             self._announce_timer.daemon = True
             self._announce_timer.start()
@@ -233,7 +233,7 @@ class _VehicleControl:
     def _announce(self) -> None:
         if self._live.failure:
             return
-        self._alone.set()
+        self._is_name_free.set()
         self.publish(self._settings)
         self._live.loop.publish_again()  # the broker may have published the last will, or lost everything
 
@@ -261,37 +261,37 @@ class _VehicleControl:
         except ValueError:
             self._live.loop.reject(message.sender)
             raise
-        asked = self._topic("clock", message.sender)
+        clock_topic = self._topic("clock", message.sender)
 
         def state_clock() -> None:
             assert report.sent is not UNSET
             now = time.time()
             answer = ClockAnswer(report.sent, received, now, wall_ahead_s(), clock_error_s())
-            self._link.publish(asked, to_json(answer))
+            self._link.publish(clock_topic, to_json(answer))
 
-        self._live.loop.take(Reported(message.sender, report, None if report.sent is UNSET else state_clock))
+        self._live.loop.take(QueuedReport(message.sender, report, None if report.sent is UNSET else state_clock))
 
     def _on_telemetry(self, message: MqttMessage) -> None:
-        """Before this vehicle has published anything, live telemetry is another vehicle's."""
-        if not self._alone.is_set() and not message.retained and read_telemetry(message.payload):
+        """Before this vehicle has published anything, live telemetry comes from another vehicle."""
+        if not self._is_name_free.is_set() and not message.retained and read_telemetry(message.payload):
             rule = "choose another `name`, or stop the other vehicle"
             self._live.fail(RunError(f"a vehicle named {self._name} is already connected to the broker; {rule}"))
 
     def _on_state(self, message: MqttMessage) -> None:
-        """A last will that the broker publishes late, when the vehicle is already back."""
-        if self._alone.is_set() and read_state(message.payload) is None:
+        """Correct a last will that the broker publishes late, when the vehicle is already back."""
+        if self._is_name_free.is_set() and read_state(message.payload) is None:
             self._live.loop.publish_again()
 
     def _on_configuration(self, message: MqttMessage) -> None:
         run = read_settings(message.payload).run
         own = run == self._settings.run
-        if self._alone.is_set() and not message.retained and not own and run not in self._others:
+        if self._is_name_free.is_set() and not message.retained and not own and run not in self._others:
             self._others.add(run)
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
 def _check_ros(vehicle: Vehicle) -> None:
-    """raises UserError if the node of ROS would find others that need not prove who they are"""
+    """raises UserError if the ROS node would discover unauthenticated nodes"""
     if any(camera.topic for camera in vehicle.cameras.values()):
         from runner.ros.process import check_discovery
 
@@ -301,7 +301,7 @@ def _check_ros(vehicle: Vehicle) -> None:
 def ros_cameras(
     vehicle: Vehicle, push: Callable[[str, SharedPicture], bool], report: Callable[[str], None]
 ) -> RosCameras | None:
-    """The node that subscribes to the topics of a vehicle's cameras; None: none has one."""
+    """The node that subscribes to the topics of a vehicle's cameras; None if no camera has one."""
     if not any(camera.topic for camera in vehicle.cameras.values()):
         return None
     from runner.ros.cameras import RosCameras
@@ -321,10 +321,10 @@ def live_vehicle(
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
 ) -> Iterator[LiveVehicle]:
-    """Everything that the vehicle's side needs, stopped and disconnected at the end.
+    """Run the vehicle's side; at the end it is stopped and disconnected.
 
     log       directory that the drive is recorded to
-    say       called, from a separate thread, with one line for each event
+    say       called, from a separate thread, with one line per event
     progress  called with the progress of rendering a synthetic drive
     raises    ConfigError, RunError
     """

@@ -1,4 +1,4 @@
-"""The live loop of the vehicle: take an event, step, apply, log, publish. Kept simple, and survives exceptions."""
+"""The vehicle's live loop: take an event, step, apply, log, publish. Kept simple; survives exceptions."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from runner.records import (
 )
 from runner.schema import event_problem
 from runner.vehicle.access import Access
-from runner.vehicle.inbox import WAITING, Answer, Inbox, Item, Reported, Request
+from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.uplink import MeasuredUplink
 
@@ -54,15 +54,15 @@ if TYPE_CHECKING:
 
 TICK_S = 0.1  # time between clock_advanced events
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
-STATE_S = 0.2  # between two states, unless a request waits for its answer: each is some kB on the link that it limits
-REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; while no operator is present
-CLOCK_S = 0.1  # between two statements of the clock to an operator; it asks five times a second
-KEY_FRAME_S = 1.0  # between two key frames that repair pictures of a camera: each takes bits from the next ones
-STEERING_S = 0.05  # between two steering angles published: each takes 0.2 kB of the link that video needs
-ADVICE_S = 0.2  # how long a reported latency, and what is advised because of it, counts
-POSITION_S = 5.0  # a position that is older is not where the vehicle is
+STATE_S = 0.2  # between two states, unless a request waits for its answer: each takes some kB of a limited link
+REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; the second without an operator
+CLOCK_S = 0.1  # between two answers about the clock to an operator, which asks five times a second
+KEY_FRAME_S = 1.0  # between two key frames that repair a camera's pictures: each costs bits of the next pictures
+STEERING_S = 0.05  # between two published steering angles: each costs the video 0.2 kB of the link
+ADVICE_S = 0.2  # how long a reported latency, and the advice based on it, is valid
+POSITION_S = 5.0  # an older position is stale
 REPEAT_S = 10.0  # the same fault is reported no more often than this
-REFUSALS = 10  # refusals that a sender is answered between two ticks; further ones are only counted
+REFUSALS = 10  # refusals answered per sender between two ticks; further ones are only counted
 
 
 class Applier(Protocol):
@@ -81,7 +81,7 @@ class Applier(Protocol):
 
 
 class _PendingReply(NamedTuple):
-    """An accepted request, which is answered once its commands are read back as applied."""
+    """An accepted request, answered once its commands are read back as applied."""
 
     answer: Answer
     knobs: Sequence[tuple[str, str]]  # camera, knob
@@ -92,13 +92,13 @@ class _PendingReply(NamedTuple):
 class ControlLoop:
     """Events in, commands out, in one thread. Other threads `post` their events.
 
-    publish      called with the state (decided and applied) whenever it changed, and telemetry a few times a second;
-                 returns False for one that has to wait, since the control link is behind
-    on_report    called with one line on what happened and its result
+    publish      called with the state (decided and applied) whenever it has changed, and telemetry a few times a
+                 second; returns False for a record that has to wait because the control link is behind
+    on_report    called with one line per event and its result
     access       who may request what
 
-    An exception in the loop is reported, counted in `errors` and survived. `beat` is when the loop last finished
-    something (time.monotonic), `busy_with` what it is doing.
+    An exception in the loop is reported and counted in `errors`; the loop continues. `beat` is when the loop last
+    finished a piece of work (time.monotonic), `busy_with` what it is doing.
     """
 
     vehicle: Vehicle
@@ -121,18 +121,18 @@ class ControlLoop:
     _publish_again: bool = False
     _cause: str = ""  # the event that the decision in force came from
     _position: PositionReported | None = None
-    _reported: dict[str, float] = field(default_factory=dict)  # by fault, when it was last reported
-    _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, when
-    _seen: tuple[float, float | None] = (-ADVICE_S, None)  # when the operator reported a latency, and that, ms
-    _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, when one was last asked for
-    _steered: float = -STEERING_S  # when the steering angle was last published
+    _reported: dict[str, float] = field(default_factory=dict)  # by fault, time of its last report
+    _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, time of the last answer
+    _latency: tuple[float, float | None] = (-ADVICE_S, None)  # time of the last reported latency, and its value, ms
+    _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, time of the last request for one
+    _steering_published: float = -STEERING_S  # when the steering angle was last published
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
         self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
         self._uplink = MeasuredUplink(self.vehicle)
         self._in_control = ""
-        self._watched = 0.0  # when operators were last watched
+        self._operators_checked = 0.0  # when operators were last checked for silence
         self._began = time.monotonic()
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
@@ -143,33 +143,33 @@ class ControlLoop:
         self.take(Request("", document, answer))
 
     def take(self, item: Item) -> None:
-        """A request or a report, from any thread. Once a sender's queue is full, its further ones are refused."""
+        """Queue a request or a report, from any thread; refused if its sender's queue is full."""
         dropped = self._inbox.put(item)
-        if isinstance(dropped, Reported):
+        if isinstance(dropped, QueuedReport):
             self.reject(dropped.sender)
         elif dropped is item:
-            self.refuse(dropped, f"too many: {WAITING} requests of this sender are waiting")
+            self.refuse(dropped, f"too many: {MAX_QUEUED} requests of this sender are waiting")
         elif dropped:
             self.refuse(dropped, "superseded by a newer measurement")
 
     def overrun(self, sender: str, *, reports: bool = False) -> bool:
-        """Whether a sender floods the vehicle, so that its message is only counted and not read. From any thread.
+        """Whether a sender floods the vehicle, so that its message is only counted, not parsed. From any thread.
 
-        reports  of reception reports, which are not answered: an invalid one counts as much as one too many
+        reports  of reception reports, which are not answered: an invalid report counts like an excess one
         """
         answers = self._refusals.get(sender, 0)
-        if answers < REFUSALS or not (reports or self._inbox.full(sender)):
+        if answers < REFUSALS or not (reports or self._inbox.is_full(sender)):
             return False
         self.refused += 1
         return True
 
     def reject(self, sender: str) -> None:
-        """Count a reception report that is invalid or too many. From any thread."""
+        """Count an invalid or excess reception report. From any thread."""
         self.refused += 1
         self._refusals[sender] = self._refusals.get(sender, 0) + 1
 
     def refuse(self, request: Request, problem: str) -> None:
-        """Count and answer a request that is not queued, from any thread; answers between two ticks are limited."""
+        """Refuse a request that is not queued, from any thread; answers between two ticks are limited."""
         self.refused += 1
         answers = self._refusals[request.sender] = self._refusals.get(request.sender, 0) + 1
         if request.answer and answers <= REFUSALS:
@@ -180,12 +180,12 @@ class ControlLoop:
         self._inbox.wake()
 
     def publish_again(self) -> None:
-        """Publish the state even if nothing changed, since the broker may have lost it. From any thread."""
+        """Publish the state even if unchanged, because the broker may have lost it. From any thread."""
         self._publish_again = True
         self._inbox.wake()
 
     def stop(self) -> None:
-        """End soon. From any thread or signal handler's thread, any number of times."""
+        """End soon. From any thread, including a signal handler's, any number of times."""
         self._stopped = True
         self._inbox.wake()
 
@@ -205,14 +205,14 @@ class ControlLoop:
                 self._tick()
                 next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
             item = self._inbox.get(self._began + next_tick)
-            if isinstance(item, Reported):
+            if isinstance(item, QueuedReport):
                 self._guarded("reception report", lambda r=item: self._take_report(r))  # type: ignore[misc]
             elif item:
                 self._guarded(str(item.document.get("event")), lambda r=item: self._take_request(r))  # type: ignore[misc]
             self._guarded("state", self._publish_state)
 
     def _guarded(self, what: str, work: Callable[[], None]) -> None:
-        """Do a piece of work; an exception in it must not end the streams of a moving vehicle."""
+        """Run a piece of work; an exception must not end the streams of a moving vehicle."""
         self.busy_with = what
         try:
             work()
@@ -232,13 +232,13 @@ class ControlLoop:
         return round(time.monotonic() - self._began, 6)
 
     def _tick(self) -> None:
-        """What is due ten times a second. A step that fails does not stop the others."""
+        """Work that is due ten times a second. A failing step does not stop the others."""
         t = self._now()
         self._refusals = {}
         self._ticks += 1
         if self.track is not None:
-            at = self.track.at
-            self._guarded("position_reported", lambda: self._take(replace(at(t), t=t)))
+            position_at = self.track.at
+            self._guarded("position_reported", lambda: self._take(replace(position_at(t), t=t)))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
         self._guarded("copies_counted", lambda: self._count_copies(t))
         self._guarded("faults", self._report_faults)
@@ -279,15 +279,15 @@ class ControlLoop:
             self._refuse(problem, t, request.answer)
         elif request.sender and isinstance(event, OWN):
             self._refuse(f"{NAMES[type(event)]}: only the vehicle itself makes this event", t, request.answer)
-        elif request.as_of is not None and (late := self._operators.expired(request.sender, t, request.as_of)):
+        elif request.as_of is not None and (expired := self._operators.expired(request.sender, t, request.as_of)):
             self.refused += 1
-            self._answer(request.answer, Outcome(t, "expired", late))
+            self._answer(request.answer, Outcome(t, "expired", expired))
         elif isinstance(event, OperatorConnected | OperatorDisconnected):
             self._answer(request.answer, Outcome(t, "applied", ""))  # presence is already updated
         else:
             self._take(event, request.answer)
 
-    def _take_report(self, item: Reported) -> None:
+    def _take_report(self, item: QueuedReport) -> None:
         t = self._now()
         self._update_presence(item.sender, t, None)
         if item.sender not in self._operators.present:
@@ -297,7 +297,7 @@ class ControlLoop:
         if reported.in_control:
             latency_ms = item.report.latency_ms
             overdue_s = self._operators.overdue_s(item.sender, t, item.report.as_of)
-            self._seen = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
+            self._latency = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
@@ -305,29 +305,29 @@ class ControlLoop:
             self._repair(item.report.damaged, t)
 
     def _repair(self, damaged: Iterable[str], t: float) -> None:
-        """Send key frames of cameras that lack packets for good; one that is not sent has nothing to repair."""
+        """Send key frames of cameras with unrecovered packet loss; a camera that is not sent needs none."""
         sending = {name for name, setting in self._run.decision.settings.items() if setting.sending}
-        named = sending.intersection(damaged)
-        due = sorted(name for name in named if t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S)
+        affected = sending.intersection(damaged)
+        due = sorted(name for name in affected if t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S)
         self._key_frames |= dict.fromkeys(due, t)
         if due:
             self.applier.send_key_frames(due)
 
     def _advise(self, t: float) -> None:
-        """Publish the speed that the latency of the operator's pictures allows: 0 if none was reported lately."""
+        """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report."""
         if (factor := self._speed_factor(t)) is not None:
-            _, measured_ms = self._seen
+            _, measured_ms = self._latency
             limit = self.vehicle.latency
             total_ms = None if not factor or measured_ms is None else round(measured_ms + (limit.fixed_ms or 0.0), 1)
             self.publish(SpeedAdvice(t, factor, total_ms, ADVICE_S))
 
     def _speed_factor(self, t: float) -> float | None:
-        at, measured_ms = self._seen
+        at, measured_ms = self._latency
         factor = self.vehicle.latency.speed_factor(measured_ms if t - at <= ADVICE_S else None)
         return None if factor is None else round(factor, 3)
 
-    def _state_clock(self, item: Reported, t: float) -> None:
-        """Answer an operator that compares clocks; not a flood of such reports, whose answers would fill the uplink."""
+    def _state_clock(self, item: QueuedReport, t: float) -> None:
+        """Answer an operator that compares clocks, at a limited rate: answers to a flood would fill the uplink."""
         if item.state_clock and t - self._clock_stated.get(item.sender, -CLOCK_S) >= CLOCK_S:
             present = self._operators.present
             self._clock_stated = {name: at for name, at in self._clock_stated.items() if name in present}
@@ -345,20 +345,20 @@ class ControlLoop:
             self._operators.message_received(sender, t)
         self._presence_changed(before, t, "disconnected")
         if isinstance(event, OperatorConnected) and sender and sender == self._operators.in_control:
-            self._attend(sender, event.attention, t)
+            self._update_attention(sender, event.attention, t)
 
-    def _attend(self, operator: str, attention: Attention | None, t: float) -> None:
-        """What the operator in control states of the person who drives."""
+    def _update_attention(self, operator: str, attention: Attention | None, t: float) -> None:
+        """Pass on the driver's attention as stated by the operator in control."""
         if attention is not self._run.state.attention:
             self._take(AttentionChanged(t=t, attention=attention))
             self.on_report(f"operator {operator} is {attention or 'no longer stating its attention'}")
 
     def _watch_operators(self, t: float) -> None:
-        """Notice operators that have fallen silent, unless it is this loop that has stood still."""
-        stalled, self._watched = t - self._watched > SILENT_S / 2, t
+        """Detect operators that have fallen silent, unless this loop itself has stalled."""
+        stalled, self._operators_checked = t - self._operators_checked > SILENT_S / 2, t
         before = self._operators.present
         if not stalled:
-            self._operators.silent(t, self._inbox.senders())
+            self._operators.expire_silent(t, self._inbox.senders())
         self._presence_changed(before, t, f"has been silent for {SILENT_S:g} s")
 
     def _presence_changed(self, before: frozenset[str], t: float, why: str) -> None:
@@ -370,7 +370,9 @@ class ControlLoop:
         if in_control != self._in_control:
             self._in_control = in_control
             self._guarded("control", lambda: self._pass_control(in_control, t))
-        if bool(now) != (self._run.state.operator_since is not None):  # as the core knows it: an event may have failed
+        if bool(now) != (
+            self._run.state.operator_since is not None
+        ):  # compared with the core: an event may have failed
             self._take(OperatorConnected(t=t) if now else OperatorDisconnected(t=t))
 
     def _pass_control(self, operator: str, t: float) -> None:
@@ -399,7 +401,7 @@ class ControlLoop:
         try:
             self.applier.turn(after.commands)
         except Exception:
-            self._run = replace(after, commanded=before.commanded)  # so that the next event commands it again
+            self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
             raise
         log_run(self.log, event, before, after)
         if isinstance(event, PositionReported):
@@ -407,7 +409,7 @@ class ControlLoop:
         if isinstance(event, SteeringReported):
             self._publish_steering(event)
         if after.fault:
-            self._report_once(f"{after.fault}; the decision before stays in force")
+            self._report_once(f"{after.fault}; the previous decision stays in force")
         elif before.fault:
             self.on_report("the rules decide again")
         if after.refused:
@@ -421,8 +423,8 @@ class ControlLoop:
             self._report_decision(before, event)
 
     def _publish_steering(self, event: SteeringReported) -> None:
-        if event.t - self._steered >= STEERING_S:
-            self._steered = event.t
+        if event.t - self._steering_published >= STEERING_S:
+            self._steering_published = event.t
             self.publish(SteeringAngle(round(time.time() - (self._now() - event.t), 4), event.rad))
 
     def _report_decision(self, before: Run, event: Event) -> None:
@@ -433,23 +435,23 @@ class ControlLoop:
                 self.on_report(f"{self._cause} -> {name}: {now.reason}")
 
     def _publish_state(self) -> None:
-        """Publish the decided and the applied values if either changed; answer requests that are applied now."""
+        """Publish the decided and the applied values if either has changed; answer requests that are now applied."""
         applied = self.applier.applied()
         due = self._published is None or self._now() - self._published.t >= STATE_S or bool(self._pending)
         state = self._state(applied) if due or self._publish_again else None
         if state and self._is_news(state) and self.publish(state):
             self._publish_again, self._published = False, state
-        self._pending = [asked for asked in self._pending if not self._answered(asked, applied)]
+        self._pending = [pending for pending in self._pending if not self._answered(pending, applied)]
 
     def _is_news(self, state: VehicleState) -> bool:
-        """Whether to publish a state. Reasons alone, such as one with a time that counts up, are not urgent."""
+        """Whether to publish a state. Changed reasons alone, such as one with a running time, are not urgent."""
         last = self._published
         if last is None or self._publish_again:
             return True
         if state == last:
             return False
-        rest_s = REASONS_S if self._operators.present else UNSEEN_REASONS_S
-        return state.t - last.t >= rest_s or _without_reasons(state) != _without_reasons(last)
+        interval_s = REASONS_S if self._operators.present else UNSEEN_REASONS_S
+        return state.t - last.t >= interval_s or _without_reasons(state) != _without_reasons(last)
 
     def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights = self._run.decision, self._run.state.weights
@@ -467,7 +469,7 @@ class ControlLoop:
         return VehicleState(self._now(), self._cause, *decided, asked_kbps=asked, attention=attention)
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
-        """Answer a request if all its knob values are applied, or it has timed out."""
+        """Answer a request if all its knob values are applied or it has timed out; returns whether it is answered."""
         now, commanded = self._now(), self._run.commanded
         watched = [(name, knob) for name, knob in pending.knobs if applied[name]]
         waiting = [f"{name} {knob}" for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]

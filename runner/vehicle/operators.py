@@ -1,8 +1,8 @@
-"""Which operators are present, and whether a request is too old to be carried out. Pure: time is passed in.
+"""Tracks which operators are present and whether a request is too old to execute. Pure: time is passed in.
 
 An operator is a client that sends requests under its own id, which is part of the topic. It is present from its
-`operator_connected` on. It leaves by its silence or its `operator_disconnected`; any later message from it brings it
-back. One of those present is in control.
+`operator_connected` until it falls silent or sends `operator_disconnected`; any later message brings it back. One of
+the operators present is in control.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
 
-SILENT_S = 1.0  # an operator that sends nothing for this long is offline; a present one sends four messages a second
+SILENT_S = 1.0  # an operator that sends nothing for this long is offline; it normally sends four messages a second
 AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks drift apart
 DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
-MOST = 64  # operators remembered; the one that has been silent longest is forgotten for a new one
+MAX_OPERATORS = 64  # remembered; a new one replaces the one that has been silent longest
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ class Operators:
     """All operators known to the vehicle.
 
     expires_s    age from which a request is dropped, beyond the measured round trip
-    may_control  whether an operator may be in control, now
+    may_control  whether an operator currently may be in control
     """
 
     def __init__(self, expires_s: float, may_control: Callable[[str], bool] = lambda name: True) -> None:
@@ -51,10 +51,10 @@ class Operators:
         return self._control if self._control in self.present and self._may_control(self._control) else ""
 
     def _pass_control(self, t: float) -> None:
-        """Control stays with an operator that is present; then it passes to the one that has been present longest.
+        """Control stays with an operator while it is present, then passes to the one that has been present longest.
 
-        One that fell silent keeps it until another has been heard for SILENT_S since: where nobody was heard meanwhile,
-        the link was down, and whoever is heard first after it must not take the pictures from the one that drives.
+        An operator that falls silent keeps control until another one has been present for SILENT_S since. If all fell
+        silent, the link was down, and the first one to return must not take control from the one that drives.
         """
         present = {name: o.since for name, o in self._known.items() if o.present and self._may_control(name)}
         if not present or self._control in present:
@@ -65,13 +65,13 @@ class Operators:
             self._control = longest
 
     def connected(self, name: str, t: float) -> bool:
-        """An operator announces itself, or does so again as its heartbeat; returns whether it was absent."""
+        """An operator announces itself, initially or as its heartbeat; returns whether it was absent."""
         operator = self._operator(name, t)
         operator.announced = True
         return self.message_received(name, t)
 
     def message_received(self, name: str, t: float) -> bool:
-        """Any message of an operator at time t, s; returns whether it brings the operator back."""
+        """An operator sent any message at time t, s; returns whether it was absent."""
         operator = self._operator(name, t)
         operator.last_message = t
         returns = operator.announced and not operator.present
@@ -81,7 +81,7 @@ class Operators:
         return returns
 
     def disconnected(self, name: str, t: float) -> bool:
-        """An operator disconnects, by itself or through its last will; returns whether it was present."""
+        """An operator disconnected, by itself or through its last will; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
@@ -89,20 +89,20 @@ class Operators:
         self._pass_control(t)
         return was_present
 
-    def silent(self, t: float, heard: Collection[str] = ()) -> list[str]:
-        """Operators that have been silent for too long since the last call; they count as offline now.
+    def expire_silent(self, t: float, queued: Collection[str] = ()) -> list[str]:
+        """Mark operators that have been silent for too long as offline; returns them.
 
-        heard  whose messages wait to be processed
+        queued  operators with messages still to be processed
         """
-        late = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
-        gone = [name for name in late if name not in heard]
-        for name in gone:
+        silent = [name for name, o in self._known.items() if o.present and t - o.last_message > SILENT_S]
+        offline = [name for name in silent if name not in queued]
+        for name in offline:
             self._known[name].present = False
         self._pass_control(t)
-        return gone
+        return offline
 
     def expired(self, name: str, t: float, as_of: float) -> str | None:
-        """Why a request is too old to be carried out at time t; None if it is not.
+        """Why a request is too old to execute at time t; None if it is not.
 
         as_of  the vehicle's time in the newest telemetry that the sender had, plus the time since by the sender's
                clock. So `t - as_of` is one round trip for a request that was not delayed; no clocks are compared.
@@ -117,12 +117,12 @@ class Operators:
         return f"{delay:.2f} s old, limit {limit:.2f} s" if delay > limit else None
 
     def overdue_s(self, name: str, t: float, as_of: float) -> float:
-        """By how much a message took longer than the shortest round trip of its sender; see `expired`."""
+        """How much longer a message took than its sender's shortest round trip; see `expired`."""
         return max(0.0, t - as_of - min(self._operator(name, t).delays, default=0.0))
 
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:
-            if len(self._known) >= MOST:
+            if len(self._known) >= MAX_OPERATORS:
                 del self._known[min(self._known, key=lambda n: (self._known[n].present, self._known[n].last_message))]
             self._known[name] = _Operator(last_message=t)
         return self._known[name]

@@ -1,4 +1,4 @@
-"""The measured uplink: reception reports in, `link_measured` out. Live and replay share it. Pure."""
+"""Measures the uplink: reception reports in, `link_measured` out. Shared by live runs and replay. Pure."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 from runner.records import ReceptionReport, ReceptionReported
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
-LONGEST_S = 60.0  # that is reported as a round trip
+LONGEST_S = 60.0  # upper limit of a reported round trip
 
 
 @dataclass
 class MeasuredUplink:
-    """Estimates the uplink from what the operator in control receives; a change of operator begins anew."""
+    """Estimates the uplink from what the operator in control receives; restarts when the operator changes."""
 
     vehicle: Vehicle
     _operator: str = ""
@@ -27,7 +27,7 @@ class MeasuredUplink:
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
 
     def take(self, reported: ReceptionReported) -> LinkMeasured | None:
-        """The event that follows from a report; None if its operator is not in control, or nothing has arrived."""
+        """The event that results from a report; None if its operator is not in control, or nothing has arrived."""
         if not reported.in_control:
             return None
         if reported.operator != self._operator or reported.report.at < self._at:
@@ -49,7 +49,7 @@ class MeasuredUplink:
 
 
 def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
-    """The report with the headers of packets; units of unknown cameras are left out."""
+    """The report with packet headers added; units of unknown cameras are omitted."""
     units = [
         ReceivedUnit(
             unit.camera,

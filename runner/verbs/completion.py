@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from runner.configuration.files import GROUPS, conf_directories, find_file, options
-from runner.configuration.yaml_file import MOST_BYTES
+from runner.configuration.yaml_file import MAX_BYTES
 from runner.errors import UserError
 from runner.schema import referred, schema_document
 from runner.system.files import read_file
@@ -128,7 +128,7 @@ class _Selection:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = yaml.load(read_file(path, MOST_BYTES), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    content: dict[str, Any] = yaml.load(read_file(path, MAX_BYTES), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     return content
 
 

@@ -49,7 +49,7 @@ FAULTS = [
     Fault(
         "vehicle/operators.py", "t - o.last_message > SILENT_S", "t - o.last_message > 9 * SILENT_S", "test_operators"
     ),
-    Fault("vehicle/inbox.py", "len(waiting) >= WAITING", "len(waiting) > WAITING", "test_inbox"),
+    Fault("vehicle/inbox.py", "len(waiting) >= MAX_QUEUED", "len(waiting) > MAX_QUEUED", "test_inbox"),
     Fault("operator/meter.py", "* 8 / 1000 /", "/ 1000 /", "test_meter"),
     Fault("operator/notes.py", "if factors[0] != factors[1]", "if True", "test_notes"),
     Fault("mqtt/messages.py", "if len(payload) > limit:", "if len(payload) > 2 * limit:", "test_messages"),

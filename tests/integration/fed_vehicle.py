@@ -1,9 +1,9 @@
-"""A vehicle whose cameras this program feeds, and which fail when they are told to.
+"""A vehicle whose cameras this program feeds, and which fail on command.
 
     python fed_vehicle.py CONF OVERRIDE...
 
-Each line of input is a camera and what it does from then on: `rear moves`, `rear hangs` (it delivers nothing) or
-`rear repeats` (its last picture, as new). It is answered with when that began, s since 1970. Ends with its input.
+Each line of input is a camera and its new behaviour: `rear moves`, `rear hangs` (it delivers nothing) or
+`rear repeats` (its last picture, as new). The answer is the time of the change, s since 1970. Ends with its input.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Feed:
         self._moving = {name: moving(camera) for name, camera in vehicle.cameras.items()}
         self._shown = {name: next(pictures) for name, pictures in self._moving.items()}
         self._does = dict.fromkeys(vehicle.cameras, "moves")
-        self._lock = threading.Lock()  # what a camera does changes between two pictures
+        self._lock = threading.Lock()  # a camera's behaviour changes between two pictures
         self._pause_s = 1 / float(next(iter(vehicle.cameras.values())).fps) / len(vehicle.cameras)
 
-    def tell(self, camera: str, does: str) -> float:
-        """Returns when that begins."""
+    def set_behaviour(self, camera: str, does: str) -> float:
+        """Returns the time of the change."""
         assert camera in self._does and does in DOES, f"{camera} {does}"
         with self._lock:
             self._does[camera] = does
@@ -52,7 +52,7 @@ class Feed:
                     self._shown[name] = next(self._moving[name])
                 if self._does[name] != "hangs":
                     self._live.push(name, self._shown[name])
-            due = max(due + self._pause_s, time.monotonic() - self._pause_s)  # time that was lost is not made up for
+            due = max(due + self._pause_s, time.monotonic() - self._pause_s)  # lost time is not caught up
             time.sleep(max(0.0, due - time.monotonic()))
 
 
@@ -74,7 +74,7 @@ def main(conf: str, *words: str) -> None:
         feed = Feed(vehicle, live)
         threading.Thread(target=feed.run, name="feed", daemon=True).start()
         for line in sys.stdin:
-            print(feed.tell(*line.split()), flush=True)
+            print(feed.set_behaviour(*line.split()), flush=True)
 
 
 if __name__ == "__main__":

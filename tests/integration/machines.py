@@ -1,4 +1,4 @@
-"""Machines with a network of their own: namespaces of the kernel, with addresses, cables, translation of addresses."""
+"""Machines with their own network: kernel namespaces with addresses, cables and NAT."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from rig import CHECKOUT, WAIT_S
 from runner.link.netns import _inside
 from runner.system import children
 
-AWAY_S = 1.0  # without a picture, or an answer, of more than ten a second; a busy machine is late by less
-# What a machine changes in these directories only it sees, and it is gone with it.
+AWAY_S = 1.0  # without a picture or an answer, of more than ten a second; delays on a busy machine are shorter
+# Changes of a machine in these directories are visible only to it, and vanish with it.
 OWN = "mount -t tmpfs own /run; for own in etc var; do mkdir -p /run/own/$own /run/own/work.$own; " + (
     "mount -t overlay own -o lowerdir=/$own,upperdir=/run/own/$own,workdir=/run/own/work.$own /$own; done; "
 )
@@ -107,7 +107,7 @@ class Mobile:
         operator.run(f"ip addr add {OPERATOR}/24 dev eth0")
         if translated:
             carrier.run("nft -f -", TRANSLATING)
-            # Once forgotten, a TCP connection is not answered any more, not even by a reset.
+            # Once forgotten, a TCP connection is no longer answered, not even by a reset.
             carrier.run("sysctl -qw net.netfilter.nf_conntrack_tcp_loose=0")
         else:
             operator.run("ip route add 100.64.0.0/24 via 198.51.100.1")
@@ -150,14 +150,14 @@ class Watch:
     def _read(self) -> None:
         assert self._process.stdout
         for line in self._process.stdout:
-            told = json.loads(line)
-            if note := told.get("note"):
-                self.notes.append(f"{told['t']:.2f} {note}")
+            message = json.loads(line)
+            if note := message.get("note"):
+                self.notes.append(f"{message['t']:.2f} {note}")
             else:
-                self.times.setdefault(told["what"], []).append(told["t"])
+                self.times.setdefault(message["what"], []).append(message["t"])
 
     def back(self, since: float) -> dict[str, float]:
-        """By camera, and for `control`: how long after a moment it was back for good, s; inf: it is not.
+        """By camera, and for `control`: time from a moment until permanent recovery, s; inf: not recovered.
 
         That is the next picture or answer that no gap of AWAY_S follows.
         """

@@ -1,4 +1,4 @@
-"""The recipes of docs/deployment.md, carried out on machines: the document is what is tested."""
+"""Executes the recipes of docs/deployment.md on machines, to test the document itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rig import CHECKOUT, WAIT_S, process, until
 
 DOCUMENT = CHECKOUT / "docs" / "deployment.md"
 TWO_MACHINES, FIREWALLS, SRT, WIREGUARD = "From two bare machines to driving", "Firewalls", "SRT", "WireGuard"
-# There is no systemd here: what stands in for its services.
+# There is no systemd here: replacements for its services.
 BROKER = "sudo install -d -o mosquitto /run/mosquitto; sudo mosquitto -d -c /etc/mosquitto/mosquitto.conf"
 SERVICES = {"sudo systemctl restart mosquitto": BROKER}
 SIDES = ("tod-runner operator ", "tod-runner vehicle ")
@@ -90,10 +90,10 @@ class Site:
         ssh.write_text(f'#!/bin/sh\ntest "$1" = vehicle && shift && exec {inside} sh -c "$*"\n')
         ssh.chmod(0o700)
         self._environment = f"RSYNC_RSH={ssh}"
-        self.other: dict[str, str] = {}  # what stands in files in place of the document's text
+        self.other: dict[str, str] = {}  # in files, in place of the document's text
 
     def shell(self, where: str, text: str) -> str:
-        """What a command line printed on one machine."""
+        """Output of a command line on one machine."""
         text = SERVICES.get(text, text)
         command = [*self.machines[where].inside(self.homes[where]), self._environment, "bash", "-ec", text]
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)

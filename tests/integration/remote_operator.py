@@ -26,13 +26,13 @@ from runner.security.exposure import viewer_keyring
 ASK_S = 0.1
 
 
-def tell(**what: object) -> None:
-    os.write(sys.stdout.fileno(), f"{json.dumps(what)}\n".encode())  # at once: several threads tell
+def report(**what: object) -> None:
+    os.write(sys.stdout.fileno(), f"{json.dumps(what)}\n".encode())  # unbuffered: several threads write
 
 
 class Notes(Listener):
     def on_note(self, note: Note) -> None:
-        tell(note=note.text, t=time.monotonic())
+        report(note=note.text, t=time.monotonic())
 
 
 def main(words: list[str]) -> None:
@@ -46,7 +46,7 @@ def main(words: list[str]) -> None:
         return apply.OperatorSide(
             plans,
             station.report,
-            on_picture=lambda camera, *_: tell(what=camera, t=time.monotonic()),
+            on_picture=lambda camera, *_: report(what=camera, t=time.monotonic()),
             operator=station.identity,
             keyring=keyring,
             vehicle=vehicle.name,
@@ -60,7 +60,7 @@ def main(words: list[str]) -> None:
 
 def on_answer(outcome: object) -> None:
     if getattr(outcome, "result", "") == "applied":
-        tell(what="control", t=time.monotonic())
+        report(what="control", t=time.monotonic())
 
 
 if __name__ == "__main__":

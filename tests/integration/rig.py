@@ -35,7 +35,7 @@ SMALL_ROBOT = (
     *("cameras.rear.width_px=424", "cameras.rear.height_px=240"),
     *("cameras.mast.width_px=400", "cameras.mast.height_px=300"),
 )
-# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
+# Without the measured link: a busy machine delays packets, which would lower the total.
 ROBOT = (
     *SMALL_ROBOT,
     "source=test",
@@ -48,7 +48,7 @@ ROBOT = (
 
 _SNOW = "{name: source, element: videotestsrc, properties: {is-live: true, pattern: snow}}"
 _RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
-NOISE = ("source=test", f"source.elements=[{_SNOW}, {_RAW}]")  # of which the encoder needs all of its bitrate
+NOISE = ("source=test", f"source.elements=[{_SNOW}, {_RAW}]")  # noise, for which the encoder needs all of its bitrate
 
 # No sandbox inside containers; no background traffic to hosts that a closed network refuses anyway.
 CHROMIUM_FLAGS = [
@@ -149,7 +149,7 @@ def set_clock(directory: Path, seconds: float) -> None:
 _PORTS = itertools.cycle(range(10_000, 30_000))
 next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes start elsewhere
 
-WAIT_S = 60.0  # a demo starts in 3 s, and in 15 where five such tests run beside each other
+WAIT_S = 60.0  # a demo starts in 3 s, and in 15 if five such tests run in parallel
 
 
 def free_port(count: int = 1) -> int:
@@ -206,7 +206,7 @@ def passes(done: Callable[[], Any], seconds: float) -> bool:
 
 
 class RecordingListener(Listener):
-    """Keeps what a station reports, as ("state" | "sample" | "note", record)."""
+    """Records a station's reports, as ("state" | "sample" | "note", record)."""
 
     def __init__(self) -> None:
         self.received: list[tuple[str, Any]] = []
@@ -281,7 +281,7 @@ class Operator:
         return state
 
     def reach(self, wanted: Callable[[Any], bool]) -> Any:
-        """The last state, or else the next one, that fulfils a condition."""
+        """The last state if it fulfils a condition, otherwise the next one that does."""
         return self.last if self.last and wanted(self.last) else self.state(wanted)
 
     def publish(self, payload: bytes, **options: Any) -> None:

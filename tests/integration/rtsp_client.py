@@ -1,4 +1,4 @@
-"""An RTSP client on bare sockets, for what players never do: wrong URLs, silence, a reader that stops or is slow."""
+"""An RTSP client on plain sockets, for behaviour that players lack: wrong URLs, silence, a slow or stopped reader."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Digest:
         self._realm = self._nonce = ""
 
     def challenge(self, head: str) -> None:
-        """Take the challenge of an answer with status 401."""
+        """Read the challenge of an answer with status 401."""
         self._realm, self._nonce = (re.search(rf'{key}="([^"]*)"', head)[1] for key in ("realm", "nonce"))  # type: ignore[index]
 
     def header(self, method: str, url: str) -> dict[str, object]:
@@ -100,19 +100,19 @@ class RtspClient:
         self.delay_s = 0.0  # between two reads
 
     def ask(self, method: str, url: str = "", **headers: object) -> int:
-        """The status code of the answer; the password is given once it is asked for."""
-        code = self._asked(method, url, headers)
+        """Send a request, with the password once it is required; returns the status code."""
+        code = self._exchange(method, url, headers)
         if code == 401 and self._login:
             self._login.challenge(self.head)
-            code = self._asked(method, url, headers)
+            code = self._exchange(method, url, headers)
         return code
 
-    def _asked(self, method: str, url: str, headers: dict[str, object]) -> int:
+    def _exchange(self, method: str, url: str, headers: dict[str, object]) -> int:
         self._send(method, url, headers)
         return self._answer()
 
     def leave(self) -> None:
-        """Say TEARDOWN, without waiting for the answer: what has been sent may come before it."""
+        """Send TEARDOWN without waiting for the answer, which may arrive after media data."""
         self._send("TEARDOWN", "", {})
 
     def _send(self, method: str, url: str, headers: dict[str, object]) -> None:
@@ -214,7 +214,7 @@ class RtspClient:
         return self._buffer
 
     def _packet(self) -> None:
-        """Take one interleaved packet (RFC 2326, 10.12)."""
+        """Read one interleaved packet (RFC 2326, 10.12)."""
         size = 4 + int.from_bytes(self._fill(4)[2:4], "big")
         data, self._buffer = self._fill(size)[4:size], self._buffer[size:]
         if self._fill(0) is not None and data[1] & 0x7F == 96:

@@ -50,19 +50,19 @@ def test_bitrate_is_read_back_and_on_the_wire():
 
 @pytest.mark.parametrize("kbps", [3, pytest.param(9, marks=pytest.mark.soak), 26])
 def test_the_lowest_bitrates_limit_the_encoder_too(kbps):
-    """x264 takes a buffer below 1 kbit for none, and encodes without limit from its next start on: 40 Hz of noise."""
+    """x264 treats a buffer below 1 kbit as unlimited from its next restart on: 40 Hz of noise."""
     with streaming(*NOISE) as (side, _, (plan,), _reported), watching(plan) as client:
         turn(side, size=(240, 130), bitrate=500)
         until(lambda: len(client.sizes) > 20)
         turn(side, bitrate=kbps)
         until(lambda: side.applied()[CAMERA].get("bitrate") == kbps)
-        for size in ((256, 138), (240, 130)):  # the encoder starts anew
+        for size in ((256, 138), (240, 130)):  # the encoder restarts
             turn(side, size=size)
             until(lambda size=size: client.sizes[-1] == size)
         side.send_key_frames([CAMERA])
         start, sent = len(client.sizes), side.sent()[CAMERA][1]
         until(lambda: len(client.sizes) - start >= 80)
-        assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 60_000  # of noise x264 makes 20 kbit/s at least, else 7000
+        assert (side.sent()[CAMERA][1] - sent) * 8 / 2 < 60_000  # x264 needs 20 kbit/s for noise, otherwise uses 7000
         assert side.faults() == []
 
 
@@ -133,7 +133,7 @@ def test_a_camera_that_is_off_before_the_first_client_answers_at_once():
     with streaming() as (side, vehicle, (plan,), reported):
         turn(side, sending=False)
         assert describe(vehicle.media, CAMERA) == "RTSP/1.0 200 OK"
-        until(lambda: f"{CAMERA}: pipeline stopped" in reported)  # the server refuses clients at this very moment
+        until(lambda: f"{CAMERA}: pipeline stopped" in reported)  # the server refuses clients at this moment
         with watching(plan) as client:
             until(lambda: side.applied()[CAMERA].get("sending") is False)
             turn(side, sending=True, size=(240, 130), bitrate=200)
@@ -191,7 +191,7 @@ def colour(pixel):
 
 
 def received(side, plan, camera, frame):
-    """The picture that arrives if a frame is pushed again and again."""
+    """The picture that arrives while a frame is pushed repeatedly."""
     client = Client(plan, pictures=True)
 
     def pushed():
@@ -214,7 +214,7 @@ def received(side, plan, camera, frame):
         (Roi(960, 520, 960, 520), (480, 260), (DARK, DARK, DARK, DARK)),
     ],
 )
-def test_an_roi_shows_what_it_names(roi, size, corners):
+def test_an_roi_shows_its_region(roi, size, corners):
     frame = quadrants(1920, 1040)
     with streaming("source=appsrc") as (side, _, (plan,), _reported):
         turn(side, roi=roi, size=size, bitrate=2000)
@@ -262,7 +262,7 @@ def test_a_port_in_use_is_reported_in_one_line():
     assert str(raised.value) == f"cannot listen on {where}: address already in use; choose another port"
 
 
-def test_other_modules_may_throw_beside_gstreamer():
+def test_other_libraries_may_throw_exceptions_after_gstreamer_is_loaded():
     # GStreamer loads libunwind; a C++ exception that unwinds through it ends the process.
     pytest.importorskip("cv2")
     pytest.importorskip("matplotlib")

@@ -1,4 +1,4 @@
-"""Bags played by a real vehicle: pixels, pace, capture times, order; and what ends or interrupts a bag."""
+"""Bags played by a real vehicle: pixels, pace, capture times and order; causes that end or interrupt a bag."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_two_cameras_arrive_in_order_with_the_times_of_the_bag(tmp_path):
         assert starts, "the bag did not begin again"
         places = [number + count * sum(start <= at for start in starts) for at, number in enumerate(numbers)]
         assert places == sorted(set(places))  # in order, none twice
-        # The capture times have the pace of the bag; a machine that stands still loses time as with a clip.
+        # The capture times have the pace of the bag; a machine that stalls loses time as with a clip.
         captured = [at for _, at, _ in pictures]
         steps = [(b - a) / (n - m) for (a, b), (m, n) in zip(pairwise(captured), pairwise(places), strict=True)]
         assert np.median(steps) == pytest.approx(1 / RATE, abs=0.0005)
@@ -202,7 +202,7 @@ def test_a_vehicle_whose_bag_lacks_a_topic_does_not_start(tmp_path):
 def test_a_bag_is_recorded_picture_by_picture_faster_than_it_plays(tmp_path):
     bag = camera_bag(tmp_path / "drive", "sqlite3", {"/front/image": map(numbered, range(60))}, 0.25)
     words = [*robot(bag, topics=["front"]), "~cameras.rear", "fps_max=0.25"]
-    done = run("record", *words, f"output={tmp_path}/rec", timeout=120)  # half of what the bag lasts
+    done = run("record", *words, f"output={tmp_path}/rec", timeout=120)  # half of the bag's length
     assert (done.returncode, done.stderr.count("WARNING")) == (0, 0)
     line = f"front: {tmp_path}/rec/front.mkv: 384x216 at 0.25 Hz, 60 frames in 240.00 s, "
     assert done.stdout.startswith(line)

@@ -1,4 +1,4 @@
-"""What cameras deliver: colors, capture times, logins. For V4L2 cameras others stand in, before the same elements."""
+"""Cameras: colors, capture times, logins. V4L2 cameras are replaced by other sources in front of the same elements."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MJPEG = [
 @pytest.mark.parametrize("graph", ["h264_rtsp", "openh264_rtsp"])
 @pytest.mark.parametrize("between", [[], MJPEG], ids=["raw", "MJPEG"])
 def test_colors_are_right_at_every_size(graph, between):
-    """Without colorimetry decoders take BT.601 for small pictures and BT.709 for large ones."""
+    """Without colorimetry, decoders assume BT.601 for small pictures and BT.709 for large ones."""
     with (
         streaming(*colored(*between), f"graph={graph}", "cameras.front_left.fps=15") as (side, _, (plan,), _),
         watching(plan, pictures=True) as client,
@@ -65,7 +65,7 @@ def is_right(picture, size):
 
 @pytest.mark.parametrize("fps", [15, 30])
 def test_frames_of_a_v4l2_camera_keep_their_capture_times(fps):
-    """Also those of a camera that runs at twice the rate, of which each second one is dropped."""
+    """Also of a camera at twice the rate, whose every second frame is dropped."""
     from runner.gst import Gst
 
     (plan,) = (p for p in compile_plans(configuration([*V4L2]).vehicle()) if p.camera.name == CAMERA)
@@ -116,11 +116,11 @@ def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
     [
         ("viewer:wrong", 0o600, "Unauthorized"),
         ("viewer:se:same7", 0o640, "credentials FILE: others may read it (mode 640); chmod 600"),
-        ("viewer", 0o600, "credentials FILE: must hold one line user:password"),
+        ("viewer", 0o600, "credentials FILE: must contain one line user:password"),
         (None, 0o600, "credentials FILE: no such file"),
     ],
 )
-def test_what_is_wrong_with_credentials_is_reported(credentials, text, mode, why):
+def test_problems_with_credentials_are_reported(credentials, text, mode, why):
     credentials.unlink()
     if text:
         credentials.write_text(text)

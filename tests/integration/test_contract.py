@@ -1,4 +1,4 @@
-"""What loop and station require of the streaming sides: the same with GStreamer and with recording stand-ins."""
+"""Contract between loop or station and the streaming sides: with GStreamer and with recording stand-ins."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runner.operator.live import live_operator
 from runner.vehicle.live import live_vehicle
 from stand_in import RecordingOperator, RecordingVehicle
 
-# Not the measured link: a busy machine delays packets, which would lower it and with it the total.
+# Without the measured link: a busy machine delays packets, which would lower the total.
 ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=10", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 CAMERAS = ("front", "rear", "mast")
 
@@ -65,7 +65,7 @@ def operator(broker, vehicle):
 
 
 def applied(operator, name, **knobs):
-    """The applied knobs of a camera, once they are as given."""
+    """Waits until the applied knobs of a camera have the given values; returns them."""
 
     def fits(state):
         have = state["cameras"][name]["applied"]
@@ -74,7 +74,7 @@ def applied(operator, name, **knobs):
     return operator.reach(fits)["cameras"][name]["applied"]
 
 
-def test_what_nobody_watches_is_kept_until_somebody_does(operator, vehicle):
+def test_settings_of_unwatched_cameras_are_kept_until_somebody_watches(operator, vehicle):
     operator.ask("1", event="mode_selected", mode="collective")
     reply = operator.ask("2", event="total_set", kbps=1200)
     assert reply["result"] == "applied"
@@ -134,8 +134,8 @@ def test_telemetry_counts_what_is_sent_of_watched_cameras_only(operator, vehicle
 
 
 @pytest.mark.parametrize("vehicle", ["recording"], indirect=True)
-def test_a_camera_that_is_damaged_for_good_starts_anew_once_a_second(operator, vehicle, broker):
-    operator.ask("1", event="operator_connected")  # holds control from here on
+def test_a_camera_with_unrecovered_loss_sends_a_key_frame_at_most_once_a_second(operator, vehicle, broker):
+    operator.ask("1", event="operator_connected")  # in control from here on
     stranger = Operator(broker)
     stranger.ask("1", event="operator_connected")
     sent, side = [], vehicle.live.side
@@ -159,7 +159,7 @@ def test_a_camera_that_is_damaged_for_good_starts_anew_once_a_second(operator, v
 
 @pytest.fixture(params=["recording", "gstreamer"])
 def live(request, broker, monkeypatch):
-    """An operator's side beside a real vehicle, and a listener to its station."""
+    """An operator's side with a real vehicle, and a listener to its station."""
     if request.param == "recording":
         monkeypatch.setattr(apply, "OperatorSide", RecordingOperator)
     words = [*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"]
@@ -194,7 +194,7 @@ def test_every_camera_that_should_send_arrives(live):
 
 def test_requests_are_answered_and_change_the_state(live):
     operator, listener, _ = live
-    # What is asked while the pipelines are being built may time out on a busy machine.
+    # Requests while the pipelines are being built may time out on a busy machine.
     until(lambda: samples(listener) and all(camera.frames for camera in cameras(listener).values()))
     replies = []
     operator.station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)

@@ -1,4 +1,4 @@
-"""The control link under operators that stall, brokers that vanish, floods, garbage, and rules that fail."""
+"""The control link with stalled operators, vanishing brokers, floods, invalid messages and failing rules."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def stack():
 
 
 class Present:
-    """An operator that sends signs of life until it leaves."""
+    """An operator that sends heartbeats until it leaves."""
 
     def __init__(self, broker, stack, name=""):
         self.operator = Operator(broker, name=name)
@@ -101,21 +101,21 @@ def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_
     waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path)
 
 
-@pytest.mark.soak  # reconnecting may take a second of it
+@pytest.mark.soak  # up to a second of it is for reconnecting
 @pytest.mark.parametrize("stall_s", [2.2, 3.0, 3.4, 4.0])
-def test_a_stalled_operator_is_back_at_once(broker, vehicle, ports, stall_s, tmp_path):
+def test_a_stalled_operator_is_back_immediately(broker, vehicle, ports, stall_s, tmp_path):
     assert waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path) < 1.5
 
 
 def waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path):
-    """s from its waking until the vehicle sends again."""
+    """Time from its wake-up until the vehicle sends again, s."""
     onlooker = Operator(broker)
     with process("operator", *ROBOT, *ports, stdout=subprocess.DEVNULL) as operator:
         onlooker.state(lambda state: sending(state) and all(c["applied"] for c in state["cameras"].values()))
         until(lambda: any("is present" in note for note in notes(tmp_path)))
         operator.send_signal(signal.SIGSTOP)
         onlooker.state(paused)
-        time.sleep(stall_s - 2.1)  # gone after 1 s, paused after another one
+        time.sleep(stall_s - 2.1)  # offline after 1 s, paused after another one
         operator.send_signal(signal.SIGCONT)
         woken = time.monotonic()
         onlooker.state(sending)
@@ -125,7 +125,7 @@ def waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path):
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_request_that_comes_late_is_not_carried_out(broker, vehicle):
+def test_a_late_request_is_not_executed(broker, vehicle):
     operator = Operator(broker)
     operator.ask("1", event="mode_selected", mode="collective")
     operator.ask("2", event="total_set", kbps=1000)
@@ -205,7 +205,7 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
         assert int(flood.communicate()[0]) > 20_000
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
     assert sorted(waits)[len(waits) * 9 // 10] < 0.2
-    assert max(waits) < 1  # while the flood begins, everything on the machine waits
+    assert max(waits) < 1  # when the flood begins, everything on the machine is delayed
     assert until(lambda: good.telemetry[-1]["refused"]) > 10_000
 
 
@@ -221,7 +221,7 @@ def test_both_sides_wait_for_a_broker(stack):
         output[verb] = []
         reader = threading.Thread(target=lambda c=child, v=verb: output[v].extend(c.stdout), daemon=True)
         reader.start()
-    wanted = f"no control link: MQTT broker at {broker}: connection refused; trying again"
+    wanted = f"no control link: MQTT broker at {broker}: connection refused; retrying"
     until(lambda: any(wanted in line for line in output["vehicle"]))
     time.sleep(2)
     with private_broker(broker):
@@ -232,7 +232,7 @@ def test_both_sides_wait_for_a_broker(stack):
 
 
 @pytest.mark.alone
-def test_the_link_is_back_after_the_broker_has_hung(tmp_path):
+def test_the_control_link_recovers_after_the_broker_has_hung(tmp_path):
     """A broker that hangs accepts connections and answers nothing, like a link that is cut."""
     broker = Endpoint("127.0.0.1", free_port())
     file = tmp_path / "mosquitto.conf"
@@ -298,7 +298,7 @@ def station(broker):
     station.close()
 
 
-def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
+def test_invalid_messages_from_the_vehicle_end_no_operator(broker, vehicle, station):
     station, listener = station
     station.connect()
     until(lambda: station.state)
@@ -316,7 +316,7 @@ def test_garbage_from_the_vehicle_ends_no_operator(broker, vehicle, station):
     assert until(lambda: replies)[0].result == "applied"
 
 
-def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(broker, vehicle):
+def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
     Operator(broker).as_of()
     station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).vehicle(), {})
     listener = RecordingListener()
@@ -324,12 +324,12 @@ def test_a_vehicle_that_the_broker_does_not_know_is_named_with_those_it_knows(br
     station.connect()
     try:
         until(lambda: station.take({}) is None and listener.notes, every_s=0.2)
-        assert listener.notes == ["the broker knows no vehicle named delivery_robott, online are delivery_robot"]
+        assert listener.notes == ["the broker knows no vehicle named delivery_robott; online: delivery_robot"]
     finally:
         station.close()
 
 
-def test_sides_of_different_configuration_name_the_difference(broker, vehicle, ports):
+def test_differences_between_both_sides_configurations_are_reported(broker, vehicle, ports):
     with process("operator", *ROBOT, *ports, "fps_max=10", "duration_s=4") as operator:
         output, _ = operator.communicate(timeout=60)
     assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(output.split())
@@ -398,14 +398,14 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
         vehicle.send_signal(signal.SIGTERM)
         assert vehicle.wait(15) == 0
     messages = notes(tmp_path)
-    assert "rule mine failed: ZeroDivisionError: division by zero; the decision before stays in force" in messages
+    assert "rule mine failed: ZeroDivisionError: division by zero; the previous decision stays in force" in messages
     assert messages.index("the control loop hangs in bitrate_predicted") < messages.index("the control loop runs again")
     replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
     faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}
     assert len(faults) == 4, replayed.stderr
 
 
-def test_no_message_is_queued_for_a_broker_that_is_away():
+def test_no_message_is_queued_while_the_broker_is_away():
     """After a reconnection only new messages are sent."""
     endpoint = Endpoint("127.0.0.1", free_port())
     messages, seen = [], []
@@ -428,7 +428,7 @@ def test_no_message_is_queued_for_a_broker_that_is_away():
 
 
 class Stalling:
-    """Passes one connection on to a broker, with little room to hold what it has not passed on."""
+    """Forwards one connection to a broker, with a small buffer."""
 
     def __init__(self, broker, stack):
         self.endpoint, self.carries = Endpoint("127.0.0.1", free_port()), threading.Event()
@@ -455,8 +455,8 @@ class Stalling:
                 other.sendall(data)
 
 
-def test_what_is_repeated_does_not_wait_for_a_link_that_carries_nothing(broker, stack):
-    """Else it would take the first part of a second after an outage, when pictures should return."""
+def test_periodic_messages_are_not_queued_on_a_stalled_link(broker, stack):
+    """Otherwise old messages would fill the link right after an outage, when pictures should return."""
     seen = []
     link_there = Stalling(broker, stack)
     own = {topic("x", "request", "+"): lambda message: None}

@@ -1,4 +1,4 @@
-"""What a frame and a change cost, as counts that do not depend on the machine."""
+"""Cost of a frame and of a change, as counts that do not depend on the machine."""
 
 from __future__ import annotations
 
@@ -69,21 +69,21 @@ def streaming():
 
 def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
     side, _ = streaming
-    # The operator's side, in this process too, looks at each frame and each packet that arrives.
+    # The operator's side, also in this process, inspects each arriving frame and packet.
     viewing = {name for name in calls if name.startswith(("Receiver", "RepairBuffer"))}
     assert viewing
     before, sent = Counter(calls), side.sent()
     until(lambda: all(frames > sent[name][0] + FRAMES for name, (frames, _) in side.sent().items()))
     during = calls - before
     assert {name: count for name, count in during.items() if name not in viewing} == {}
-    assert sum(during.values()) > FRAMES  # the counting works
+    assert sum(during.values()) > FRAMES  # the counters work
 
 
-def test_a_change_writes_what_differs_and_nothing_else(streaming, writes):
+def test_a_change_sets_only_what_differs(streaming, writes):
     side, vehicle = streaming
 
     def turned(knob, value):
-        """A single property is set at once, by the thread that turns the knob."""
+        """A single property is set immediately, by the thread that turns the knob."""
         writes.clear()
         side.turn(Command(name, knob, value) for name in vehicle.cameras)
         until(lambda: all(knobs.get(knob) == value for knobs in side.applied().values()))

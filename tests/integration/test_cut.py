@@ -1,4 +1,4 @@
-"""A link that is cut and comes back, under RTSP and SRT at once."""
+"""A link that is cut and restored, with RTSP and SRT together."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
 BACK_S = 5
-CONTROL_S = 1.0  # until the control link is back; before, it is unknown which cameras should send
+CONTROL_S = 1.0  # until the control link has recovered; until then it is unknown which cameras should send
 COMMON = ("source=test", "fps_max=15", "pqos=constant", "pqos.kbps=1000", "modes=paper", "page.serve=false")
 # Each vehicle with one camera.
 RTSP = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast")

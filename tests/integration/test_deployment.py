@@ -18,14 +18,14 @@ from runner.records import Sample
 pytestmark = needs_root
 VEHICLE, OPERATOR = "10.0.0.2", "10.0.0.1"
 BACK_S = 3.0
-CLOSED = 9999  # nothing in the document names it
+CLOSED = 9999  # not mentioned in the document
 LISTEN = f"import socket; s = socket.create_server(('', {CLOSED})); print(flush=True)\nwhile True: s.accept()"
 CONNECT = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), timeout=2)"
 
 
 @pytest.fixture
 def site(tmp_path):
-    """Two machines beside each other."""
+    """Two machines next to each other."""
     with machines("vehicle", "operator") as (vehicle, operator):
         cable(vehicle, "eth0", operator, "eth0")
         vehicle.run(f"ip addr add {VEHICLE}/24 dev eth0")
@@ -34,7 +34,7 @@ def site(tmp_path):
 
 
 def connects(site, where, host, port):
-    """Whether a TCP connection from one machine to the other one comes about."""
+    """Whether a TCP connection from one machine to the other can be established."""
     command = [*site.machines[where].command, sys.executable, "-c", CONNECT, host, str(port)]
     return subprocess.run(command, capture_output=True, timeout=20, check=False).returncode == 0
 
@@ -75,7 +75,7 @@ def test_two_bare_machines_drive_behind_their_firewalls(site):
 
 
 def has_arrived(drive):
-    """Whether pictures of every camera have come, and the vehicle has stated their bitrates over the control link."""
+    """Whether pictures of every camera have arrived, and the control link has reported their bitrates."""
     log = drive / "operator.jsonl"
     found = list(read_drive(drive).sides["operator"].of(Sample)) if log.exists() and log.stat().st_size else []
     return found and all(camera.frames > 20 and camera.allocated_kbps > 0 for camera in found[-1].cameras.values())
@@ -139,7 +139,7 @@ def test_through_wireguard_nothing_is_fragmented(path, mtu, rtp, tmp_path):
     ids=["srt", "srt behind NAT", "wireguard"],
 )
 @pytest.mark.soak
-def test_a_vehicle_that_roams_is_back(heading, translated, change, tmp_path):
+def test_a_roaming_vehicle_reconnects(heading, translated, change, tmp_path):
     """Twice; ten times in tests/soak."""
     with mobile(translated) as network:
         site = Site(network.vehicle, network.operator, tmp_path)

@@ -40,9 +40,9 @@ image = pytest.importorskip("PIL.Image")
 ROUNDS = int(os.environ.get("TOD_TASK_ROUNDS", "20"))
 YAWS = {"front": 0, "left": 55, "right": -55, "rear": 180}
 FULL_KBPS, TOTAL_KBPS = 800, 1600
-REPEATED_S = 1  # from then on a repeated picture is a fault
-LOST_MS = 1000  # without a picture for so long a camera is lost: status.js
-MORE_MS = 200  # than late_ms may pass from a cause to its mark
+REPEATED_S = 1  # a picture repeated for this long is a fault
+LOST_MS = 1000  # without a picture for this long a camera counts as lost: status.js
+MORE_MS = 200  # that may pass from a cause to its mark in addition to late_ms
 WIDE, STOPPED, QUEUE_MS = 50_000, 20, 60_000  # kbit/s of the link, and how long packets may wait for it
 RED, AMBER = (224, 27, 36), (255, 176, 0)  # of the marks: overlay.js
 
@@ -178,7 +178,7 @@ def selected(page):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_look_aside(driver, page, side):
-    """One press selects the picture beside the front camera's, another makes it the large one."""
+    """One press selects the picture next to the front camera's, another enlarges it."""
     front, aside = box(page, "front"), box(page, side)
     assert (aside["x"] < front["x"]) == (side == "left")
     assert aside["height"] > 0.4 * page.viewport_size["height"]
@@ -285,7 +285,7 @@ def marked_ms(page, camera, wanted, cause_ms):
 
 
 def settled(page):
-    """Wait until all pictures have been live for a while, and then for any part of a frame interval."""
+    """Wait until all pictures have been live for a while, plus a random part of a frame interval."""
 
     def is_settled():
         quiet = all(not marks(page, name, 1000 * time.time() - 700) for name in YAWS)

@@ -81,7 +81,7 @@ def some_of(*now):
 
 
 @pytest.mark.parametrize("part", some_of("the operator's side", "relay"))
-def test_a_part_of_a_demo_that_dies_is_named_and_ends_it(tmp_path, part):
+def test_a_dead_part_of_a_demo_is_reported_and_ends_it(tmp_path, part):
     with demo(tmp_path) as (child, parts, output):
         os.kill(parts[part], signal.SIGKILL)
         assert child.wait(20) == 1

@@ -23,7 +23,7 @@ SECONDS, SETTLED_S = 14, 6
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A drive over a link that carries half of what is predicted."""
+    """A drive over a link that carries half of the predicted bitrate."""
     path = tmp_path_factory.mktemp("feedback") / "drive"
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     link = ("link=relay", "link.share=0.5")
@@ -48,7 +48,7 @@ def test_reports_reach_the_vehicle_and_measure_the_link(drive):
 
 
 def test_the_vehicle_knows_its_operator_before_pictures_fill_the_link(drive):
-    """And so begins at half of what is predicted."""
+    """So it starts at half of the predicted bitrate."""
     sides = read_drive(drive).sides
     vehicle, link = sides["vehicle"], sides["link"]
     connected = next(vehicle.of(OperatorConnected)).t

@@ -74,7 +74,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
         time.sleep(frozen_s - 1)
         frozen = counts()
         camera.send_signal(signal.SIGCONT)
-        until(lambda: not side.sources(), seconds=12)  # 10 s between two attempts, at most
+        until(lambda: not side.sources(), seconds=12)  # at most 10 s between two attempts
         until(lambda: all(now > then + 10 for now, then in zip(counts(), frozen, strict=True)))
         assert client.errors == []
         messages = [line.removeprefix("rear: ") for line in reported]
@@ -83,7 +83,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
     assert len(set(messages)) == len(messages) <= 5  # each reason once, however many attempts
 
 
-def test_a_camera_that_is_off_is_watched_all_the_same():
+def test_a_camera_that_is_off_is_still_monitored():
     with driving() as (camera, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
         knobs(side, sending=False)
@@ -96,7 +96,7 @@ def test_a_camera_that_is_off_is_watched_all_the_same():
         assert reported[1].startswith("rear: source: ")
 
 
-def test_frames_that_are_held_up_behind_the_source_are_no_fault_of_it():
+def test_frames_blocked_downstream_are_no_fault_of_the_source():
     from runner.gst import Gst
 
     with driving() as (_, side, _, plan, reported), watching(plan) as client:

@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from runner.h264.access_unit import Recent, read_unit
+from runner.h264.access_unit import RecentUnits, read_unit
 from runner.h264.damage import Damage
 from runner.h264.keyframe import grey_idr
 
@@ -52,8 +52,8 @@ def test_a_grey_picture_starts_a_decoder_and_waves_make_it_exact(width, height, 
     assert (late[-10:] == whole[-10:]).all()
 
 
-def test_the_burst_of_a_late_viewer_is_exact_though_shorter_than_two_periods():
-    recent, whole = Recent(refresh_s=0.5), encoded(480, 260)
+def test_the_burst_for_a_late_viewer_is_exact_although_shorter_than_two_periods():
+    recent, whole = RecentUnits(refresh_s=0.5), encoded(480, 260)
     pictures, _ = decoded(whole, 480, 260)
     lengths = []
     for number, data in enumerate(whole):
@@ -77,7 +77,7 @@ def test_data_without_a_parameter_set_makes_no_picture():
 
 @pytest.mark.parametrize("lost", [[13], [3, 17], [10, 11, 12]])
 def test_a_picture_that_is_not_marked_as_damaged_is_exact(lost):
-    """However a decoder conceals what is missing."""
+    """Whatever the error concealment of a decoder."""
     units = encoded(480, 260)
     whole, _ = decoded(units, 480, 260)
     came = [number for number in range(len(units)) if number not in lost]

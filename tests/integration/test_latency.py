@@ -43,7 +43,7 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
         assert sum(shown) >= 0.99 * len(shown)
     for camera in ("front", "rear", "mast"):
         check_stages([sample.cameras[camera] for sample in known], max(sample.clock_bound_ms for sample in known))
-    # What a latency shows too much is what the difference of the clocks is wrong by.
+    # The excess of a latency is the error of the clock difference.
     wrong = [abs(sample.clock_ahead_ms - sign * AHEAD_MS) for sample in known]
     assert sum(w <= sample.clock_bound_ms for w, sample in zip(wrong, known, strict=True)) >= 0.99 * len(known)
     assert max(wrong) > ONE_WAY_MS / 4  # of a delay in one direction, half is shown as difference of the clocks
@@ -52,7 +52,7 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     aligned = drive.sides["vehicle"].began_s - drive.sides["operator"].began_s
     assert abs(aligned) < 3  # one of the two starts some time after the other
     factors = [line.speed_factor for line in drive.sides["vehicle"].of(Telemetry) if line.t > 3]
-    # What is shown, what it may be wrong, 60 ms that are not measured; more while the machine is busy.
+    # The displayed value, its maximum error, and 60 ms that are not measured; more while the machine is busy.
     assert 0.4 < max(factors) <= 150 / (ONE_WAY_MS + 60)
     assert run("report", str(path), f"output={report}").returncode == 0
     (found,) = json.loads((report / "report.json").read_text())["drives"]

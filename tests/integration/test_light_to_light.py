@@ -1,4 +1,4 @@
-"""Glass-to-glass latency, read by the page from the picture of a counter, agrees with what the page states."""
+"""Glass-to-glass latency, read by the page from the picture of a counter, agrees with the reported latency."""
 
 import re
 import shutil
@@ -21,7 +21,7 @@ RESULT = re.compile(
 )
 
 
-def test_the_stated_latency_is_what_a_counter_in_the_picture_shows(chromium, tmp_path: Path) -> None:
+def test_the_reported_latency_matches_a_counter_in_the_picture(chromium, tmp_path: Path) -> None:
     port = free_port()
     words = (*ROBOT, f"page.port={port}", f"media.port={free_port()}")
     output, own = tmp_path / "output", ("camera=rear", "loop=true", "duration_s=3", f"control.port={free_port()}")
@@ -69,7 +69,7 @@ def readings(elapsed: list[float | None], age: float | None = 40.0) -> list[Coun
     return [CounterReading("rear", ms, age, None if age is None else 2.0) for ms in elapsed]
 
 
-def test_the_fixed_part_is_what_the_reported_latency_lacks() -> None:
+def test_the_fixed_part_is_the_difference_to_the_reported_latency() -> None:
     """Camera and screen add 50 ms to the 40 of which the page knows; the vehicle knows of 25 of those."""
     found = glass_to_glass(readings([*[90.0] * 18, 130.0, None]), [25.0, 20.0, 30.0])
     assert found

@@ -76,7 +76,7 @@ def test_a_clip_with_blanks_in_its_path_plays(tmp_path):
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 @pytest.mark.parametrize("retransmission_ms", [0, 200])
-def test_a_foreign_client_plays_the_stream(transport, retransmission_ms):
+def test_a_third_party_client_plays_the_stream(transport, retransmission_ms):
     words = ("vehicle=delivery_robot", f"graph.retransmission_ms={retransmission_ms}")
     with streaming(*words, cameras=("rear",)) as (_, vehicle, _, _reported):
         url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"

@@ -1,4 +1,4 @@
-"""Limited links between real sides: what passes, what is dropped, and that nothing is left behind."""
+"""Limited links between real sides: forwarding, drops and cleanup."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def rate(first, last):
 
 
 def full_rate(lines):
-    """The same where packets waited all the time: a vehicle or a link that a busy machine holds up passes less."""
+    """The same while packets were queued: a vehicle or a link that a busy machine delays passes less."""
     waiting = [(one, other) for one, other in pairwise(lines) if one.queue_ms >= 1000 * (other.t - one.t)]
     seconds = sum(other.t - one.t for one, other in waiting)
     assert seconds > 1
@@ -155,7 +155,7 @@ def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
 
 
 @pytest.mark.alone
-def test_rtsp_over_tcp_waits_where_udp_is_dropped():
+def test_rtsp_over_tcp_is_queued_where_udp_is_dropped():
     with driving("relay", lambda t: 5000 if t < 1 else 1000, sent_kbps=2000, tcp=True) as drive:
         until(lambda: drive.lines[-1].t > 1)
         drive.settle()
@@ -169,7 +169,7 @@ def test_rtsp_over_tcp_waits_where_udp_is_dropped():
 
 @needs_root
 @pytest.mark.alone
-def test_two_viewers_share_the_total_though_one_has_a_narrow_link():
+def test_two_viewers_share_the_total_although_one_has_a_narrow_link():
     """Both copies leave the vehicle over one link; most packets of the second one are lost behind it."""
     with driving("netns", lambda t: 20_000, sent_kbps=1400) as drive:
         drive.settle()
@@ -187,7 +187,7 @@ def test_two_viewers_share_the_total_though_one_has_a_narrow_link():
 
 
 def _narrow(client, kbps):
-    """Drop what the client receives beyond a rate; returns a function that counts what has passed, bytes."""
+    """Drop packets to the client beyond a rate; returns a function that counts the passed bytes."""
     passed, began = 0, time.monotonic()
 
     def take(_pad, info):
@@ -214,19 +214,19 @@ def test_a_delay_is_added_to_the_wait(kind):
         assert drive.lines[-1].dropped == 0
 
 
-def test_lost_packets_are_sent_again_through_the_relay(monkeypatch):
+def test_lost_packets_are_retransmitted_through_the_relay(monkeypatch):
     from runner.gst.server import CameraServer, GstRtsp
 
     factory = CameraServer._factory
 
     def with_feedback_only(self, plan):
-        # Offered both, a client that does not choose takes AVP, which has no retransmission.
+        # Offered both, a client that does not choose uses AVP, which has no retransmission.
         made = factory(self, plan)
         made.set_profiles(GstRtsp.RTSPProfile.AVPF)
         return made
 
     monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
-    # A queue that holds most of a frame but not all of it: the rest arrives as soon as it is requested again.
+    # A queue that fits most of a frame but not all of it: the rest arrives once it is retransmitted.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
     overrides = (*NOISE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
     with (
@@ -263,7 +263,7 @@ def test_queued_packets_do_not_block_their_sender():
         "out.setblocking(False)\n"
         "print(sum(out.sendto(bytes(1200), (sys.argv[1], 9)) for _ in range(300)))\n"
     )
-    slow = Limit(lambda t: 100, queue_ms=60_000, delay_ms=0)  # it takes 29 s to send them
+    slow = Limit(lambda t: 100, queue_ms=60_000, delay_ms=0)  # sending them takes 29 s
     with limited_link("netns", slow, *_ends(), print) as link:
         command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
@@ -274,7 +274,7 @@ def test_queued_packets_do_not_block_their_sender():
 
 
 @needs_root
-def test_nothing_of_a_namespace_stays_behind():
+def test_a_namespace_is_removed_completely():
     before = _names()
     with limited_link("netns", WIDE, *_ends(), print) as one, limited_link("netns", WIDE, *_ends(), print) as two:
         names = [link.vehicle_command[-1] for link in (one, two)]
@@ -384,7 +384,7 @@ out.sendto(b"!" * 1000, (sys.argv[1], int(sys.argv[2])))
 
 
 @needs_root
-def test_both_ways_of_a_namespace_lose_and_delay_any_packet():
+def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
     """As the relay does with UDP. Half of the packets pass one way, and half of those come back."""
     lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=Reverse(lambda t: 5000, 200, 150, loss=0.5))
     with limited_link("netns", lossy, *_ends(), print) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:
@@ -408,7 +408,7 @@ def test_both_ways_of_a_namespace_lose_and_delay_any_packet():
 
 @needs_root
 def test_tcp_flows_compete_from_the_start_of_the_drive_on():
-    """Some that end, under cubic, share the link with everything else."""
+    """Finite transfers with CUBIC share the link with all other traffic."""
     lines = []
     flows = TcpFlows(2, size=(20_000, 60_000), pause_s=0.1)
     with limited_link("netns", replace(WIDE, delay_ms=20, tcp=flows), *_ends(), lines.append) as link:

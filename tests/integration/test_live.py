@@ -66,7 +66,7 @@ def test_requests_are_answered_applied_or_refused(broker, vehicle, tmp_path):
     assert operator.state(lambda state: not state["online"]) == {"online": False}
     lines = [json.loads(line) for line in (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()]
     assert [line["kbps"] for line in lines if line.get("event") == "total_set"] == [2000, 1500]
-    times = [line["t"] for line in lines if "event" in line]  # lines of other threads may come a moment later
+    times = [line["t"] for line in lines if "event" in line]  # lines of other threads may arrive slightly later
     assert times == sorted(times)
 
 
@@ -108,7 +108,7 @@ def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
     state = operator.state(lambda state: not any(camera["sending"] for camera in state["cameras"].values()))
     assert "operator" in state["cameras"]["front"]["reason"]
     assert state["t"] - hello["t"] < 3  # by the vehicle's clock: 1 s of silence, and another one by the rule
-    # As its heartbeat: a request may be lost with a connection that was just made anew.
+    # Repeated, as its heartbeat is: a request may be lost with a connection that was just re-established.
     until(lambda: operator.send("2", event="operator_connected") or operator.replies.get("2"), every_s=0.25)
     assert operator.replies["2"]["result"] == "applied"
     operator.state(lambda state: all(camera["sending"] for camera in state["cameras"].values()))
@@ -315,7 +315,7 @@ def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     assert {line["kbps"] for line in lines if line.get("event") == "bitrate_predicted"} <= {2500, 4500, 8000}
 
 
-def test_what_is_missing_is_one_line_and_status_1(broker, tmp_path):
+def test_missing_requirements_are_reported_in_one_line_with_status_1(broker, tmp_path):
     port = f"control.port={broker.port}"
     absent = run("vehicle", "source=v4l2", "cameras.front_left.device=/dev/video99", port, f"media.port={free_port()}")
     assert absent.returncode == 1

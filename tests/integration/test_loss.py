@@ -18,7 +18,7 @@ SENDING = {"front_left": True}
 
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("openh264_rtsp", marks=pytest.mark.soak)])
-def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
+def test_incomplete_units_are_dropped(graph, monkeypatch):
     from runner.apply import OperatorSide
     from runner.gst import Gst
 
@@ -54,7 +54,7 @@ def test_units_that_miss_packets_are_left_out(graph, monkeypatch):
     assert "concealing" not in errors
 
 
-def test_lost_packets_are_sent_again(monkeypatch):
+def test_lost_packets_are_retransmitted(monkeypatch):
     """Most packets lost in transit are retransmitted (RFC 4588), and few pictures are left out."""
     from runner.apply import OperatorSide
     from runner.gst import Gst
@@ -94,7 +94,7 @@ def test_lost_packets_are_sent_again(monkeypatch):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("by_time", [True, pytest.param(False, marks=pytest.mark.soak)])
-def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeypatch, by_time):
+def test_the_loss_of_the_end_of_a_frame_is_detected_before_the_next_frame(monkeypatch, by_time):
     from runner.apply import OperatorSide
     from runner.gst import Gst, arriving, repair
 
@@ -115,7 +115,7 @@ def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeyp
             return Gst.PadProbeReturn.DROP
 
     monkeypatch.setattr("runner.apply.Receiver", Lossy)
-    if not by_time:  # as if only later packets showed what is missing
+    if not by_time:  # as if only later packets revealed the loss
         monkeypatch.setattr(repair.RepairBuffer, "request_tail", lambda self: None)
     with streaming("fps_max=3") as (side, _, plans, _):
         knobs = {"sending": True, "size": (960, 520), "bitrate": 3000}
@@ -133,7 +133,7 @@ def test_the_loss_of_the_end_of_a_frame_is_noticed_before_the_next_frame(monkeyp
 
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("openh264_rtsp", marks=pytest.mark.soak)])
-def test_a_picture_that_is_damaged_for_good_is_whole_again_after_a_key_frame(graph, monkeypatch):
+def test_a_picture_with_unrecovered_loss_is_healed_by_a_key_frame(graph, monkeypatch):
     """Long before the next refresh wave or key frame."""
     from runner.apply import OperatorSide
     from runner.gst import Gst
@@ -177,7 +177,7 @@ def test_a_picture_that_is_damaged_for_good_is_whole_again_after_a_key_frame(gra
             operator.stop()
 
 
-def test_a_graph_that_does_not_state_how_is_left_alone():
+def test_a_graph_without_key_frame_requests_gets_none():
     with streaming("graph.key_frame=null", "fps_max=15") as (side, _, (plan,), _), watching(plan) as client:
         until(lambda: len(client.sizes) > 5)
         side.send_key_frames(["front_left"])

@@ -17,7 +17,7 @@ from runner.gst import GLib, Gst
 from runner.gst.one_shot import OneShot
 from runner.plans import compile_plans
 
-LOOKS = 20_000
+SAMPLES = 20_000
 STAMPED = 3_900_000_000 * Gst.SECOND
 FED = "appsrc name=fed format=time ! identity name=seen ! fakesink sync=false"
 MADE = "videotestsrc ! video/x-raw,width=40,height=30 ! identity name=seen ! fakesink sync=false"
@@ -106,11 +106,11 @@ def test_reading_keeps_no_memory(playing):
         until(looked, every_s=0)
         return resident_kb()
 
-    begun = look(LOOKS // 4)
-    assert look(LOOKS) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
+    begun = look(SAMPLES // 4)
+    assert look(SAMPLES) - begun < 500  # the binding's own probe would keep 130 bytes each time: 1950 kB
 
 
-def test_an_owner_that_is_gone_is_called_no_more(playing):
+def test_a_deleted_owner_is_no_longer_called(playing):
     pipeline, pad = playing
     seen = []
     shot = OneShot(pad, lambda _pad, _buffer: seen.append(1))

@@ -1,4 +1,4 @@
-"""The operator's receivers: a vehicle that starts late or goes away, strangers, a link that is cut."""
+"""The operator's receivers: a vehicle that starts late or disappears, other senders, a link that is cut."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def receiving(plans):
         side.stop()
 
 
-def test_a_vehicle_that_starts_later_is_waited_for_in_silence():
+def test_waiting_for_a_vehicle_that_starts_later_is_silent():
     vehicle, plans = compiled()
     with receiving(plans) as (side, messages, more):
         end = time.monotonic() + 3
@@ -96,11 +96,11 @@ def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
     assert all(" works again after " in what for what in back)
 
 
-def test_packets_of_strangers_are_dropped_and_counted():
+def test_packets_of_other_senders_are_dropped_and_counted():
     vehicle, plans = compiled()
     with sending(vehicle, plans), receiving(plans) as (side, messages, more):
         more()
-        sockets = [taken for r in side._receivers.values() for taken in r._filter._sockets.values()]
+        sockets = [sock for r in side._receivers.values() for sock in r._filter._sockets.values()]
         assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
         ports = [taken.getsockname()[1] for taken in sockets]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -114,10 +114,10 @@ def test_packets_of_strangers_are_dropped_and_counted():
         assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
         assert {(received.lost, received.rebuilt) for received in samples.values()} == {(0, 0)}
         until(lambda: messages)
-    assert messages == ["front, rear: packets from other hosts than the vehicle are dropped"]
+    assert messages == ["front, rear: packets from hosts other than the vehicle are dropped"]
 
 
-def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
+def test_an_unresponsive_server_is_retried_every_two_seconds():
     """Accepts connections and sends nothing, like a vehicle that hangs."""
     vehicle, plans = compiled()
     with socket.create_server((vehicle.media.host, vehicle.media.port)) as server:
@@ -131,7 +131,7 @@ def test_a_server_that_does_not_answer_is_tried_again_every_two_seconds():
     assert connected[-1] - connected[0] < 3 * 2.0
 
 
-def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
+def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
     """Another viewer keeps the stream running, so that it does not begin with an IDR picture."""
     vehicle, plans = compiled("media.max_viewers=2")
     with sending(vehicle, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
@@ -139,7 +139,7 @@ def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
         more()
         assert side.sample(SENDING)["front"].damaged == 0
         receiver = side._receivers["front"]
-        side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+        side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
         more()
         until(lambda: side.sample(SENDING)["front"].damaged > 0 or not receiver.is_damaged, every_s=0.1)
         seen = side.sample(SENDING)["front"]
@@ -147,7 +147,7 @@ def test_what_a_rebuilt_receiver_missed_shows_until_a_wave_is_whole():
         until(lambda: side.sample(SENDING) and not receiver.is_damaged, every_s=0.1)
 
 
-def test_receivers_that_are_rebuilt_leave_nothing():
+def test_rebuilt_receivers_leak_nothing():
     """Python cannot free an object that holds a pad whose probe holds the object."""
     from runner.gst.repair import RepairBuffer
 
@@ -160,7 +160,7 @@ def test_receivers_that_are_rebuilt_leave_nothing():
         more()
         before, receiver = buffers(), side._receivers["front"]
         for number in range(1, 4):
-            side._glib.call("restarting", lambda: receiver._supervised.restart("as asked"))
+            side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
             until(lambda n=number: side.sample(SENDING)["front"].rebuilt == n, every_s=0.1)
             more()
         until(lambda: buffers() == before, every_s=0.2)
@@ -203,7 +203,7 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     assert f"front: {aside.HUNG}" in messages
 
 
-def test_work_that_hangs_in_gstreamer_s_thread_is_named(monkeypatch):
+def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
     from runner import apply
 
     monkeypatch.setattr(apply, "CALL_S", 0.2)

@@ -32,7 +32,7 @@ RAW = '{name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}'
 
 @pytest.fixture
 def conf(tmp_path: Path) -> Path:
-    """The user's own sources, one that ends and one that fails; and an encoder that takes 0.2 s for each frame."""
+    """The user's own sources, one that ends and one that fails; and an encoder that needs 0.2 s per frame."""
     directory = tmp_path / "conf"
     (directory / "source").mkdir(parents=True)
     sources = {
@@ -186,7 +186,7 @@ def test_a_source_that_ends_early_is_reported(tmp_path, conf):
 
 def test_lost_frames_are_counted_and_reported(tmp_path, conf):
     words = ("source=test", "recording=slow", f"conf={conf}", f"output={tmp_path / 'rec'}")
-    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=30")  # the queue holds ten
+    huge = ("cameras.rear.width_px=3840", "cameras.rear.height_px=2160", "cameras.rear.fps=30")  # the queue fits ten
     done = run("record", *ONE, *words, *huge, "duration_s=2")
     assert done.returncode == 0, done.stderr
     about = index(tmp_path / "rec")["cameras"]["rear"]

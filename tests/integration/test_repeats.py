@@ -51,7 +51,7 @@ def test_a_source_that_repeats_a_picture_is_at_fault_until_its_pictures_change()
     assert reported[begins + 1].startswith("rear: works again after ")
 
 
-def test_a_picture_that_comes_seldom_is_not_taken_for_a_repeated_one():
+def test_a_rare_picture_is_not_mistaken_for_a_repeated_one():
     """Until it has been seen several times."""
     with streaming(*WORDS, cameras=("rear",)) as (side, _, (plan,), _reported), watching(plan) as client:
         play(side, dark, lambda: len(client.sizes) > 5)

@@ -209,7 +209,7 @@ def test_a_vehicle_with_revoked_keys_is_disconnected(keys):
         until(lambda: min(seen().values()) > 10, every_s=0.1)
         changed(keys, "rotate", NAME)
         began = time.monotonic()
-        until(lambda: any("the vehicle's keys are not accepted any more" in what for what in seen() and messages))
+        until(lambda: any("the vehicle's keys are no longer accepted" in what for what in seen() and messages))
         assert time.monotonic() - began < 5
         time.sleep(1)
         before = seen()

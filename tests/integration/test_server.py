@@ -24,7 +24,7 @@ OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only used to find the route
 
 
 class Vehicle:
-    """Some streaming cameras, and what the tests do with them."""
+    """Several streaming cameras, and helpers of the tests."""
 
     def __init__(self, side, vehicle, reported):
         self.side, self.reported = side, reported
@@ -95,7 +95,7 @@ def asking_options(vehicle, camera):
 @pytest.mark.parametrize(
     "line", [b"rtsp://h/\x8f", b"rtsp://h/front_left?\xff", b"rtsp://h/front_left/\xc9", b"rtsp://h\xab/front_left?x"]
 )
-def test_a_url_that_is_no_text_is_refused_without_a_traceback(line, capfd):
+def test_a_url_that_is_not_text_is_rejected_without_a_traceback(line, capfd):
     with serving() as vehicle, watched(vehicle):
         for method in (b"OPTIONS", b"DESCRIBE", b"SETUP", b"PLAY", b"TEARDOWN"):
             with socket.create_connection(("127.0.0.1", vehicle.port), 5) as connection:
@@ -105,8 +105,8 @@ def test_a_url_that_is_no_text_is_refused_without_a_traceback(line, capfd):
 
 
 @pytest.mark.parametrize("pauses", [3, pytest.param(20, marks=pytest.mark.soak)])
-def test_a_pause_loses_no_packet_of_what_follows(pauses):
-    """Over UDP and TCP at once: queues stand between the stream and its sinks. Each frame has several packets."""
+def test_no_packet_is_lost_after_a_pause(pauses):
+    """With UDP and TCP together there are queues between the stream and its sinks. Each frame has several packets."""
     with serving() as vehicle, watched(vehicle) as over_udp, watched(vehicle, udp=False) as over_tcp:
         vehicle.turn(bitrate=4000)
         for _ in range(pauses):
@@ -121,7 +121,7 @@ def test_a_pause_loses_no_packet_of_what_follows(pauses):
 @pytest.mark.alone
 @pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
 @pytest.mark.parametrize("state", ["sending", "off before the first viewer", "off", "off with a viewer over UDP"])
-def test_opening_a_camera_in_any_state_is_answered_at_once(state, udp):
+def test_opening_a_camera_in_any_state_is_answered_immediately(state, udp):
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving(cameras=(CAMERA, OTHER)))
         stack.enter_context(watched(vehicle, OTHER))
@@ -162,10 +162,10 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
         until(lambda: vehicle.side.push(CAMERA, frame))
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [200, 200, 200]
-        assert vehicle.pipelines() == 1  # the one that the first client asked for
+        assert vehicle.pipelines() == 1  # the one requested by the first client
 
 
-def test_a_camera_opened_again_at_once_is_there():
+def test_a_camera_can_be_reopened_immediately():
     """Clients that each may be the last one to leave, while another opens it."""
     answers = []
 
@@ -185,7 +185,7 @@ def test_a_camera_opened_again_at_once_is_there():
 
 @pytest.mark.parametrize("source", ["source=test", "source=synthetic"])
 @pytest.mark.parametrize("header", [{"Range": "npt=5.000-"}, {"Scale": "2.0"}, {"Speed": "4.0"}], ids=str)
-def test_nobody_seeks_what_others_watch(source, header):
+def test_a_viewer_cannot_seek_a_shared_stream(source, header):
     with serving(source) as vehicle, watched(vehicle) as viewer:
         first = vehicle.frames() - viewer.frames
         with RtspClient(vehicle.url()) as client:
@@ -251,7 +251,7 @@ FFMPEG = "ffmpeg -v error -rtsp_transport {} -i {{url}} -frames:v 5 -f null -"
     ],
     ids=["ffmpeg over TCP", "ffmpeg over UDP", "rtspsrc"],
 )
-def test_players_follow_to_the_url_that_is_right(line, has_played):
+def test_players_follow_a_redirect_to_the_correct_url(line, has_played):
     with serving() as vehicle, watched(vehicle):
         words = line.format(url=f"{vehicle.url()}?x=1").split()
         done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
@@ -286,13 +286,13 @@ def test_a_second_viewer_over_the_uplink_is_refused(outside):
             until(lambda: third.session or third.open() == [200, 200, 200])
 
 
-def test_more_viewers_are_let_in_if_the_configuration_allows_them(outside):
+def test_more_viewers_are_admitted_if_the_configuration_allows_them(outside):
     with serving("media.max_viewers=2") as vehicle, ExitStack() as stack:
         viewers = [stack.enter_context(RtspClient(vehicle.url(), source=outside)) for _ in range(3)]
         assert [viewer.open() for viewer in viewers] == [[200, 200, 200], [200, 200, 200], [200, 453]]
 
 
-def test_the_controller_is_let_in_and_the_other_viewer_closed(outside):
+def test_the_controller_is_admitted_and_the_other_viewer_disconnected(outside):
     with serving() as vehicle, RtspClient(vehicle.url(), source=outside) as stranger:
         vehicle.side.give_control("anna")
         assert stranger.open() == [200, 200, 200]
@@ -444,7 +444,7 @@ def test_rtp_and_rtcp_sockets_listen_on_the_servers_address_only():
             assert [line.split()[3] for line in lines if f":{port} " in line] == [f"127.0.0.1:{port}"]
 
 
-def test_a_server_that_stops_amid_requests_leaves_no_thread_that_reads_on(capfd):
+def test_a_server_that_stops_during_requests_leaves_no_reading_thread(capfd):
     """The library's thread of a connection reads without end if another thread closes it in the middle of a request."""
 
     def ask(address):
@@ -467,7 +467,7 @@ def test_a_server_that_stops_amid_requests_leaves_no_thread_that_reads_on(capfd)
         assert "CRITICAL" not in capfd.readouterr().err[:1000]
 
 
-def test_a_pipeline_that_fails_with_viewers_ends_whole_and_is_built_anew(capfd):
+def test_a_pipeline_that_fails_with_viewers_is_torn_down_and_rebuilt(capfd):
     """The library complains on standard error about whatever it leaves behind, or ends twice."""
     sender = (
         "graph.sender=[{name: sent, element: identity, properties: {error-after: 6}},"
@@ -479,7 +479,7 @@ def test_a_pipeline_that_fails_with_viewers_ends_whole_and_is_built_anew(capfd):
             with one, other, idle:
                 assert idle.ask("DESCRIBE") == 200
                 assert one.open() == [200, 200, 200]
-                other.open(udp=True)  # it may come too late
+                other.open(udp=True)  # may be too late
                 until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
             assert vehicle.pipelines(SMALL_CAMERA) == number
         assert any("Failed after iterations" in report for report in vehicle.reported)

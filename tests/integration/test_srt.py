@@ -11,7 +11,7 @@ from runner.plans import compile_plans
 WORDS = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "source=test", "fps_max=15", "graph=h264_srt")
 
 
-def test_a_call_that_nobody_answers_is_repeated_each_second():
+def test_an_unanswered_call_is_repeated_every_second():
     from runner.gst import Gst
 
     (plan,) = compile_plans(configuration([*WORDS, f"graph.first_port={free_port()}"]).vehicle())

@@ -130,7 +130,7 @@ def test_a_new_station_announces_itself_and_is_answered(both):
     assert listener.notes == ["the vehicle is online, mode automatic"]
 
 
-def test_retained_telemetry_is_no_sign_of_life(both):
+def test_retained_telemetry_is_no_heartbeat(both):
     station, vehicle, _ = both
     vehicle.publish("state", STATE | {"total_kbps": 2999})  # behind all telemetry: from now on that is retained
     until(lambda: station.state.total_kbps == 2999)
@@ -147,7 +147,7 @@ def test_retained_telemetry_is_no_sign_of_life(both):
         late.close()
 
 
-def test_a_request_that_nobody_answers_has_timed_out(both):
+def test_an_unanswered_request_times_out(both):
     station, _, _ = both
     replies = []
     station.ask({"event": "total_set", "kbps": 1000}, replies.append)
@@ -197,11 +197,11 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
 
 def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both):
     """None before that clock is compared with the vehicle's, and none of the future."""
-    heard = []
+    received = []
 
     class Steered(Listener):
         def on_steering(self, at, rad):
-            heard.append((at, rad))
+            received.append((at, rad))
 
     station, vehicle, _ = both
     station.listeners.append(Steered())
@@ -211,11 +211,11 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     at = time.time()
     vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
     vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
-    until(lambda: heard)
-    assert heard == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
+    until(lambda: received)
+    assert received == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
 
 
-def test_the_sign_of_life_states_whether_the_driver_watches(both):
+def test_the_heartbeat_states_the_drivers_attention(both):
     station, vehicle, _ = both
     assert "attention" not in vehicle.request("operator_connected")
     for number, attention in enumerate((Attention.HIDDEN, Attention.WATCHING, None), 2):
@@ -243,16 +243,16 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
         return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0
 
     until(lambda: 40 <= reported() < 60, every_s=0.05)
-    until(lambda: reported(ms=130) >= 130, every_s=0.05)  # at once, not with the next sample
+    until(lambda: reported(ms=130) >= 130, every_s=0.05)  # immediately, not with the next sample
     until(lambda: 40 <= reported() < 60, every_s=0.05)
     until(lambda: reported(silent=["rear"]) > 500, every_s=0.05)  # the longer it sends nothing
     until(lambda: 40 <= reported() < 60, every_s=0.05)
     cameras = {name: {**camera, "fault": "it repeats"} for name, camera in STATE["cameras"].items()}
     vehicle.publish("state", {**STATE, "t": 2.0, "cameras": cameras})
-    until(lambda: reported() == 0, every_s=0.05)  # pictures come, and nobody knows how old what they show is
+    until(lambda: reported() == 0, every_s=0.05)  # pictures arrive whose age is unknown
 
 
-def test_the_latency_of_a_source_that_knows_no_capture_times_is_unknown(both):
+def test_the_latency_of_a_source_without_capture_times_is_unknown(both):
     station, vehicle, listener = both
 
     def reach(done):
@@ -280,7 +280,7 @@ def test_the_latency_of_a_source_that_knows_no_capture_times_is_unknown(both):
     assert station.captured_here("front", 1003.7) is not None
 
 
-def test_a_clock_that_is_stated_twice_or_unasked_is_not_believed(both):
+def test_duplicate_or_unrequested_clock_answers_are_ignored(both):
     station, vehicle, _ = both
     report_until(station, lambda: station.clock)
     before, answer = station.clock, vehicle.answers[-1]
@@ -319,7 +319,7 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
     assert listener.notes[1:] == [text]
 
 
-def test_a_vehicle_that_leaves_is_gone_at_once(both):
+def test_a_vehicle_that_signs_off_is_offline_immediately(both):
     station, vehicle, listener = both
     vehicle.publish("state", OFFLINE)
     until(lambda: not station.state)

@@ -90,7 +90,7 @@ OPENH264 = pytest.param(("graph=openh264_rtsp",), marks=pytest.mark.soak)
 
 
 @pytest.mark.parametrize("sides", [(), ("graph=h264_srt",), OPENH264], indirect=True, ids=str)
-def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
+def test_both_sides_store_what_they_send_and_receive(sides, tmp_path):
     with sides.receiving() as operator:
         for size in ((160, 90), (640, 360), (320, 180)):
             until(lambda: all(received.frames > 20 for received in operator.sample({}).values()))
@@ -105,7 +105,7 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
         assert found[-4:] == sizes  # a caller sends before any knob is turned
         assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames continue while both sides stop
-        # On a busy machine packets get lost on loopback, too; what arrives is kept as it is.
+        # On a busy machine packets get lost on loopback, too; what arrives is stored unchanged.
         whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # A receiver that joins a running stream begins with the next parameter sets.
@@ -114,7 +114,7 @@ def test_both_sides_keep_what_they_send_and_receive(sides, tmp_path):
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
 
 
-def test_a_side_that_cannot_start_blames_no_file(tmp_path):
+def test_a_side_that_cannot_start_reports_no_file_error(tmp_path):
     """A pipeline that fails to start resets the element that writes the file before it has a name."""
     with ExitStack() as stack:
         sides = Sides(tmp_path, "graph=h264_srt", cameras=("front",))
@@ -142,7 +142,7 @@ def test_the_first_frame_of_a_file_is_reported_with_its_capture_time(sides):
         assert abs(received - sent) < 0.001  # the same frame, and the packets carry its capture time
 
 
-def test_a_pause_lasts_as_long_in_the_files_as_it_did(sides, tmp_path):
+def test_a_pause_has_its_true_length_in_the_files(sides, tmp_path):
     """GStreamer's demuxer would leave half a second of it."""
     with sides.receiving() as operator:
         until(lambda: operator.sample({})["front"].frames > 20)
@@ -157,7 +157,7 @@ def test_a_pause_lasts_as_long_in_the_files_as_it_did(sides, tmp_path):
         assert max(b.demuxed_ns - a.demuxed_ns for a, b in pairwise(units)) < 1.4 * Gst.SECOND
 
 
-def test_a_pipeline_that_is_built_again_begins_a_file_of_its_own(sides, tmp_path):
+def test_a_rebuilt_pipeline_begins_a_new_file(sides, tmp_path):
     for number in range(2):
         with watching(sides.plans[0]) as client:
             until(lambda c=client: len(c.sizes) > 20)
@@ -263,7 +263,7 @@ def test_a_directory_that_cannot_be_made_ends_the_file_and_not_the_stream(sides,
 
 
 def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
-    """A pipe that nobody reads takes 64 kB and then blocks."""
+    """A pipe without a reader accepts 64 kB and then blocks."""
     monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", 20_000)
     sides = Sides(tmp_path)
 
@@ -289,7 +289,7 @@ def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
 # --- configuration ----------------------------------------------------------------------------------------------------
 
 
-def test_a_graph_that_counts_nothing_is_refused(tmp_path):
+def test_a_graph_without_counters_is_rejected(tmp_path):
     text = (CHECKOUT / "conf/graph/h264_rtsp.yaml").read_text()
     (tmp_path / "graph").mkdir()
     (tmp_path / "graph/mine.yaml").write_text(text.replace("{name: sent,", "{name: other,"))
@@ -298,7 +298,7 @@ def test_a_graph_that_counts_nothing_is_refused(tmp_path):
         configuration(["source=test", "graph=mine", "log.video=true"], tmp_path).vehicle()
 
 
-def test_h265_is_kept_as_it_is(tmp_path):
+def test_h265_is_stored_unchanged(tmp_path):
     for element in ("x265enc", "avdec_h265"):
         if not Gst.ElementFactory.find(element):
             pytest.skip(f"{element} is not installed")

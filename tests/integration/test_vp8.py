@@ -1,4 +1,4 @@
-"""A graph with an encoder that does not declare what may change while it plays: vp8enc."""
+"""A graph with an encoder that does not declare its properties as mutable while playing: vp8enc."""
 
 from __future__ import annotations
 

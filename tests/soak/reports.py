@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from fractions import Fraction
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, REPORT_S, LinkCap, advanced, believed
+from runner.core.link_cap import LEAST, REPORT_S, LinkCap, believed_limit, update_cap
 from runner.core.model import exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 
@@ -85,8 +85,8 @@ def _step(
     kbps = None if link.kbps is None else exact(round(link.kbps, 1))
     measured = LinkMeasured(t=t, kbps=kbps, queue_ms=link.queue_ms, loss=link.loss, state=link.state, rtt_ms=30.0)
     position = PositionReported(t=t, lat=place[0], lon=place[1])
-    cap = advanced(cap, measured, t, LIMIT, LEAST_TRUST, position)
-    total = min(believed(cap, LIMIT, LEAST_TRUST), cap.kbps or LIMIT)
+    cap = update_cap(cap, measured, t, LIMIT, LEAST_TRUST, position)
+    total = min(believed_limit(cap, LIMIT, LEAST_TRUST), cap.kbps or LIMIT)
     if not LEAST <= total <= LIMIT or (cap.kbps is not None and cap.kbps < LEAST):
         return uplink, cap, f"total {float(total)} under {cap}"
     return uplink, cap, ""
