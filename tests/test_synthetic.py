@@ -156,7 +156,7 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_partial_clip(world: Path, t
 @pytest.mark.gst
 def test_failing_worker(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):
-        synthetic._share_out([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
+        synthetic._distribute([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
 
 
 # --- the files ------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import uuid
 from contextlib import contextmanager, suppress
 
 import pytest
-from soak.signals import LIMIT_S, MARK, ROBOT, marked
+from soak.signals import LIMIT_S, MARK, ROBOT, marked_processes
 
 from rig import CHECKOUT, free_port, until
 from runner.core.model import Endpoint
@@ -46,14 +46,14 @@ def demo(tmp_path, *words):
             until(lambda: (tmp_path / "drive" / "link.jsonl").exists() and "front" in (tmp_path / "output").read_text())
             yield child, until(lambda: _parts(mark)), (tmp_path / "output").read_text
         finally:
-            for pid in marked(mark):
+            for pid in marked_processes(mark):
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
 
 
 def _parts(mark):
     """The process id of each part; None before all of them run."""
-    started = marked(mark)
+    started = marked_processes(mark)
     found = {name: [p for p, words in started.items() if re.search(part, words + " ")] for name, part in PARTS.items()}
     return {name: pid for name, (pid,) in found.items()} if all(found.values()) else None
 
