@@ -31,7 +31,7 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
         page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         page.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
         page.goto(url)
-        assert rig.passes(lambda: page.evaluate("window.tod !== undefined")), wrong
+        assert rig.passes(lambda: page.evaluate("window.tod !== undefined"), rig.WAIT_S), wrong
         yield page
         expected = ("WebSocket connection", *(["net::ERR_"] if refused else []))
         unexpected = [text for text in wrong if not any(each in text for each in expected)]
