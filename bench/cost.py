@@ -40,7 +40,7 @@ from runner.verbs.print import decide
 
 WORDS = ("vehicle=delivery_robot", "source=test", "mode=single", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 SETTLE_S = 3.0
-SIZES = (0.5, 0.75)  # scaling factors that alternate, for the time until a new size arrives
+SIZES = (0.75, 0.5)  # scaling factors that alternate, for the time until a new size arrives
 RESIZE_S = 0.7
 WAIT_S = 30.0
 HERE = Path(__file__).parent

@@ -39,23 +39,27 @@ SCALER, ENCODER = "graph.vehicle.2.properties", "graph.encoder.0.properties"
 UNCHANGED = "unchanged"
 OPTIONS: Mapping[str, Sequence[str]] = {
     UNCHANGED: (),
-    "effort=low": ("graph.effort=low",),
-    "effort=high": ("graph.effort=high",),
-    **{
-        f"scaler: {name}": (f"+{SCALER}.method={name}",)
-        for name in ("nearest-neighbour", "4-tap", "lanczos", "mitchell")
-    },
+    **{f"effort={name}": (f"graph.effort={name}",) for name in ("lowest", "low", "high")},
+    **{f"scaler: {name}": (f"+{SCALER}.method={name}",) for name in ("nearest-neighbour", "4-tap", "lanczos")},
     "scaler: two threads": (f"+{SCALER}.n-threads=2",),
     "encoder: two threads, two slices": (f"{ENCODER}.threads=2",),
-    "encoder: no deblocking": ('graph.efforts.medium.options="no-deblock=1"',),
-    "encoder: no adaptive quantization": ('graph.efforts.medium.options="aq-mode=0"',),
-    "encoder: subme=0": ('graph.efforts.medium.options="subme=0"',),
+    **{
+        f"encoder: {options}": (f'graph.efforts.medium.options="{options}"',)
+        for options in (
+            "no-deblock=1",
+            "subme=0",
+            "aq-mode=0",
+            "aq-mode=0:subme=0",
+            "aq-mode=0:subme=0:weightp=0",
+            "aq-mode=0:subme=0:partitions=none",
+        )
+    },
 }
 HALF, FULL = Fraction(1, 2), Fraction(1)
 KBPS = 800
 STUDY = ("scalings=[0.5]", "bitrates_kbps=[250,800]", "plan=full", "metric_every=4")
 RUNS = 3  # of each measurement; the median counts
-FEW = 10  # frames of the run that is subtracted, for start and end of the process
+FEW, MANY = 10, 200  # frames; the shorter run is subtracted: start and end of the process
 MEMORY = "/dev/shm"
 
 
@@ -80,7 +84,9 @@ class Raw(NamedTuple):
 
     def source(self, frames: int) -> str:
         read = f"filesrc location={self.path} blocksize={self.frame_bytes} num-buffers={frames}"
-        return f"{read} ! rawvideoparse format=i420 width={self.width} height={self.height} framerate=25/1"
+        # As the sources state it: without colorimetry, a scaler that crosses 576 lines also converts colours.
+        form = f"format=i420 width={self.width} height={self.height} framerate=25/1 colorimetry=bt709"
+        return f"{read} ! rawvideoparse {form}"
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
@@ -119,8 +125,9 @@ def spent(raw: Raw, line: str) -> Spent:
 
 
 def _slope(raw: Raw, line: str) -> Spent:
-    few, all_of_them = (_run(f"{raw.source(frames)} ! {line}") for frames in (FEW, raw.frames))
-    return Spent(*(1000 * (b - a) / (raw.frames - FEW) for a, b in zip(few, all_of_them, strict=True)))
+    many = min(MANY, raw.frames)
+    ends = [_run(f"{raw.source(frames)} ! {line}") for frames in (FEW, many)]
+    return Spent(*(1000 * (b - a) / (many - FEW) for a, b in zip(*ends, strict=True)))
 
 
 def _run(line: str) -> Spent:

@@ -59,7 +59,7 @@ def test_the_command_line_changes_a_part(conf: UserConf) -> None:
         ((), "tune=zerolatency speed-preset=superfast intra-refresh"),
         (("graph.effort=high",), "tune=zerolatency speed-preset=veryfast intra-refresh"),
         (
-            ("graph=h264_srt", "graph.effort=low"),
+            ("graph=h264_srt", "graph.effort=lowest"),
             "speed-preset=ultrafast option-string=cabac=1:8x8dct=1:deblock=0,0 intra-refresh",
         ),
         (
@@ -76,10 +76,10 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
 @pytest.mark.parametrize(
     "words, problem",
     [
-        (("graph.effort=most",), "'most': must be one of low, medium, high"),
+        (("graph.effort=most",), "'most': must be one of lowest, low, medium, high, did you mean lowest?"),
         (
             ("graph.effort=high", "~graph.efforts.high"),
-            "high: must be low or medium, which this graph's encoder supports",
+            "high: must be lowest or low or medium, which this graph's encoder supports",
         ),
         (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],
