@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, UnitTimes, VideoFile, arrivals, matched
+from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched
 from runner.drive.delivered import _nearest, _thumbnail, displayed_units
 from runner.h264.access_unit import coded_picture
 
@@ -71,7 +71,7 @@ def test_arrivals_are_found_despite_an_apparent_clock_difference() -> None:
 
 def test_times_of_a_file_are_those_of_its_last_shift() -> None:
     """In ms: a pause of 5 s after the frame at 200, during which the clock ran on; then a receiver was 30 behind."""
-    file = VideoFile("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
+    file = RecordedVideo("front", "front.ts", ((0, 1000 * MS), (300 * MS, 6300 * MS), (500 * MS, 6530 * MS)))
     assert [file.captured(after * MS) // MS for after in (0, 200, 300, 400, 500, 900)] == [
         1000,
         1200,

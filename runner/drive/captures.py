@@ -32,7 +32,7 @@ class UnitTimes(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class VideoFile:
+class RecordedVideo:
     """A video file of a drive.
 
     name   relative to the directory of the drive
@@ -55,16 +55,16 @@ class VideoFile:
         return Path(self.name).is_absolute() or ".." in Path(self.name).parts
 
 
-def files(side: Side) -> dict[str, list[VideoFile]]:
+def files(side: Side) -> dict[str, list[RecordedVideo]]:
     """By camera, its video files, in the order of their first frames."""
     shifts: dict[str, list[tuple[int, int]]] = {}
     for shift in side.of(VideoShifted):
         shifted = (round(shift.after_s * SECOND_NS), round(shift.captured * SECOND_NS))
         shifts.setdefault(shift.file, []).append(shifted)
-    found: dict[str, list[VideoFile]] = {}
+    found: dict[str, list[RecordedVideo]] = {}
     for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
         times = ((0, round(line.captured * SECOND_NS)), *sorted(shifts.get(line.file, [])))
-        found.setdefault(line.camera, []).append(VideoFile(line.camera, line.file, times))
+        found.setdefault(line.camera, []).append(RecordedVideo(line.camera, line.file, times))
     return found
 
 

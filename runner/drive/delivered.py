@@ -28,8 +28,8 @@ from runner.drive.captures import (
     SAME_NS,
     SECOND_NS,
     ReadVideo,
+    RecordedVideo,
     UnitTimes,
-    VideoFile,
     arrivals,
     files,
     matched,
@@ -53,7 +53,7 @@ BLOCKS = 32  # along the shorter side of a picture
 
 DecodeVideo = Callable[[Path, int, int], Iterator[tuple[int, Luma]]]
 FileTimes = tuple[
-    VideoFile, Mapping[int, int]
+    RecordedVideo, Mapping[int, int]
 ]  # a file, and its capture times, ns, by time as `decode_video` yields it
 
 
@@ -130,7 +130,7 @@ class _Videos:
     read: ReadVideo
     decode: DecodeVideo
 
-    def units(self, file: VideoFile) -> list[_FileUnit]:
+    def units(self, file: RecordedVideo) -> list[_FileUnit]:
         """The access units of a file."""
         found = () if file.is_outside else self.read(self.directory / file.name)
         return [_FileUnit(unit.demuxed_ns, file.captured(unit.after_ns), _digest(unit)) for unit in found]
@@ -144,7 +144,7 @@ class _Videos:
 
 
 def _matched(
-    videos: _Videos, sent: Sequence[VideoFile], received_files: Sequence[VideoFile], log: Sequence[UnitTimes]
+    videos: _Videos, sent: Sequence[RecordedVideo], received_files: Sequence[RecordedVideo], log: Sequence[UnitTimes]
 ) -> tuple[list[FileTimes], list[FileTimes], list[UnitTimes]]:
     """Files as sent and as received, with capture times by the vehicle, and when each received unit arrived."""
     exact: list[FileTimes] = []
@@ -169,8 +169,8 @@ def _camera(
     videos: _Videos,
     vehicle: Side,
     operator: Side,
-    sent: Sequence[VideoFile],
-    received_files: Sequence[VideoFile],
+    sent: Sequence[RecordedVideo],
+    received_files: Sequence[RecordedVideo],
     clip: Path | None,
 ) -> DeliveredQuality:
     exact, shown, units = _matched(videos, sent, received_files, received(operator, camera.name))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, ReadVideo, VideoFile, files
+from runner.drive.captures import SECOND_NS, ReadVideo, RecordedVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
@@ -93,8 +93,8 @@ def _streams(
     for name, side in drive.sides.items():
         # Without a log of the vehicle, its positions are in the operator's log.
         yield _lines(name, side, target, positions="vehicle" not in drive.sides)
-        for camera, filmed in files(side).items():
-            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, filmed, target, read_video, on_warning)
+        for camera, recorded in files(side).items():
+            yield _pictures(drive.path, VIDEO_TOPICS[name], camera, recorded, target, read_video, on_warning)
 
 
 def _lines(name: str, side: Side, target: ExportTarget, positions: bool) -> Iterator[ExportMessage]:
@@ -128,7 +128,7 @@ def _pictures(
     directory: Path,
     topic: str,
     camera: str,
-    filmed: list[VideoFile],
+    recorded: list[RecordedVideo],
     target: ExportTarget,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
@@ -136,7 +136,7 @@ def _pictures(
     """The frames of one camera on one side, at their capture times."""
     topic = topic.format(camera=camera)
     last = -1
-    for file in filmed:
+    for file in recorded:
         if file.is_outside:
             on_warning(f"{file.name}: is outside the drive's directory and was left out")
             continue

@@ -59,8 +59,8 @@ def run(arguments: Arguments) -> int:
     drive = read_drive(directory)
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
-    filmed = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
-    read_video = streaming().read_video if filmed else _no_video
+    has_video = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
+    read_video = streaming().read_video if has_video else _no_video
     with _delayed_progress(f"{output}") as progress:
         count = WRITERS[form](drive, output, read_video, lambda what: print(what, file=sys.stderr), progress)
     size = sum(path.stat().st_size for path in (output.iterdir() if output.is_dir() else [output]))
