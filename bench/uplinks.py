@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, median
+from textwrap import fill
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -285,7 +287,7 @@ def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
                 axes.plot([x] * len(values), values, "o", color=colours[name], markersize=4, alpha=0.5)
                 axes.plot([x - 0.03, x + 0.03], [median(values)] * 2, color=colours[name], linewidth=3)
         axes.set(title=title, yscale=scale, xticks=range(len(found)), xlim=(-0.5, len(found) - 0.5))
-        axes.set_xticklabels([name.removesuffix("_uplink_1s").replace("_", " ") for name in found], fontsize=8)
+        axes.set_xticklabels([fill(re.sub("[_-]", " ", name), 14) for name in found], fontsize=8)
         if scale == "log":
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
