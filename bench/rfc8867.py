@@ -93,7 +93,7 @@ def _below_floor(drive: Drive) -> float:
         for line, after in pairwise(decisions)
         if any(own.on and own.kbps < floors[name] for name, own in line.cameras.items())
     )
-    return below / (decisions[-1].t - decisions[0].t)
+    return below / (decisions[-1].t - decisions[0].t) if below else 0.0  # with the cameras off nothing may be decided
 
 
 def settling(drive: Drive) -> Figures:
