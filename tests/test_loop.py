@@ -96,11 +96,14 @@ def test_an_operator_returns_though_control_cannot_be_given(monkeypatch: pytest.
         raise OSError("broken pipe")
 
     monkeypatch.setattr(watched.side, "give_control", fail)
+
+    def sending() -> list[bool]:
+        return [camera.sending for camera in watched.of(VehicleState)[-1].cameras.values()]
+
     with watched.running():
         watched.breathe(0.2)
-        until(lambda: not any(camera.sending for camera in watched.of(VehicleState)[-1].cameras.values()))
-        watched.breathe(0.4)
-        assert all(camera.sending for camera in watched.of(VehicleState)[-1].cameras.values())
+        until(lambda: not any(sending()))
+        until(lambda: watched.breathe(0.1) > 0 and all(sending()))
     assert "control: OSError: broken pipe" in watched.reports
 
 
