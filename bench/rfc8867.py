@@ -39,7 +39,7 @@ FIGURES = {
     "down": "settled down s",
     "up": "up s",
 }
-SETTLED = 0.8  # share of the new rate
+SETTLED_SHARE = 0.8  # share of the new rate
 
 
 def main() -> None:
@@ -97,7 +97,7 @@ def _below_floor(drive: Drive) -> float:
 
 
 def settling(drive: Drive) -> Figures:
-    """Time from a step of the link's rate until the total is at most the new rate and at least SETTLED of it, s.
+    """Time from a step of the link's rate until the total is at most the new rate and at least SETTLED_SHARE of it, s.
 
     returns  medians by direction; inf: not before the next step; nan: no such step
     """
@@ -110,7 +110,7 @@ def settling(drive: Drive) -> Figures:
     for (t, kbps, down), end in zip(steps, ends, strict=False):  # no step, no end
         in_force = [total for since, total in totals if since <= t][-1:]
         after = [(t, total) for total in in_force] + [(since, total) for since, total in totals if t < since < end]
-        settled = (since for since, total in after if SETTLED * kbps <= total <= kbps)
+        settled = (since for since, total in after if SETTLED_SHARE * kbps <= total <= kbps)
         waits[down].append(next(settled, np.inf) - t)
     return {name: median(waits[down]) if waits[down] else np.nan for name, down in (("down", True), ("up", False))}
 

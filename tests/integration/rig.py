@@ -383,9 +383,9 @@ class Client:
         stride = len(data) // height
         return np.frombuffer(data, np.uint8).reshape(height, stride)[:, : width * 3].reshape(height, width, 3)
 
-    def insist(self) -> int:
-        """Frames so far; connects again if it was turned away (503): a camera's first frame may take longer than a
-        second on a busy machine."""
+    def frames_with_retry(self) -> int:
+        """Number of frames received; reconnects if the server refused it with 503, as it does when a camera's first
+        frame takes too long on a busy machine."""
         if self.errors and not self.sizes:
             self.reconnect()
         return len(self.sizes)

@@ -196,7 +196,7 @@ def received(side, plan, camera, frame):
 
     def pushed():
         time.sleep(0.02)
-        return side.push(camera, frame) and client.insist() > 5
+        return side.push(camera, frame) and client.frames_with_retry() > 5
 
     try:
         until(pushed)

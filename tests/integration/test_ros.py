@@ -104,7 +104,7 @@ def watched(plans, reported):
     """Viewers of both cameras, once both have pictures."""
     until(lambda: len(matching(reported, ": pictures are ")) == 2)
     with watching(plans[0]) as front, watching(plans[1]) as rear:
-        until(lambda: min(front.insist(), rear.insist()) > 10)
+        until(lambda: min(front.frames_with_retry(), rear.frames_with_retry()) > 10)
         yield front, rear
 
 
