@@ -1,6 +1,6 @@
 """Events: one vocabulary for the control link, the drive log and `replay` (schemas/event.schema.json).
 
-`Event` objects are valid once built; `parse` turns JSON that the schema accepts into one.
+An `Event` is valid once built; `parse` turns JSON that the schema accepts into one.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from runner.core.uplink import LinkState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Event:
+class _Event:
     """Something that happened `t` seconds after the start of the run; `t` never decreases."""
 
     t: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModeSelected(Event):
+class ModeSelected(_Event):
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BitratePredicted(Event):
+class BitratePredicted(_Event):
     """Prediction of the bitrate available for all cameras together, from pQoS.
 
     kbps        the prediction
@@ -42,7 +42,7 @@ class BitratePredicted(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PositionReported(Event):
+class PositionReported(_Event):
     """WGS-84 position of the vehicle; heading in degrees clockwise from north."""
 
     lat: float
@@ -52,33 +52,33 @@ class PositionReported(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringReported(Event):
+class SteeringReported(_Event):
     """Angle of the front wheels (bicycle model), rad, positive to the left."""
 
     rad: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TotalSet(Event):
+class TotalSet(_Event):
     """The operator's total for mode collective."""
 
     kbps: Kbps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraSwitched(Event):
+class CameraSwitched(_Event):
     camera: str
     on: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RoiSet(Event):
+class RoiSet(_Event):
     camera: str
     roi: Roi
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraConfigured(Event):
+class CameraConfigured(_Event):
     """The operator's bitrate and scaling factor of one camera, mode single; None: unchanged."""
 
     camera: str
@@ -87,12 +87,12 @@ class CameraConfigured(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WeightsSet(Event):
+class WeightsSet(_Event):
     weights: Mapping[str, Fraction]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkMeasured(Event):
+class LinkMeasured(_Event):
     """The uplink, estimated from what the operator's side received of all cameras, see `runner.core.uplink`.
 
     kbps      received kbit/s; while a queue lasts, the capacity of the link; None: too little has arrived
@@ -112,14 +112,14 @@ class LinkMeasured(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CopiesCounted(Event):
+class CopiesCounted(_Event):
     """Number of copies of each camera's stream that leave the vehicle, one per viewer; 1 for cameras not named."""
 
     copies: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ControlPassed(Event):
+class ControlPassed(_Event):
     """Another operator is in control, "" for none; measurements of the previous one are no longer valid."""
 
     operator: str
@@ -136,29 +136,48 @@ class Attention(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AttentionChanged(Event):
+class AttentionChanged(_Event):
     """The attention stated by the operator in control has changed; None: none stated, for example without a page."""
 
     attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OperatorConnected(Event):
+class OperatorConnected(_Event):
     """attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it"""
 
     attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OperatorDisconnected(Event):
+class OperatorDisconnected(_Event):
     pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockAdvanced(Event):
+class ClockAdvanced(_Event):
     """Only time has passed; emitted every 100 ms while live, so that rules can wait without a clock."""
 
 
+# A union, so that mypy reports a match that lacks one.
+Event = (
+    ModeSelected
+    | BitratePredicted
+    | PositionReported
+    | SteeringReported
+    | TotalSet
+    | CameraSwitched
+    | RoiSet
+    | CameraConfigured
+    | WeightsSet
+    | LinkMeasured
+    | CopiesCounted
+    | ControlPassed
+    | AttentionChanged
+    | OperatorConnected
+    | OperatorDisconnected
+    | ClockAdvanced
+)
 EVENTS: dict[str, type[Event]] = {
     "mode_selected": ModeSelected,
     "bitrate_predicted": BitratePredicted,

@@ -136,7 +136,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
         case ev.ClockAdvanced():
             return {}
         case _:
-            assert_never(event)  # type: ignore[arg-type]
+            assert_never(event)
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
