@@ -33,7 +33,7 @@ image = pytest.importorskip("PIL.Image")
 
 pytestmark = pytest.mark.slow  # draws figures
 
-FIGURES = ["bitrate_on_track", "bitrates", "scaling", "totals", "latency"]
+FIGURES = ["bitrate_on_track", "totals", "bitrates", "scaling", "latency"]
 STATIC = Path(CONF).parent / "runner" / "page" / "static"
 
 

@@ -274,11 +274,12 @@ def _quality_axis(title: str) -> Callable[[int, Sequence[Sequence[Curve]]], Axis
     return axis
 
 
+# Heading and definition by name, in the order of the page.
 FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
     "bitrate_on_track": ("Total bitrate on the track", bitrate_on_track),
+    "totals": ("Predicted, allocated and actual total", totals),
     "bitrates": ("Camera bitrates over time", bitrates),
     "scaling": ("Resolution factors over time", scaling),
-    "totals": ("Predicted, allocated and actual total", totals),
     "latency": ("Latency and freezes", latency),
     "quality": ("Estimated quality over time", quality),
     "delivered": ("Measured quality of delivered pictures", delivered),

@@ -24,7 +24,6 @@ from runner.system.files import plotly_script
 STATIC = Path(__file__).parent / "static"
 MOST_POINTS = 2000  # of a curve; longer ones are thinned
 LAST_REASONS = 200
-ORDER = ("bitrate_on_track", "totals", "bitrates", "scaling", "latency", "quality", "delivered")
 HtmlTable = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
@@ -89,7 +88,7 @@ def _body(
             heading = f"Claims of the paper and results{_suffix(drive, several)}"
             yield _section(heading, _table("Claims", (("claim", "result", "holds"), rows)))
     yield f'<div class="figures{"" if several else " single"}">'
-    yield from (_figure(figure) for figure in _shown(figures))
+    yield from (_figure(figure) for figure in figures)
     yield "</div>"
     for drive in drives:
         yield _section(f"Cameras{_suffix(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
@@ -98,11 +97,6 @@ def _body(
     named = ((each, f"{side}{_suffix(drive, several)}") for drive in drives for side, each in _versions(drive))
     versions = _grouped(named)
     yield _section("Versions", _list((", ".join(labels), each) for each, labels in versions.items()))
-
-
-def _shown(figures: Sequence[Figure]) -> list[Figure]:
-    """Figures in the order of the page."""
-    return sorted(figures, key=lambda figure: ORDER.index(figure.name))
 
 
 def _notes(drives: Sequence[DriveStatistics], left_out: Sequence[str]) -> str:
@@ -210,7 +204,7 @@ def _reasons(drive: DriveStatistics, of: str) -> str:
 
 
 def _data(figures: Sequence[Figure]) -> dict[str, Any]:
-    charts = [_chart(chart) for figure in _shown(figures) for chart in chain.from_iterable(figure.rows)]
+    charts = [_chart(chart) for figure in figures for chart in chain.from_iterable(figure.rows)]
     return {"day": DAY, "night": NIGHT, "charts": charts}
 
 
