@@ -25,17 +25,28 @@ def opened(browser, url, width=1280, height=800, refused=False, **context):
     refused  the station goes offline in between, which the browser logs for each request
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
-        page = tab.new_page()
         wrong, own = [], (url.partition("#")[0], "data:", "blob:")
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
+        tab.on("weberror", lambda error: wrong.append(str(error.error)))
+        tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+        tab.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
+        page = tab.new_page()
         page.goto(url)
-        assert rig.passes(lambda: page.evaluate("window.tod !== undefined"), rig.WAIT_S), wrong
+        assert rig.passes(lambda: has_started(page)), (wrong, loaded(page))
         yield page
         expected = ("WebSocket connection", *(["net::ERR_"] if refused else []))
         unexpected = [text for text in wrong if not any(each in text for each in expected)]
         assert not unexpected, unexpected
+
+
+def has_started(page):
+    """Whether the page's main module has run."""
+    return page.evaluate("window.tod !== undefined")
+
+
+def loaded(page):
+    """Why a page may not have started: its address and state, and each resource with its status and times, ms."""
+    return page.evaluate("""() => [location.href, document.readyState, performance.getEntriesByType("resource").map(
+        ({ name, responseStatus, startTime, duration }) => [name, responseStatus, startTime, duration])]""")
 
 
 def take_control(page):

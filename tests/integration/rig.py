@@ -197,7 +197,7 @@ def until(done: Callable[[], Any], seconds: float = WAIT_S, every_s: float = 0.0
     return seen
 
 
-def passes(done: Callable[[], Any], seconds: float) -> bool:
+def passes(done: Callable[[], Any], seconds: float = WAIT_S) -> bool:
     """Whether a condition becomes true in time."""
     try:
         return bool(until(done, seconds))

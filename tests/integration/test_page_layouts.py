@@ -13,8 +13,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from browser import all_live, boxes, measure, opened, shot, take_control, until
-from rig import SMALL_ROBOT, answers, free_port, process
+from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until
+from rig import SMALL_ROBOT, answers, free_port, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
 from runner.core.events import parse
@@ -193,7 +193,7 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
             page.locator("#monitors a").first.click()
         page.keyboard.press("Escape")
         monitor = opening.value
-        until(lambda: monitor.evaluate("window.tod !== undefined"))
+        assert passes(lambda: has_started(monitor)), loaded(monitor)
         all_live(monitor)
         assert set(measure(monitor)) == {"front", "mast"}
         controlling(monitor)
@@ -380,7 +380,7 @@ def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path)
         look("drawer")
         monitor = page.context.new_page()
         monitor.goto(f"{server.url}?show=front,rear")
-        until(lambda: monitor.evaluate("window.tod !== undefined"))
+        assert passes(lambda: has_started(monitor)), loaded(monitor)
         all_live(monitor)
         look("monitor", on=monitor)
         assert sorted(set(found)) == []

@@ -7,6 +7,7 @@ import { byId, displayName, factor, make } from "./format.js";
 
 const SETTLE_MS = 1500; // from the first picture to loading the charts
 const AT_LATEST_MS = 4000; // if no picture is live by then
+const LEAST_PX = 70; // Plotly cannot place the axes in a lower chart; the rest is clipped
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
 
@@ -126,7 +127,7 @@ const config = { displaylogo: false, displayModeBar: false, responsive: false, d
 function draw(chart) {
   const element = byId(chart.id);
   if (!globalThis.Plotly || !visible.has(chart.id) || document.hidden || !element.clientHeight) return;
-  const size = { width: element.clientWidth, height: element.clientHeight, autosize: false };
+  const size = { width: element.clientWidth, height: Math.max(LEAST_PX, element.clientHeight), autosize: false };
   Plotly.react(element, chart.traces(), { ...chart.layout(), ...size }, config);
   document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true"); // Plotly measures text in it
 }
