@@ -26,6 +26,7 @@ class Link:
     kbps     capacity
     delay_s  further delay of packets sent at that time, both ways; packets stay in order
     queue_s  longest wait
+    playout_s  for which the transport holds frames back, counted from when they are sent
     """
 
     kbps: Profile
@@ -33,6 +34,7 @@ class Link:
     one_way_s: float = 0.015
     queue_s: float = 0.3
     loss: float = 0.0
+    playout_s: float = 0.0
 
 
 class Queue:
@@ -171,7 +173,14 @@ def drive(
                 done.record_frame(t, left[-1] - t, last_unit, size)
                 in_flight.append(
                     (
-                        ReceivedUnit(f"camera {camera}", captured, last_unit, size, not lost_packets),
+                        ReceivedUnit(
+                            f"camera {camera}",
+                            captured,
+                            max(last_unit, t + link.one_way_s + link.playout_s),
+                            size,
+                            not lost_packets,
+                            link.playout_s,
+                        ),
                         len(left),
                         missing[camera],
                     )

@@ -108,6 +108,17 @@ def test_a_link_that_halves_causes_an_immediate_cut() -> None:
     assert done.wait_ms(0.99, since=6) <= 100
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("fps", [30, 40])
+def test_a_play_out_delay_that_hides_a_short_queue_delays_the_cut_little(fps: float, seed: int) -> None:
+    """As with SRT: by the time frames are late, the queue is 60 ms long, and they arrive at the new rate."""
+    at = 5 + 0.009 * seed
+    link = Link(steps((0, 4400), (at, 2200)), one_way_s=0.02, playout_s=0.06)
+    done = drive(link, steps((0, 4000)), 10, cameras=3, fps=fps, seed=seed, noise=0.1)
+    assert done.first(at, lambda cap: cap <= 2200) <= 0.04 + 0.29  # 0.37 if the delay is ignored
+    assert done.wait_ms(0.99, since=at + 1) <= 150
+
+
 @pytest.mark.parametrize("seconds", [0.1, 0.15, 0.2, 0.25])
 @pytest.mark.parametrize("begin", [5.0, 5.013, 5.021, 5.03])
 def test_a_stall_cuts_once_and_is_over_within_a_second(begin: float, seconds: float) -> None:

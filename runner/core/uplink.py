@@ -31,7 +31,8 @@ RATE_S = 0.25  # the rate is averaged over this time, or over three frame interv
 # obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
-EVIDENCE_S = 0.08  # a rate measured over a shorter time is not significant
+EVIDENCE_S = 0.08  # a rate measured over a shorter time is not significant ...
+LATE_EVIDENCE_S = 0.05  # ... or over this one with a play-out delay: all late units arrive at the link's rate
 EMPTY_S = 0.010  # a unit that waited less met no queue
 GROWN_S = 0.020  # a queue from here on may be growing
 GROWTH_S = 0.006  # change within COMPARED_S from which a queue counts as growing or draining
@@ -64,6 +65,7 @@ class ReceivedUnit:
     arrived   of its last packet, s by the operator's monotonic clock
     bytes     received on the wire, including headers
     whole     whether no packet was initially missing
+    playout   s for which the transport holds a unit back, which hides a shorter wait in the queue
     """
 
     camera: str
@@ -71,6 +73,7 @@ class ReceivedUnit:
     arrived: float
     bytes: int
     whole: bool = True
+    playout: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,11 +140,12 @@ def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """When a unit arrived, how long it waited in the queue, s, and its size."""
+    """When a unit arrived, how long it visibly waited in the queue, s, its size, and the play-out delay, s."""
 
     arrived: float
     queue: float
     bytes: int
+    playout: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +198,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = uplink.onset
     queues = (*_entries_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
-    fallen = onset is not None and queue > FALLEN_S
+    fallen = onset is not None and queue + uplink.units[-1].playout > FALLEN_S
     own = min(frame, SLOW_S)
     kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
     uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
@@ -231,7 +235,8 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
         if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals):
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
-        kept.append(_Unit(unit.arrived, max(0.0, unit.arrived - unit.captured - shortest), unit.bytes))
+        queue = max(0.0, unit.arrived - unit.captured - shortest)
+        kept.append(_Unit(unit.arrived, queue, unit.bytes, unit.playout))
     kept.sort(key=attrgetter("arrived"))  # a unit without its last packets is reported late
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MAX_UNITS:]
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
@@ -251,7 +256,7 @@ def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame:
 
     A shorter time than a frame interval may lack the frame of the camera that sends most.
     """
-    evidence = max(EVIDENCE_S, frame)
+    evidence = max(LATE_EVIDENCE_S if uplink.units[-1].playout else EVIDENCE_S, frame)
     # From one arrival to another: a window that begins in between would count too much or too little.
     begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-inf)
     begin = max(begin, uplink.units[0].arrived)

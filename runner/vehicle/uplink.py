@@ -57,6 +57,7 @@ def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
             report.at - unit.ago_s,
             on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
             unit.whole,
+            float(vehicle.cameras[unit.camera].graph.settings.get("srt_latency_ms", 0)) / 1000,
         )
         for unit in report.units
         if unit.camera in vehicle.cameras
