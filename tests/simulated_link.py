@@ -127,6 +127,7 @@ def drive(
     start: Fraction = Fraction(1),
     key_frame: float = 1,
     late: Callable[[int, float], float] = lambda camera, t: 0.0,
+    filled: float = 1.0,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
@@ -137,6 +138,7 @@ def drive(
     start  share of the limit until the link is measured
     key_frame  size of each camera's first frame, in multiples of the others
     late  delay until the frame that a camera captures at t is sent, s
+    filled  share of their bitrate that the encoders use
     """
     rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
@@ -163,7 +165,7 @@ def drive(
         elif kind == "sent":
             camera, captured = what
             varied = rng.uniform(1 - noise, 1 + noise) * (key_frame if captured < 1 / fps else 1)
-            size = int(in_force * 1000 / 8 / fps / cameras * varied)
+            size = int(filled * in_force * 1000 / 8 / fps / cameras * varied)
             left, lost_packets = _send_frame(link_queue, t, size, lambda: rng.random() < link.loss)
             missing[camera] += lost_packets
             done.lost += [t] * bool(lost_packets)

@@ -39,8 +39,8 @@ LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
 # To competing traffic the cameras yield down to this share of the most that arrived recently ...
 YIELDED = Fraction(1, 3)
-# ... unless a cap was held for this long, s, and less than this share of it arrives, or never more than TRIED of it:
-# then the link itself is narrower.
+# ... unless, while a cap was held and the queue was long for this many s, less than this share of the cap arrived, or
+# never more than TRIED of it: then the link itself is narrower. Without a long queue, the encoders used less than the cap.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
 # A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent
@@ -50,7 +50,7 @@ JITTER_MS = 40
 LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
-FADED = Fraction(997, 1000)  # factor by which that most decays each second
+FADED = Fraction(999, 1000)  # factor by which that most decays each second
 SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
 
 
@@ -280,7 +280,9 @@ def _record(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     """Whether less arrives than is sent, so that the link itself is narrow, not filled by competing traffic."""
     assert link.kbps is not None
-    held_s, sent = t - cap.changed, _in_force(cap, limit)
+    if _is_short(link):
+        return False
+    held_s, sent = t - max(cap.changed, cap.short), _in_force(cap, limit)
     if held_s >= TRIED_S and cap.passed[1] < TRIED * sent:
         return True
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
