@@ -40,7 +40,7 @@ LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
 # To competing traffic the cameras yield down to this share of the most that arrived recently ...
 YIELDED = Fraction(1, 3)
 # ... unless, while a cap was held and the queue was long for this many s, less than this share of the cap arrived, or
-# never more than TRIED of it: then the link itself is narrower. Without a long queue, the encoders used less than the cap.
+# never more than TRIED of it: then the link itself is narrower. Otherwise the encoders may have used less than the cap.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
 # A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent
