@@ -74,7 +74,10 @@ function drive() {
   const points = metres();
   if (!points) return [];
   const { x, y, kbps } = points;
-  const bar = { title: { text: "kbit/s", side: "top" }, thickness: 10, outlinewidth: 0, tickfont: { size: 12 }, nticks: 5 };
+  const known = kbps.flatMap((each) => each ?? []);
+  const ends = known.length ? [...new Set([Math.min(...known), Math.max(...known)])] : []; // more do not fit
+  const bar = { title: { text: "kbit/s", side: "right" }, thickness: 10, outlinewidth: 0, ypad: 0, tickfont: { size: 12 },
+    tickvals: ends, ticktext: ends.map((value) => value.toFixed()) };
   return [
     { type: "scatter", mode: "markers", x, y, marker: { color: kbps, colorscale: "Viridis", size: 7, colorbar: bar },
       hovertemplate: "%{x:.0f} m east, %{y:.0f} m north<br>%{marker.color:.0f} kbit/s<extra></extra>" },
