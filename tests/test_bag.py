@@ -153,6 +153,7 @@ def words(bag, **topics):
     return (*ROBOT, f"source.bag={bag}", *(f"cameras.{name}.topic={topic}" for name, topic in topics.items()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["print", "validate"])
 def test_problems_of_a_bag_are_reported(tod, bag, verb, tmp_path):
     given = words(bag, front="/a/image_raw", rear="/a/image", mast="/b/image_raw")

@@ -46,6 +46,7 @@ def test_a_bag_is_a_track(tmp_path):
     assert place.heading_deg == pytest.approx(0)
 
 
+@pytest.mark.slow
 def test_a_bag_is_named_as_a_track(tmp_path, tod):
     bag = gps(tmp_path / "b", "/gps", "/rtk/fix")
     position = {"kind": "track", "file": bag.name, "topic": "/gps"}

@@ -53,6 +53,7 @@ def test_requests_are_sorted_by_time() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_request_that_is_not_an_event_is_a_problem(tod: Command) -> None:
     wrong = PAUSE.replace("rear_center, on: false", "rear_center")
     result = tod("validate", "experiment=driving_test", f"+experiment.requests=[{wrong}]")
@@ -138,6 +139,7 @@ def test_a_link_and_an_experiment_need_not_be_chosen() -> None:
     assert "experiment" not in compose(["experiment=null"]).document
 
 
+@pytest.mark.slow
 def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> None:
     conf.write(
         "experiment/mine.yaml",

@@ -52,6 +52,7 @@ cameras:
 """
 
 
+@pytest.mark.slow
 def test_a_default_given_changes_nothing_and_another_value_does(key_tables: ModuleType, conf: UserConf) -> None:
     conf.write("vehicle/van.yaml", MINIMAL)
 

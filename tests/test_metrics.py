@@ -78,6 +78,7 @@ def test_unknown_name(name: str, message: str) -> None:
     assert str(raised.value) == message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", [PSNR, MSSIM])
 def test_metric_is_sane(metric: Metric) -> None:
     low, high = metric.bounds
@@ -434,6 +435,7 @@ def slow_features(luma: Luma) -> Any:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_brisque_features_of_a_drive() -> None:
     for picture in (frame(0)[-360:, :400], blurred(frame(0))[:180], blurred(noise(3, 180, 240))):
         assert brisque_module.features(picture) == pytest.approx(slow_features(picture), abs=2e-4)

@@ -101,6 +101,7 @@ def test_road_that_does_not_close() -> None:
     assert back.at(120).heading_deg == pytest.approx(270, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_order_is_found_quickly() -> None:
     """Limits are in processor time."""
     random = np.random.default_rng(0)
