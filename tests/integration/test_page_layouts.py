@@ -181,6 +181,24 @@ def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
         assert where(page, "front") == "row 2, column 1, 1 high, 1 wide", "the draft is kept"
 
 
+@pytest.mark.parametrize("module", ["boot.js", "tiles.js", "video.js", "stream.js"])
+def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module):
+    """The last two are those of the worker."""
+    with served(picture, None) as (server, _), chromium.new_context() as tab:
+        page, failed = tab.new_page(), []
+
+        def fail_once(route):
+            if failed:
+                return route.continue_()
+            failed.append(route.request.url)
+            return route.abort("connectionreset")
+
+        tab.route(f"**/static/{module}", fail_once)
+        page.goto(server.url)
+        until(lambda: failed and page.evaluate("window.tod?.state"))
+        all_live(page)
+
+
 def test_monitors_share_selection_control_and_attention_with_their_page(chromium, picture):
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         all_live(page)

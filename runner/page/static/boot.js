@@ -23,6 +23,7 @@ worker.postMessage({
 });
 
 addEventListener("hashchange", () => location.reload()); // #counter may name another camera
+worker.addEventListener("error", (event) => event instanceof ErrorEvent || globalThis.loadAgain?.()); // it was not loaded
 
 function liveUrl() {
   const url = new URL("/live", location.href);
