@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until
-from rig import SMALL_ROBOT, answers, free_port, passes, process
+from rig import SMALL_ROBOT, WAIT_S, answers, free_port, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
 from runner.core.events import parse
@@ -195,7 +195,8 @@ def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module
 
         tab.route(f"**/static/{module}", fail_once)
         page.goto(server.url)
-        until(lambda: failed and page.evaluate("window.tod?.state"))
+        page.wait_for_function("() => window.tod?.state", timeout=1000 * WAIT_S)  # through navigations
+        assert failed
         all_live(page)
 
 
