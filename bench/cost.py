@@ -114,7 +114,7 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
         knobs = wanted(decision.settings[plan.camera.name])
         lines[plan.camera.name] = f"( {launch(turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs))} )"
     began = time.time()
-    with _child([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
+    with child_of([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
         assert server.stdin
         _write(server.stdin, lines)
 
@@ -133,7 +133,7 @@ def _own(words: Sequence[str], seconds: float) -> Cost:
     vehicle = _vehicle(words)
     with private_broker(broker):
         began = time.time()
-        with _child(["-m", "runner", "vehicle", *words]) as side:
+        with child_of(["-m", "runner", "vehicle", *words]) as side:
             operator = Operator(broker, vehicle.name)
             operator.state(lambda state: state["online"])
             numbers = count()
@@ -153,8 +153,8 @@ def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: 
     urls = [f"rtsp://127.0.0.1:{vehicle.media.port}/{name}" for name in names]
     frames: list[Frame] = []
     until(lambda: answers(vehicle.media.port), WAIT_S, every_s=0.005)
-    with _child([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
-        threading.Thread(target=_read, args=(client.stdout, frames), daemon=True).start()
+    with child_of([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
+        threading.Thread(target=read_frames, args=(client.stdout, frames), daemon=True).start()
         until(lambda: {frame.stream for frame in list(frames)} == set(range(len(names))), WAIT_S, every_s=0.005)
         first = {frame.stream: frame.t for frame in reversed(list(frames))}
         time.sleep(SETTLE_S)
@@ -189,7 +189,7 @@ def _reaction(names: Sequence[str], frames: list[Frame], resize: Any) -> float:
     return median(waits)
 
 
-def _read(lines: IO[str], frames: list[Frame]) -> None:
+def read_frames(lines: IO[str], frames: list[Frame]) -> None:
     for line in lines:
         frames.append(Frame(*json.loads(line)))
 
@@ -199,7 +199,7 @@ def _vehicle(words: Sequence[str]) -> Vehicle:
 
 
 @contextmanager
-def _child(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[str]]:
+def child_of(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[str]]:
     pipes = {"stdout": subprocess.DEVNULL, **pipes}
     child = subprocess.Popen([sys.executable, *command], text=True, stderr=subprocess.DEVNULL, **pipes)
     try:

@@ -3,10 +3,12 @@
   python bench/ros.py CLIP.mp4
   python bench/ros.py CLIP.mp4 --cameras 2 --fps 2 --seconds 20
   python bench/ros.py CLIP.mp4 --version 1
+  python bench/ros.py CLIP.mp4 --bag                        from a bag, without ROS
 
 Starts a node that publishes the clip as topics of 480x270 (simultaneously, in ROS 2 reliable), the demo with source=ros
 and ros.pictures=true, and a node that subscribes to the decoded pictures. Mode A for the first half, then mode C
-with a fifth of the bitrate and smaller pictures. Needs `make ros2`, or `make ros1` for version 1.
+with a fifth of the bitrate and smaller pictures. Needs `make ros2`, or `make ros1` for version 1. With --bag the same
+topics are in a bag (MCAP), and the demo's own table shows what arrived.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
+sys.path += [str(Path(__file__).resolve().parents[1] / "tests" / name) for name in (".", "integration")]
+from bags import BEGAN_NS, image, typestore, write_bag
 from ros_domain import MISSING, Ros, running
 
 from rig import CHECKOUT, free_port
@@ -58,7 +61,10 @@ def main() -> int:
     for name, default in (("cameras", 8), ("fps", 10), ("seconds", 30)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--version", type=int, choices=(2, 1), default=2, help="of ROS")
+    parser.add_argument("--bag", action="store_true", help="from a bag, without ROS")
     options = parser.parse_args()
+    if options.bag:
+        return from_bag(options)
     if MISSING[options.version]:
         print(MISSING[options.version], file=sys.stderr)
         return 1
@@ -77,8 +83,10 @@ def main() -> int:
             node(ros, "publish", *form, *topics.values()) as publisher,
             node(ros, "subscribe", *decoded.values()) as subscriber,
         ):
+            # Slightly above the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
+            words = ["source=ros", *ros.words, "ros.pictures=true"]
             status = subprocess.run(
-                demo(ros, topics, options.fps, options.seconds), check=False, cwd=CHECKOUT
+                demo(words, topics, 1.2 * options.fps, options.seconds), check=False, cwd=CHECKOUT
             ).returncode
             delivered, published = results(subscriber), results(publisher)
     if status == 0:
@@ -99,22 +107,28 @@ def pictures_of(clip: Path) -> bytes:
     return b"".join(rows)
 
 
-def demo(ros: Ros, topics: Mapping[str, str], fps: int, seconds: int) -> list[str]:
+def from_bag(options: argparse.Namespace) -> int:
+    """The same topics from a bag; returns the demo's exit status."""
+    cameras = list(configuration([]).vehicle().cameras)[: options.cameras]
+    topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
+    data, store = pictures_of(options.clip), typestore("mcap")
+    pictures = np.frombuffer(data, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
+    stamps = [BEGAN_NS + number * 10**9 // options.fps for number in range(len(pictures))]
+    messages = [(ns, image(store, ns, picture, "bgr8")) for ns, picture in zip(stamps, pictures, strict=True)]
+    with tempfile.TemporaryDirectory() as directory:
+        bag = write_bag(Path(directory, "clip"), "mcap", dict.fromkeys(topics.values(), messages))
+        words = ["source=bag", f"source.bag={bag}"]
+        return subprocess.run(demo(words, topics, options.fps, options.seconds), check=False, cwd=CHECKOUT).returncode
+
+
+def demo(words: Sequence[str], topics: Mapping[str, str], fps: float, seconds: int) -> list[str]:
     left_out = [f"~cameras.{name}" for name in configuration([]).vehicle().cameras if name not in topics]
     mounted = [f"cameras.{name}.topic={topic}" for name, topic in topics.items()]
     size = [f"cameras.{name}.{key}" for name in topics for key in (f"width_px={WIDTH}", f"height_px={HEIGHT}")]
     total = KBPS * len(topics)
     change = f"{{at_s: {seconds // 2}, request: {{event: mode_selected, mode: collective}}}}"
     less = f"{{at_s: {seconds // 2}, request: {{event: total_set, kbps: {total // 5}}}}}"
-    # Slightly above the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
-    own = [
-        "source=ros",
-        "modes=paper",
-        f"fps_max={fps * 1.2:g}",
-        *ros.words,
-        "ros.pictures=true",
-        "page.serve=false",
-    ]
+    own = [*words, "modes=paper", f"fps_max={fps:g}", "page.serve=false"]
     own += ["pqos=constant", f"pqos.kbps={total}", f"+experiment.requests=[{change}, {less}]"]
     own += ["+experiment.about='Image topics of ROS'", f"+experiment.duration_s={seconds}"]
     own += [f"media.port={free_port()}", f"control.port={free_port()}", f"duration_s={seconds}"]

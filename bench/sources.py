@@ -1,0 +1,227 @@
+"""What a camera of 1920x1040 costs the vehicle by each way in: processor time, and how many of them two cores carry.
+
+  python bench/sources.py CLIP.mp4
+  python bench/sources.py CLIP.mp4 --fps 15 --only file bag ros2
+
+Each way delivers the same pictures of the clip, and the camera is sent at factor 0.5 with its whole bitrate. Processor
+time includes that of the side's child processes, such as the node of ROS; not that of publisher, IP camera and client.
+ROS needs `make ros2` and `make ros1`; what is missing is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from cost import WAIT_S, Frame, child_of, read_frames
+from ros import node
+from uplinks import row
+from usage import processor_s
+
+sys.path += [str(Path(__file__).resolve().parents[1] / "tests" / name) for name in (".", "integration")]
+from bags import BEGAN_NS, compressed, image, typestore, write_bag
+from ros_domain import MISSING, running
+
+from rig import answers, free_port, passes, until
+from runner.configuration.config import configuration
+from runner.core.model import Endpoint
+from runner.mqtt.broker import private_broker
+
+HERE = Path(__file__).parent
+CAMERA, KBPS = "front_center", 5000
+WIDTH, HEIGHT = 1920, 1040
+PICTURES = 40  # of the clip, which repeat
+SETTLE_S = 3.0
+ATTEMPTS = 6  # to connect, within WAIT_S
+TOPIC = "/front/image_raw"
+
+
+class Cost(NamedTuple):
+    """Of one camera: processor time per wall time, and frames received per second."""
+
+    cores: float
+    fps: float
+
+
+class Clip(NamedTuple):
+    """The pictures, and how often they are captured, Hz."""
+
+    pictures: Sequence[np.ndarray]
+    fps: int
+    directory: Path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clip", type=Path)
+    parser.add_argument("--fps", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=15)
+    parser.add_argument("--only", nargs="*", choices=WAYS, default=[*WAYS])
+    options = parser.parse_args()
+    print(row("way in", "cores", "frames a second", "two cores carry"))
+    print(row(*["---"] * 4), flush=True)
+    with tempfile.TemporaryDirectory() as directory:
+        clip = Clip(pictures_of(options.clip), options.fps, Path(directory))
+        for name in options.only:
+            title, missing, words_of = WAYS[name]
+            if missing:
+                print(row(title, "–", "–", missing))
+                continue
+            with words_of(clip) as words:
+                cost = measure(words, options.seconds)
+            print(row(title, f"{cost.cores:.2f}", f"{cost.fps:.1f}", f"{int(2 / cost.cores)}"), flush=True)
+
+
+def pictures_of(path: Path) -> list[np.ndarray]:
+    """The first pictures of a clip, as BGR of the camera's size."""
+    video, pictures = cv2.VideoCapture(str(path)), []
+    while len(pictures) < PICTURES and (read := video.read())[0]:
+        pictures.append(cv2.resize(read[1], (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
+    if not pictures:
+        raise SystemExit(f"{path}: no pictures can be read")
+    return pictures
+
+
+# --- the ways in: overrides that use them, while the block lasts ------------------------------------------------------
+
+
+@contextmanager
+def test_picture(clip: Clip) -> Iterator[list[str]]:
+    yield ["source=test", f"fps_max={clip.fps}"]
+
+
+@contextmanager
+def clip_file(clip: Clip) -> Iterator[list[str]]:
+    yield ["source=file", f"source.clip={encoded(clip)}", f"fps_max={clip.fps}"]
+
+
+@contextmanager
+def ip_camera(clip: Clip) -> Iterator[list[str]]:
+    port, line = free_port(), f"multifilesrc location={encoded(clip, 'h264')} loop=true ! h264parse"
+    line += f" ! video/x-h264,framerate={clip.fps}/1 ! identity sync=true ! rtph264pay name=pay0 config-interval=-1"
+    with child_of([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as camera:
+        assert camera.stdin
+        camera.stdin.write(f'{{"stream": "( {line} )"}}\n')
+        camera.stdin.flush()
+        yield [
+            "source=rtsp",
+            f"cameras.{CAMERA}.address=rtsp://127.0.0.1:{port}/stream",
+            f"fps_max={clip.fps}",
+        ]
+
+
+@contextmanager
+def raw_bag(clip: Clip) -> Iterator[list[str]]:
+    yield _bag(clip, "raw", lambda store, ns, picture: image(store, ns, picture, "bgr8"))
+
+
+@contextmanager
+def jpeg_bag(clip: Clip) -> Iterator[list[str]]:
+    yield _bag(clip, "jpeg", lambda store, ns, picture: compressed(store, ns, _jpeg(picture), "jpeg"))
+
+
+def _bag(clip: Clip, name: str, message: Callable[..., object]) -> list[str]:
+    store, interval_ns = typestore("mcap"), 10**9 // clip.fps
+    stamps = [BEGAN_NS + number * interval_ns for number in range(len(clip.pictures))]
+    messages = [(ns, message(store, ns, picture)) for ns, picture in zip(stamps, clip.pictures, strict=True)]
+    path = write_bag(clip.directory / name, "mcap", {TOPIC: messages})
+    return ["source=bag", f"source.bag={path}", f"cameras.{CAMERA}.topic={TOPIC}", _above(clip)]
+
+
+def ros(version: int) -> Callable[[Clip], object]:
+    @contextmanager
+    def published(clip: Clip) -> Iterator[list[str]]:
+        file = clip.directory / "clip.bgr"
+        file.write_bytes(b"".join(picture.tobytes() for picture in clip.pictures))
+        with ExitStack() as stack:
+            running_ros = stack.enter_context(running(version, clip.directory))
+            stack.enter_context(node(running_ros, "publish", *map(str, (file, WIDTH, HEIGHT, clip.fps)), TOPIC))
+            yield ["source=ros", f"cameras.{CAMERA}.topic={TOPIC}", *running_ros.words, _above(clip)]
+
+    return published
+
+
+WAYS = {
+    "test": ("`test`: GStreamer's test picture", "", test_picture),
+    "file": ("`file`: a clip in H.264", "", clip_file),
+    "rtsp": ("`rtsp`: an IP camera, H.264", "", ip_camera),
+    "bag": ("`bag`: MCAP, bgr8", "", raw_bag),
+    "bag_jpeg": ("`bag`: MCAP, JPEG", "", jpeg_bag),
+    "ros2": ("`ros`: a topic of ROS 2, bgr8", MISSING[2], ros(2)),
+    "ros1": ("`ros`: a topic of ROS 1, bgr8", MISSING[1], ros(1)),
+}
+
+
+def _above(clip: Clip) -> str:
+    """Slightly above the rate of the pictures: those beyond are dropped, and clocks are not exact."""
+    return f"fps_max={1.2 * clip.fps:g}"
+
+
+def _jpeg(picture: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", picture)[1].tobytes()
+
+
+def encoded(clip: Clip, form: str = "mp4") -> Path:
+    """The clip in H.264, made once."""
+    path = clip.directory / f"clip.{form}"
+    if not path.exists():
+        caps = f"rawvideoparse format=bgr width={WIDTH} height={HEIGHT} framerate={clip.fps}/1"
+        stream = "video/x-h264,profile=high,stream-format=byte-stream,alignment=au"
+        last = "h264parse ! mp4mux !" if form == "mp4" else ""
+        line = f"fdsrc fd=0 ! {caps} ! videoconvert ! x264enc bitrate=8000 ! {stream} ! {last} filesink location={path}"
+        pictures = b"".join(picture.tobytes() for picture in clip.pictures)
+        subprocess.run(["gst-launch-1.0", "-q", *line.split()], input=pictures, check=True, timeout=WAIT_S * 4)
+    return path
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+
+
+def measure(words: Sequence[str], seconds: float) -> Cost:
+    others = [f"~cameras.{name}" for name in configuration([]).vehicle().cameras if name != CAMERA]
+    media, broker = free_port(), Endpoint("127.0.0.1", free_port())
+    total = ["modes=open_loop", "pqos=constant", f"pqos.kbps={KBPS}", "mode=automatic"]
+    ports = [f"media.port={media}", f"control.port={broker.port}"]
+    with private_broker(broker), child_of(["-m", "runner", "vehicle", *others, *words, *total, *ports]) as side:
+        until(lambda: answers(media), WAIT_S)
+        with _watched(f"rtsp://127.0.0.1:{media}/{CAMERA}") as frames:
+            time.sleep(SETTLE_S)
+            used_s, began, before = _of_all(side.pid), time.monotonic(), len(frames)
+            time.sleep(seconds)
+            took_s = time.monotonic() - began
+            return Cost((_of_all(side.pid) - used_s) / took_s, (len(frames) - before) / took_s)
+
+
+@contextmanager
+def _watched(url: str) -> Iterator[list[Frame]]:
+    """The frames of a client, which connects again while the source has no picture yet."""
+    frames: list[Frame] = []
+    for _ in range(ATTEMPTS):
+        with child_of([HERE / "bare.py", "watch", url], stdout=subprocess.PIPE) as client:
+            threading.Thread(target=read_frames, args=(client.stdout, frames), daemon=True).start()
+            if passes(lambda: frames, WAIT_S / ATTEMPTS):
+                yield frames
+                return
+    raise SystemExit(f"no picture within {WAIT_S:g} s")
+
+
+def _of_all(pid: int) -> float:
+    """Processor time of a process and its children, s."""
+    tasks = Path(f"/proc/{pid}/task")
+    children = [int(child) for task in os.listdir(tasks) for child in (tasks / task / "children").read_text().split()]
+    return processor_s(pid) + sum(map(_of_all, children))
+
+
+if __name__ == "__main__":
+    main()
