@@ -17,7 +17,7 @@ from rig import CHROMIUM_FLAGS, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
-UNTIMED = ("test_docs", "test_keyframe", "test_model", "test_report_page")
+UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
 # Started first, so that no worker is left with a long file at the end.
 LONGEST = (
