@@ -17,7 +17,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed golden units check coverage lint javascript setup bench deadspot soak ros1 ros2 clean
+.PHONY: demo test timed untimed golden units check fast coverage lint javascript setup bench deadspot soak ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -39,8 +39,11 @@ golden: $(TEST_READY)
 units: $(TEST_READY)
 	$(BIN)/pytest -m "not timed and not alone and not soak" -n auto --dist loadfile --durations=30
 
-check: lint javascript
-	$(BIN)/pytest -m "not gst and not slow and not soak" -n auto --dist worksteal
+check: $(TEST_READY) $(NODE_READY)
+	$(MAKE) --no-print-directory -j 2 --output-sync=line fast lint javascript
+
+fast: $(TEST_READY)
+	$(BIN)/pytest tests --ignore=tests/integration -m "not gst and not slow and not soak" -n auto --dist worksteal
 
 # Branch coverage of the decisions and of reading configuration; make test runs far more of the rest.
 coverage: $(TEST_READY)
