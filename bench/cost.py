@@ -116,13 +116,13 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
     began = time.time()
     with child_of([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as server:
         assert server.stdin
-        _write(server.stdin, lines)
+        write_line(server.stdin, lines)
 
         def resize(name: str, scaling: float) -> None:
             camera = vehicle.cameras[name]
             size = output_size(camera.full_roi, exact(scaling))
             for element, key, value in assignments(camera, "size", size):
-                _write(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
+                write_line(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
 
         return _measured(vehicle, server.pid, began, seconds, resize)
 
@@ -213,7 +213,7 @@ def child_of(command: Sequence[Any], **pipes: int) -> Iterator[subprocess.Popen[
             child.wait()
 
 
-def _write(pipe: IO[str], what: Any) -> None:
+def write_line(pipe: IO[str], what: Any) -> None:
     pipe.write(json.dumps(what) + "\n")
     pipe.flush()
 

@@ -18,7 +18,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,24 +63,22 @@ def main() -> int:
     parser.add_argument("--version", type=int, choices=(2, 1), default=2, help="of ROS")
     parser.add_argument("--bag", action="store_true", help="from a bag, without ROS")
     options = parser.parse_args()
+    cameras = list(configuration([]).vehicle().cameras)[: options.cameras]
+    topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
+    try:
+        pictures = pictures_of(options.clip, WIDTH, HEIGHT, PICTURES)
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 1
     if options.bag:
-        return from_bag(options)
+        return from_bag(pictures, topics, options.fps, options.seconds)
     if MISSING[options.version]:
         print(MISSING[options.version], file=sys.stderr)
         return 1
-    cameras = list(configuration([]).vehicle().cameras)[: options.cameras]
     with tempfile.TemporaryDirectory() as directory, running(options.version, Path(directory)) as ros:
-        file = Path(directory, "clip.bgr")
-        try:
-            file.write_bytes(pictures_of(options.clip))
-        except ValueError as error:
-            print(error, file=sys.stderr)
-            return 1
-        topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
         decoded = {name: f"{NODE}/camera/{ros_name(name)}/image" for name in cameras}
-        form = map(str, (file, WIDTH, HEIGHT, options.fps))
         with (
-            node(ros, "publish", *form, *topics.values()) as publisher,
+            publishing(ros, pictures, options.fps, Path(directory), *topics.values()) as publisher,
             node(ros, "subscribe", *decoded.values()) as subscriber,
         ):
             # Slightly above the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
@@ -94,31 +92,52 @@ def main() -> int:
     return status
 
 
-def pictures_of(clip: Path) -> bytes:
-    """The first pictures of a clip, as BGR.
+def pictures_of(clip: Path, width: int, height: int, most: int) -> list[np.ndarray]:
+    """The first pictures of a clip, as BGR of this size.
 
     raises  ValueError if there are none
     """
-    video, rows = cv2.VideoCapture(str(clip)), []
-    while len(rows) < PICTURES and (read := video.read())[0]:
-        rows.append(cv2.resize(read[1], (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).tobytes())
-    if not rows:
+    video, pictures = cv2.VideoCapture(str(clip)), []
+    while len(pictures) < most and (read := video.read())[0]:
+        pictures.append(cv2.resize(read[1], (width, height), interpolation=cv2.INTER_AREA))
+    if not pictures:
         raise ValueError(f"{clip}: no pictures can be read")
-    return b"".join(rows)
+    return pictures
 
 
-def from_bag(options: argparse.Namespace) -> int:
+@contextmanager
+def publishing(
+    ros: Ros, pictures: Sequence[np.ndarray], fps: int, directory: Path, *topics: str
+) -> Iterator[subprocess.Popen[str]]:
+    """A node that publishes the pictures on all topics; the directory holds them meanwhile."""
+    file, (height, width, _) = directory / "clip.bgr", pictures[0].shape
+    file.write_bytes(b"".join(picture.tobytes() for picture in pictures))
+    with node(ros, "publish", *map(str, (file, width, height, fps)), *topics) as process:
+        yield process
+
+
+def bag_of(
+    pictures: Sequence[np.ndarray], fps: int, path: Path, topics: Iterable[str], message: Callable[..., Any]
+) -> Path:
+    """A bag (MCAP) with the pictures on all topics.
+
+    message  of a type store, a stamp in ns, and a picture
+    """
+    store = typestore("mcap")
+    stamped = [(BEGAN_NS + number * 10**9 // fps, picture) for number, picture in enumerate(pictures)]
+    messages = [(ns, message(store, ns, picture)) for ns, picture in stamped]
+    return write_bag(path, "mcap", dict.fromkeys(topics, messages))
+
+
+def raw(store: Any, ns: int, picture: np.ndarray) -> Any:
+    return image(store, ns, picture, "bgr8")
+
+
+def from_bag(pictures: Sequence[np.ndarray], topics: Mapping[str, str], fps: int, seconds: int) -> int:
     """The same topics from a bag; returns the demo's exit status."""
-    cameras = list(configuration([]).vehicle().cameras)[: options.cameras]
-    topics = {name: f"/{ros_name(name)}/image_raw" for name in cameras}
-    data, store = pictures_of(options.clip), typestore("mcap")
-    pictures = np.frombuffer(data, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
-    stamps = [BEGAN_NS + number * 10**9 // options.fps for number in range(len(pictures))]
-    messages = [(ns, image(store, ns, picture, "bgr8")) for ns, picture in zip(stamps, pictures, strict=True)]
     with tempfile.TemporaryDirectory() as directory:
-        bag = write_bag(Path(directory, "clip"), "mcap", dict.fromkeys(topics.values(), messages))
-        words = ["source=bag", f"source.bag={bag}"]
-        return subprocess.run(demo(words, topics, options.fps, options.seconds), check=False, cwd=CHECKOUT).returncode
+        words = ["source=bag", f"source.bag={bag_of(pictures, fps, Path(directory, 'clip'), topics.values(), raw)}"]
+        return subprocess.run(demo(words, topics, fps, seconds), check=False, cwd=CHECKOUT).returncode
 
 
 def demo(words: Sequence[str], topics: Mapping[str, str], fps: float, seconds: int) -> list[str]:

@@ -5,35 +5,34 @@
 
 Each way delivers the same pictures of the clip, and the camera is sent at factor 0.5 with its whole bitrate. Processor
 time includes that of the side's child processes, such as the node of ROS; not that of publisher, IP camera and client.
-ROS needs `make ros2` and `make ros1`; what is missing is left out.
+ROS needs `make ros2` and `make ros1`; the row of a version that is missing says so.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from cost import WAIT_S, Frame, child_of, read_frames
-from ros import node
+from cost import WAIT_S, Frame, child_of, read_frames, write_line
+from ros import bag_of, pictures_of, publishing, raw
 from uplinks import row
 from usage import processor_s
 
 sys.path += [str(Path(__file__).resolve().parents[1] / "tests" / name) for name in (".", "integration")]
-from bags import BEGAN_NS, compressed, image, typestore, write_bag
+from bags import compressed
 from ros_domain import MISSING, running
 
-from rig import answers, free_port, passes, until
+from rig import answers, children_named, free_port, passes, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
@@ -72,7 +71,11 @@ def main() -> None:
     print(row("way in", "cores", "frames a second", "two cores carry"))
     print(row(*["---"] * 4), flush=True)
     with tempfile.TemporaryDirectory() as directory:
-        clip = Clip(pictures_of(options.clip), options.fps, Path(directory))
+        try:
+            pictures = pictures_of(options.clip, WIDTH, HEIGHT, PICTURES)
+        except ValueError as error:
+            raise SystemExit(str(error)) from None
+        clip = Clip(pictures, options.fps, Path(directory))
         for name in options.only:
             title, missing, words_of = WAYS[name]
             if missing:
@@ -81,16 +84,6 @@ def main() -> None:
             with words_of(clip) as words:
                 cost = measure(words, options.seconds)
             print(row(title, f"{cost.cores:.2f}", f"{cost.fps:.1f}", f"{int(2 / cost.cores)}"), flush=True)
-
-
-def pictures_of(path: Path) -> list[np.ndarray]:
-    """The first pictures of a clip, as BGR of the camera's size."""
-    video, pictures = cv2.VideoCapture(str(path)), []
-    while len(pictures) < PICTURES and (read := video.read())[0]:
-        pictures.append(cv2.resize(read[1], (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
-    if not pictures:
-        raise SystemExit(f"{path}: no pictures can be read")
-    return pictures
 
 
 # --- the ways in: overrides that use them, while the block lasts ------------------------------------------------------
@@ -112,42 +105,34 @@ def ip_camera(clip: Clip) -> Iterator[list[str]]:
     line += f" ! video/x-h264,framerate={clip.fps}/1 ! identity sync=true ! rtph264pay name=pay0 config-interval=-1"
     with child_of([HERE / "bare.py", "serve", str(port)], stdin=subprocess.PIPE) as camera:
         assert camera.stdin
-        camera.stdin.write(f'{{"stream": "( {line} )"}}\n')
-        camera.stdin.flush()
-        yield [
-            "source=rtsp",
-            f"cameras.{CAMERA}.address=rtsp://127.0.0.1:{port}/stream",
-            f"fps_max={clip.fps}",
-        ]
+        write_line(camera.stdin, {"stream": f"( {line} )"})
+        address = f"cameras.{CAMERA}.address=rtsp://127.0.0.1:{port}/stream"
+        yield ["source=rtsp", address, f"fps_max={clip.fps}"]
 
 
 @contextmanager
 def raw_bag(clip: Clip) -> Iterator[list[str]]:
-    yield _bag(clip, "raw", lambda store, ns, picture: image(store, ns, picture, "bgr8"))
+    yield _bag(clip, raw)
 
 
 @contextmanager
 def jpeg_bag(clip: Clip) -> Iterator[list[str]]:
-    yield _bag(clip, "jpeg", lambda store, ns, picture: compressed(store, ns, _jpeg(picture), "jpeg"))
+    yield _bag(clip, _jpeg)
 
 
-def _bag(clip: Clip, name: str, message: Callable[..., object]) -> list[str]:
-    store, interval_ns = typestore("mcap"), 10**9 // clip.fps
-    stamps = [BEGAN_NS + number * interval_ns for number in range(len(clip.pictures))]
-    messages = [(ns, message(store, ns, picture)) for ns, picture in zip(stamps, clip.pictures, strict=True)]
-    path = write_bag(clip.directory / name, "mcap", {TOPIC: messages})
+def _bag(clip: Clip, message: Callable[..., Any]) -> list[str]:
+    path = bag_of(clip.pictures, clip.fps, clip.directory / message.__name__, [TOPIC], message)
     return ["source=bag", f"source.bag={path}", f"cameras.{CAMERA}.topic={TOPIC}", _above(clip)]
 
 
 def ros(version: int) -> Callable[[Clip], object]:
     @contextmanager
     def published(clip: Clip) -> Iterator[list[str]]:
-        file = clip.directory / "clip.bgr"
-        file.write_bytes(b"".join(picture.tobytes() for picture in clip.pictures))
-        with ExitStack() as stack:
-            running_ros = stack.enter_context(running(version, clip.directory))
-            stack.enter_context(node(running_ros, "publish", *map(str, (file, WIDTH, HEIGHT, clip.fps)), TOPIC))
-            yield ["source=ros", f"cameras.{CAMERA}.topic={TOPIC}", *running_ros.words, _above(clip)]
+        with (
+            running(version, clip.directory) as started,
+            publishing(started, clip.pictures, clip.fps, clip.directory, TOPIC),
+        ):
+            yield ["source=ros", f"cameras.{CAMERA}.topic={TOPIC}", *started.words, _above(clip)]
 
     return published
 
@@ -168,8 +153,8 @@ def _above(clip: Clip) -> str:
     return f"fps_max={1.2 * clip.fps:g}"
 
 
-def _jpeg(picture: np.ndarray) -> bytes:
-    return cv2.imencode(".jpg", picture)[1].tobytes()
+def _jpeg(store: Any, ns: int, picture: np.ndarray) -> Any:
+    return compressed(store, ns, cv2.imencode(".jpg", picture)[1].tobytes(), "jpeg")
 
 
 def encoded(clip: Clip, form: str = "mp4") -> Path:
@@ -218,9 +203,7 @@ def _watched(url: str) -> Iterator[list[Frame]]:
 
 def _of_all(pid: int) -> float:
     """Processor time of a process and its children, s."""
-    tasks = Path(f"/proc/{pid}/task")
-    children = [int(child) for task in os.listdir(tasks) for child in (tasks / task / "children").read_text().split()]
-    return processor_s(pid) + sum(map(_of_all, children))
+    return processor_s(pid) + sum(map(_of_all, children_named(pid, "")))  # of any name
 
 
 if __name__ == "__main__":
