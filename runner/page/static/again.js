@@ -5,6 +5,7 @@
 "use strict";
 
 const AGAIN_MS = 1000; // between two attempts
+const ANSWERED_MS = 2000; // limit of one: a station that hangs does not end the attempts
 let isLoadingAgain = false;
 
 addEventListener("load", () => globalThis.tod ?? loadAgain());
@@ -18,7 +19,8 @@ async function loadAgain() {
   let answers = false;
   while (!answers) {
     await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
-    answers = await fetch(location.href, { cache: "no-store" }).then(({ ok }) => ok, () => false);
+    const limited = { cache: /** @type {const} */ ("no-store"), signal: AbortSignal.timeout(ANSWERED_MS) };
+    answers = await fetch(location.href, limited).then(({ ok }) => ok, () => false);
   }
   location.reload();
 }
