@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from browser import all_live, luma, measure, opened, send, shot, state_when, until
+from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, until
 from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_compiler, process
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -309,7 +309,7 @@ def test_a_browser_on_another_machine_needs_the_token(chromium, remote_page):
         page.fill("#token", token)
         page.click("button")
         page.wait_for_url(url)
-        until(lambda: page.evaluate("window.tod !== undefined"))
+        until(lambda: has_started(page))
         all_live(page)
         authority = Authority(alice.parent)
         with authority.opened():
