@@ -315,7 +315,7 @@ class Receiver:
         return True
 
     def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        """An access unit has arrived; page, log and reception report share its times."""
+        """An access unit has arrived; page and log share its times, and over SRT the reception report too."""
         arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
         captured = capture_time(buffer)
         self._entered = (buffer.pts, monotonic)
