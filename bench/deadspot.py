@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import shutil
 import sys
 import tempfile
 import time
@@ -25,7 +24,7 @@ from playwright.sync_api import Browser, sync_playwright
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from browser import measure, opened
-from rig import CHROMIUM_FLAGS, answers, free_port, process, until
+from rig import BROWSER, CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.drive.read import read_drive
 from runner.drive.series import Series, series
 
@@ -73,7 +72,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=40)
     options = parser.parse_args()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        browser = playwright.chromium.launch(executable_path=BROWSER, args=CHROMIUM_FLAGS)
         drives = {modes: watched(browser, modes, options) for modes in POLICIES}
         browser.close()
     draw(drives, options)

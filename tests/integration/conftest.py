@@ -5,7 +5,6 @@ time, then those marked `alone`, whose limits are tight, three at a time. Everyt
 time that these leave over.
 """
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import pytest
 from ros_domain import running
 
-from rig import CHROMIUM_FLAGS, free_port
+from rig import BROWSER, CHROMIUM_FLAGS, free_port
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 
@@ -48,7 +47,7 @@ def chromium() -> Iterator[Any]:
     """A browser; its pages are opened by `browser.opened`."""
     sync_api = pytest.importorskip("playwright.sync_api")
     with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        started = playwright.chromium.launch(executable_path=BROWSER, args=CHROMIUM_FLAGS)
         yield started
         started.close()
 

@@ -50,6 +50,9 @@ _SNOW = "{name: source, element: videotestsrc, properties: {is-live: true, patte
 _RAW = "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}"
 NOISE = ("source=test", f"source.elements=[{_SNOW}, {_RAW}]")  # noise, for which the encoder needs all of its bitrate
 
+# Starts and draws with less processor time than the whole browser, on the same engine.
+BROWSER = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+needs_browser = pytest.mark.skipif(not BROWSER, reason="needs chromium-headless-shell or chromium")
 # No sandbox inside containers; no background traffic to hosts that a closed network refuses anyway.
 CHROMIUM_FLAGS = [
     "--no-sandbox",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import subprocess
 import threading
 import time
@@ -17,7 +16,7 @@ import pytest
 from painted import CAR
 
 from browser import until
-from rig import free_port
+from rig import free_port, needs_browser
 from runner.configuration.config import configuration
 from runner.core.events import parse
 from runner.core.model import plain
@@ -29,7 +28,7 @@ from runner.records import CameraState, VehicleState, applied_to_json
 MARKS = [
     pytest.mark.gst,
     pytest.mark.soak,  # builds a street
-    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+    needs_browser,
 ]
 image = pytest.importorskip("PIL.Image")
 pytest.importorskip("cv2")

@@ -11,7 +11,6 @@ import json
 import os
 import random
 import select
-import shutil
 import subprocess
 import sys
 import time
@@ -21,7 +20,7 @@ import numpy as np
 import pytest
 
 from browser import PADS, all_live, measure, opened, press_button, send, shot, state_when, take_control, until, viewing
-from rig import CHECKOUT, answers, free_port, passes, process
+from rig import CHECKOUT, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.link import Limit
@@ -33,7 +32,7 @@ from runner.operator.meter import percentile
 pytestmark = [
     pytest.mark.gst,
     pytest.mark.soak,
-    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+    needs_browser,
 ]
 image = pytest.importorskip("PIL.Image")
 

@@ -1,7 +1,6 @@
 """Glass-to-glass latency, read by the page from the picture of a counter, agrees with the reported latency."""
 
 import re
-import shutil
 import signal
 from pathlib import Path
 
@@ -9,10 +8,10 @@ import pytest
 from helpers import Command
 
 from browser import measure, opened
-from rig import ROBOT, answers, free_port, process, until
+from rig import ROBOT, answers, free_port, needs_browser, process, until
 from runner.page.counter import CounterReading, counter_reading, glass_to_glass
 
-pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+pytestmark = [pytest.mark.gst, needs_browser]
 RESULT = re.compile(
     r"rear: counter read in (\d+) of (\d+) pictures\n"
     r"  glass to glass +(\d+) ms median, \d+ ms p95\n"

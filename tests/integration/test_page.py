@@ -7,7 +7,6 @@ import base64
 import io
 import json
 import re
-import shutil
 import socket
 import subprocess
 import threading
@@ -32,10 +31,10 @@ from browser import (
     until,
     viewing,
 )
-from rig import WAIT_S, answers, free_port, process
+from rig import WAIT_S, answers, free_port, needs_browser, process
 from runner.page.server import EVENTS
 
-pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
 image = pytest.importorskip("PIL.Image")
 

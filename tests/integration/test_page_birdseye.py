@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import shutil
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from painted import ALL_AROUND, CAR, FINER, TOP_CAMERAS, TOP_SIZE, Mounted, corn
 from stills import MARKS, Station, image, on_screen, serving
 
 from browser import all_live, opened, shot, until
-from rig import CHROMIUM_FLAGS
+from rig import BROWSER, CHROMIUM_FLAGS
 from runner.core.model import Pose
 
 pytestmark = MARKS
@@ -160,7 +159,7 @@ def test_a_stalled_picture_is_not_shown(page, station):
 
 def test_without_webgl_it_says_so_and_pictures_are_not_straightened(chromium, station):
     flags = [*CHROMIUM_FLAGS, "--disable-software-rasterizer"]
-    other = chromium.browser_type.launch(executable_path=shutil.which("chromium"), args=flags)
+    other = chromium.browser_type.launch(executable_path=BROWSER, args=flags)
     try:
         with serving(station) as served, opened(other, served.url, 1280, 720) as page:
             all_live(page)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import subprocess
 import threading
 import time
@@ -14,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until
-from rig import SMALL_ROBOT, WAIT_S, answers, free_port, passes, process
+from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
 from runner.core.events import parse
@@ -24,7 +23,7 @@ from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
 from runner.records import CameraState, Outcome, VehicleState, applied_to_json
 
-pytestmark = [pytest.mark.gst, pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")]
+pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
 
 WORDS = (*SMALL_ROBOT, "source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import os
 import re
-import shutil
 import signal
 import socket
 import ssl
@@ -19,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, until
-from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_compiler, process
+from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
@@ -29,7 +28,7 @@ from runner.security.authority import Authority
 
 pytestmark = [
     pytest.mark.gst,
-    pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium"),
+    needs_browser,
 ]
 
 

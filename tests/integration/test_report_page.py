@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +11,11 @@ from typing import Any
 import pytest
 from drives import write_drive, write_models
 
+from rig import needs_browser
 from runner.configuration.compose import compose
 from runner.verbs.report import report
 
-pytestmark = pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
+pytestmark = needs_browser
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
 sync_api = pytest.importorskip("playwright.sync_api")
