@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         marks = {mark.name for mark in item.iter_markers()}
         if marks & {"timed", "alone"} and "integration" not in item.path.parts:
             raise pytest.UsageError(f"{item.nodeid}: `make test` runs timed tests of tests/integration only")
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what has been imported stays: it need not be searched for garbage again and again
 
 
 @pytest.fixture(autouse=True)

@@ -159,9 +159,8 @@ def check_shell(lines: list[str], place: Path) -> None:
     """Shell lines, beside a demo whose broker they use."""
     words = ports()
     port = words[1].partition("=")[2]
-    with process(
-        "demo", *SHORT["demo"], "duration_s=60", *FEWER, *SMALL, LOOP, *words, cwd=place, stdout=subprocess.DEVNULL
-    ):
+    short = [*SHORT["demo"], "duration_s=60", "source=test", *FEWER, *SMALL]
+    with process("demo", *short, *words, cwd=place, stdout=subprocess.DEVNULL):
         until(lambda: answers(int(port)), seconds=60)
         script = "\n".join(["set -e", *lines]).replace("-p 1884", f"-p {port}")
         subprocess.run(["bash", "-c", script], cwd=place, check=True, timeout=60)

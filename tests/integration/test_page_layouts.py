@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until
+from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until, visit
 from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
@@ -193,7 +193,7 @@ def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module
             return route.abort("connectionreset")
 
         tab.route(f"**/static/{module}", fail_once)
-        page.goto(server.url)
+        visit(page, server.url)
         page.wait_for_function("() => window.tod?.state", timeout=1000 * WAIT_S)  # through navigations
         assert failed
         all_live(page)

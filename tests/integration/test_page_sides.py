@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, until
+from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, until, visit
 from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -26,10 +26,7 @@ from runner.mqtt.broker import private_broker
 from runner.records import Sample
 from runner.security.authority import Authority
 
-pytestmark = [
-    pytest.mark.gst,
-    needs_browser,
-]
+pytestmark = [pytest.mark.gst, needs_browser]
 
 
 # Not the measured link rate: a busy machine delays packets, which would lower it and so the total.
@@ -299,7 +296,7 @@ def test_a_browser_on_another_machine_needs_the_token(chromium, remote_page):
     token = (alice / "page.token").read_text()
     with chromium.new_context(ignore_https_errors=True) as tab:  # this browser does not know the authority
         page = tab.new_page()
-        page.goto(url)
+        visit(page, url)
         assert page.url == f"{url}login"
         page.fill("#token", "guessed")
         page.click("button")
