@@ -6,12 +6,12 @@ import heapq
 import itertools
 import random
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import UNCAPPED, believed_limit, start_cap, update_cap
+from runner.core.link_cap import UNCAPPED, LinkCap, believed_limit, start_cap, update_cap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 Profile = Callable[[float], float]  # value over time, s
@@ -82,6 +82,31 @@ class Tcp:
             yield (left or queue.free) + self._rtt_s, "ack" if left else "loss"
 
 
+class ShortFlows(Tcp):
+    """TCP flows one after another, of 100 to 1000 kB: each begins with slow start, after a pause of 0.2 to 1.5 s."""
+
+    def __init__(self, until: float, rtt_s: float) -> None:
+        super().__init__(until, rtt_s)
+        self._rng, self._left, self._begins, self._is_starting = random.Random(1), 0, 0.0, True
+
+    def on_feedback(self, t: float, outcome: str) -> None:
+        if outcome == "ack" and self._is_starting:
+            self._window += 1 - 1 / self._window
+        self._is_starting = self._is_starting and outcome != "loss"
+        super().on_feedback(t, outcome)
+
+    def send(self, t: float, queue: Queue) -> Iterator[tuple[float, str]]:
+        if self._left <= 0 and t >= self._begins:
+            self._left, self._window, self._is_starting = self._rng.randint(100_000, 1_000_000), 10.0, True
+        while self._left > 0 and t < self._until and self._in_flight < self._window:
+            self._in_flight, self._left = self._in_flight + 1, self._left - self.PACKET
+            left = queue.put(t, self.PACKET)
+            yield (left or queue.free) + self._rtt_s, "ack" if left else "loss"
+            if self._left <= 0:
+                self._begins = t + self._rng.uniform(0.2, 1.5)
+                yield self._begins, "begins"
+
+
 @dataclass(repr=False)
 class Drive:
     """Record of a simulated drive: (t, cap in kbit/s, state), waits in the queue, bytes that arrived, t of losses."""
@@ -128,22 +153,25 @@ def drive(
     key_frame: float = 1,
     late: Callable[[int, float], float] = lambda camera, t: 0.0,
     filled: float = 1.0,
+    flows: type[Tcp] = Tcp,
+    predicted: bool = True,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
     noise  share by which sizes of access units vary
-    tcp_s  begin and end of a TCP flow over the same link
+    tcp_s  begin and end of a TCP flow, or of several (flows), over the same link
     position  of the vehicle over time
     queued_s  length of the queue before the cameras begin
     start  share of the limit until the link is measured
     key_frame  size of each camera's first frame, in multiples of the others
     late  delay until the frame that a camera captures at t is sent, s
     filled  share of their bitrate that the encoders use
+    predicted  whether the limit is a prediction; otherwise only the measurement limits the total
     """
     rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
-    link_queue, tcp = Queue(link, queued_s), Tcp(end, 2 * link.one_way_s)
-    done, cap = Drive(tcp=tcp.delivered), start_cap(UNCAPPED, None, 0.0, Fraction(limit(0.0)), start)
+    link_queue, tcp = Queue(link, queued_s), flows(end, 2 * link.one_way_s)
+    done, cap = Drive(tcp=tcp.delivered), _first_cap(limit(0.0), start, predicted)
     events: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -210,6 +238,10 @@ def drive(
             in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
+
+
+def _first_cap(limit: float, start: Fraction, predicted: bool) -> LinkCap:
+    return start_cap(replace(UNCAPPED, alone=not predicted), None, 0.0, Fraction(limit), start)
 
 
 def _send_frame(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:

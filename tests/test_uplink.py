@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from shared_data import shared
-from simulated_link import Link, busy, drive, jitter, stalls, steps, utilisation
+from simulated_link import Link, ShortFlows, busy, drive, jitter, stalls, steps, utilisation
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
@@ -237,6 +237,24 @@ def test_cameras_and_a_tcp_flow_share_the_link(fps: float) -> None:
     assert sum(size for t, size in done.tcp if 15 <= t < 60) * 8 / 1000 / 45 >= 500
     assert done.kbps(70, 80) >= 3000
     assert done.wait_ms(0.95, since=65) <= 100
+
+
+def test_cameras_without_predictions_hold_their_share_against_short_flows() -> None:
+    """Case 5.7 of RFC 8867, rates times two: flows that start look like a link that has become narrow."""
+    link, limit = Link(steps((0, 4000)), one_way_s=0.05), steps((0, 4000))
+    done = drive(link, limit, 60, fps=15, tcp_s=(5, 60), flows=ShortFlows, filled=0.9, predicted=False)
+    assert done.kbps(15, 60) >= 500
+    assert done.lowest(15, 60) >= 300
+    assert sum(size for t, size in done.tcp if 15 <= t < 60) * 8 / 1000 / 45 >= 1500
+
+
+@pytest.mark.parametrize("kbps", [250, 600, 1200])
+def test_without_predictions_the_cap_follows_a_link_that_becomes_narrow_within_three_seconds(kbps: float) -> None:
+    link = Link(steps((0, 4000), (10, kbps)), one_way_s=0.05)
+    done = drive(link, steps((0, 4000)), 30, fps=15, filled=0.95, predicted=False)
+    assert done.first(10, lambda cap: cap < kbps) < 3
+    assert done.wait_ms(0.95, since=14) <= 120
+    assert done.kbps(15, 30) >= 0.9 * kbps
 
 
 def laps(t: float) -> PositionReported:

@@ -49,6 +49,10 @@ JITTER_MS = 40
 # A longer one is real once it has lasted this long, s: delays on a busy machine are shorter.
 LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
+# Without predictions, a link that has become narrow cannot be told at once from competing flows that start: both fill
+# the queue and drop packets. While the queue stays long, the share above falls to half of it over this many s, and only
+# then is the link considered narrow. With predictions a wrong conclusion costs less, and waiting costs more.
+BURST_S = 2.0
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
 FADED = Fraction(999, 1000)  # factor by which that most decays each second
 SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
@@ -288,6 +292,14 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
+def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
+    """How far a long queue may still be a burst of competing traffic: from 1 to 0, in tenths."""
+    if not cap.alone:
+        return Fraction(0)
+    lasted_s = max(0.0, t - cap.short - _rtt_s(link))
+    return Fraction(10 - min(10, int(10 * lasted_s / BURST_S)), 10)
+
+
 def _is_short(link: LinkMeasured) -> bool:
     return (link.queue_ms or 0) < JITTER_MS
 
@@ -322,9 +334,10 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     carried = link.kbps
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
     most = min(cap.most.kbps, limit)
-    if lossy or _is_narrow(cap, link, t, limit):
+    burst = _burst(cap, link, t)
+    if burst == 0 and (lossy or _is_narrow(cap, link, t, limit)):
         most = min(most, PROVEN * carried)
-    target = max(target, YIELDED * most)
+    target = max(target, YIELDED * (1 + burst) / 2 * most if cap.alone else YIELDED * most)
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
