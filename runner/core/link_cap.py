@@ -25,7 +25,7 @@ TOO_LOSSY = 0.1  # share of packets lost; random loss on the radio link stays be
 LOSING_S = 0.3  # a loss share that has only fallen for longer reflects earlier packets: losses have stopped
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
-CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
+CAREFUL, DOUBLING = Fraction(1, 200), 6  # first increase beyond that, and the number of steps that double it
 TESTED = 3  # a cap grows up to this multiple of what arrives
 BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # until then the capacity is too uncertain: the cap is tied to what arrives
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
@@ -50,7 +50,7 @@ JITTER_MS = 40
 LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
 # Without predictions, a link that has become narrow cannot be told at once from competing flows that start: both fill
-# the queue and drop packets. While the queue stays long, the share above falls to half of it over this many s, and only
+# the queue and drop packets. While the queue stays long, the share above falls by a third over this many s, and only
 # then is the link considered narrow. With predictions a wrong conclusion costs less, and waiting costs more.
 BURST_S = 2.0
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
@@ -337,7 +337,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     burst = _burst(cap, link, t)
     if burst == 0 and (lossy or _is_narrow(cap, link, t, limit)):
         most = min(most, PROVEN * carried)
-    target = max(target, YIELDED * (1 + burst) / 2 * most if cap.alone else YIELDED * most)
+    target = max(target, YIELDED * (2 + burst) / 3 * most if cap.alone else YIELDED * most)
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
