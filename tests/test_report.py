@@ -154,6 +154,7 @@ def test_quality_that_was_measured_on_the_pictures_is_shown(
     assert f"{means[0]:.3f}" in out
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_without_measured_quality_the_figure_is_left_out(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert tod("report", str(drive), f"output={tmp_path}").status == 0
     content = document(tmp_path)
@@ -172,6 +173,7 @@ def test_measured_quality_that_cannot_be_read(tod: Command, drive: Path, tmp_pat
     assert err.splitlines()[-1] == f"{path / 'quality.json'}: {rule}"
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_model_that_the_configuration_names(tod: Command, tmp_path: Path) -> None:
     def named(side: str, lines: Lines) -> Lines:
         return lines
@@ -211,12 +213,13 @@ def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
         (["vehicle", "operator"], FIGURES),
     ],
 )
+@pytest.mark.usefixtures("unprinted")
 def test_sides_that_are_missing(tod: Command, tmp_path: Path, sides: list[str], figures: list[str]) -> None:
     path = write_drive(tmp_path / "drive", sides, seconds=5)
     status, out, _ = tod("report", str(path), f"output={tmp_path / 'out'}")
     assert status == 0
-    check_figures(tmp_path / "out", figures)
     content = document(tmp_path / "out")
+    assert sorted(content["figures"]) == sorted(figures)
     assert content["drives"][0]["link"] is None
     if "operator" not in sides:
         left_out = "latency: left out, no latency was logged: an operator's log is needed"
