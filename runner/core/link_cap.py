@@ -49,10 +49,10 @@ JITTER_MS = 40
 # A longer one is real once it has lasted this long, s: delays on a busy machine are shorter.
 LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
-# Without predictions, a link that has become narrow cannot be told at once from competing flows that start: both fill
-# the queue and drop packets. While the queue stays long, the share above falls by a third over this many s, and only
-# then is the link considered narrow. With predictions a wrong conclusion costs less, and waiting costs more.
-BURST_S = 2.0
+# Without predictions, this often within this many s means that competing flows start again and again: each fills the
+# queue and drops packets just as a link does that becomes narrow. From then on, the share above falls by a third over
+# BURST_S while the queue is long, and only after that the link is considered narrow.
+OFTEN, OFTEN_S, BURST_S, CONTESTED = 3, 30.0, 2.0, Fraction(2, 3)
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
 FADED = Fraction(999, 1000)  # factor by which that most decays each second
 SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
@@ -71,6 +71,13 @@ class Lowering(NamedTuple):
 
     t: float
     known: Kbps
+
+
+class Proofs(NamedTuple):
+    """When the link seemed to be narrow in the last OFTEN_S, once per long queue, and the most that arrived before."""
+
+    times: tuple[float, ...]
+    most: Kbps
 
 
 class Stall(NamedTuple):
@@ -104,6 +111,7 @@ class LastLimit(NamedTuple):
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
 NOT_LOWERED = Lowering(-float("inf"), Fraction(0))
+NO_PROOFS = Proofs((), Fraction(0))
 NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
@@ -131,6 +139,7 @@ class LinkCap:
     limit       the last one
     short       t at which the queue was last shorter than JITTER_MS
     lowering    the last lowering of the known capacity
+    proofs      that the link is narrow
     """
 
     kbps: Kbps | None = None
@@ -153,6 +162,7 @@ class LinkCap:
     limit: LastLimit = NO_LIMIT
     short: float = -float("inf")
     lowering: Lowering = NOT_LOWERED
+    proofs: Proofs = NO_PROOFS
 
 
 UNCAPPED = LinkCap()
@@ -292,9 +302,26 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
+def _note_proof(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+    """Count a proof that the link is narrow; many show that it is contested instead, and refute the earlier ones."""
+    times = tuple(each for each in cap.proofs.times if t - each <= OFTEN_S)
+    most = max(cap.proofs.most, cap.most.kbps) if times else cap.most.kbps
+    if times and times[-1] > cap.short:
+        return replace(cap, proofs=Proofs(times, most))
+    cap = replace(cap, proofs=Proofs((*times, t)[-OFTEN:], most))
+    if not _is_contested(cap) or cap.kbps is None:
+        return cap
+    least = _short(CONTESTED * YIELDED * min(most, limit))
+    return replace(cap, most=cap.most._replace(kbps=most), kbps=max(cap.kbps, least))
+
+
+def _is_contested(cap: LinkCap) -> bool:
+    return cap.alone and len(cap.proofs.times) == OFTEN
+
+
 def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
     """How far a long queue may still be a burst of competing traffic: from 1 to 0, in tenths."""
-    if not cap.alone:
+    if not _is_contested(cap):
         return Fraction(0)
     lasted_s = max(0.0, t - cap.short - _rtt_s(link))
     return Fraction(10 - min(10, int(10 * lasted_s / BURST_S)), 10)
@@ -333,11 +360,13 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     lossy = (link.loss or 0) > LOSSY  # the full queue drops packets, which hides its true length
     carried = link.kbps
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
-    most = min(cap.most.kbps, limit)
-    burst = _burst(cap, link, t)
-    if burst == 0 and (lossy or _is_narrow(cap, link, t, limit)):
+    is_proof = lossy or _is_narrow(cap, link, t, limit)
+    if is_proof and cap.alone:
+        cap = _note_proof(cap, t, limit)
+    most, burst = min(cap.most.kbps, limit), _burst(cap, link, t)
+    if is_proof and not burst:
         most = min(most, PROVEN * carried)
-    target = max(target, YIELDED * (2 + burst) / 3 * most if cap.alone else YIELDED * most)
+    target = max(target, YIELDED * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
