@@ -60,7 +60,7 @@ const STAGES = {
   draw: ["Draw", "until the picture is drawn; the screen adds its own delay"],
 };
 const latencies = new Map(); // by stage
-const age = make("td");
+const age = make("td", { class: "sum" });
 let edited = new Set(); // inputs that the operator is editing: not to be overwritten
 
 function number(control, label, limits) {
@@ -84,13 +84,15 @@ function comparison() {
   return make("table", { class: "facts" }, make("caption", { class: "unseen" }, "decided and applied values"), make("thead", {}, head), body);
 }
 
+/** Two stages in each row, which leaves space for the charts. */
 function stageTable() {
-  const body = make("tbody");
-  for (const [stage, [label, what]] of Object.entries(STAGES)) {
+  const cells = Object.entries(STAGES).map(([stage, [label, what]]) => {
     latencies.set(stage, make("td"));
-    body.append(make("tr", { title: what }, make("th", { scope: "row" }, label), latencies.get(stage)));
-  }
-  body.append(make("tr", { class: "sum", title: "capture to drawing" }, make("th", { scope: "row" }, "Latency"), age));
+    return [make("th", { scope: "row", title: what }, label), latencies.get(stage)];
+  });
+  cells.push([make("th", { scope: "row", class: "sum", title: "capture to drawing" }, "Latency"), age]);
+  const body = make("tbody");
+  for (let i = 0; i < cells.length; i += 2) body.append(make("tr", {}, ...cells.slice(i, i + 2).flat()));
   return make("table", { class: "facts" }, make("caption", {}, "Latency, ms"), body);
 }
 
