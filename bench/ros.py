@@ -81,10 +81,9 @@ def main() -> int:
             publishing(ros, pictures, options.fps, Path(directory), *topics.values()) as publisher,
             node(ros, "subscribe", *decoded.values()) as subscriber,
         ):
-            # Slightly above the publisher's rate: pictures beyond fps are dropped, and clocks are not exact.
             words = ["source=ros", *ros.words, "ros.pictures=true"]
             status = subprocess.run(
-                demo(words, topics, 1.2 * options.fps, options.seconds), check=False, cwd=CHECKOUT
+                demo(words, topics, above(options.fps), options.seconds), check=False, cwd=CHECKOUT
             ).returncode
             delivered, published = results(subscriber), results(publisher)
     if status == 0:
@@ -114,6 +113,11 @@ def publishing(
     file.write_bytes(b"".join(picture.tobytes() for picture in pictures))
     with node(ros, "publish", *map(str, (file, width, height, fps)), *topics) as process:
         yield process
+
+
+def above(fps: float) -> float:
+    """Slightly above the rate of the pictures: those beyond fps_max are dropped, and clocks are not exact."""
+    return 1.2 * fps
 
 
 def bag_of(

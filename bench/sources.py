@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from cost import WAIT_S, Frame, child_of, read_frames, write_line
-from ros import bag_of, pictures_of, publishing, raw
+from ros import above, bag_of, pictures_of, publishing, raw
 from uplinks import row
 from usage import processor_s
 
@@ -122,7 +122,7 @@ def jpeg_bag(clip: Clip) -> Iterator[list[str]]:
 
 def _bag(clip: Clip, message: Callable[..., Any]) -> list[str]:
     path = bag_of(clip.pictures, clip.fps, clip.directory / message.__name__, [TOPIC], message)
-    return ["source=bag", f"source.bag={path}", f"cameras.{CAMERA}.topic={TOPIC}", _above(clip)]
+    return ["source=bag", f"source.bag={path}", f"cameras.{CAMERA}.topic={TOPIC}", f"fps_max={above(clip.fps):g}"]
 
 
 def ros(version: int) -> Callable[[Clip], object]:
@@ -132,7 +132,7 @@ def ros(version: int) -> Callable[[Clip], object]:
             running(version, clip.directory) as started,
             publishing(started, clip.pictures, clip.fps, clip.directory, TOPIC),
         ):
-            yield ["source=ros", f"cameras.{CAMERA}.topic={TOPIC}", *started.words, _above(clip)]
+            yield ["source=ros", f"cameras.{CAMERA}.topic={TOPIC}", *started.words, f"fps_max={above(clip.fps):g}"]
 
     return published
 
@@ -146,11 +146,6 @@ WAYS = {
     "ros2": ("`ros`: a topic of ROS 2, bgr8", MISSING[2], ros(2)),
     "ros1": ("`ros`: a topic of ROS 1, bgr8", MISSING[1], ros(1)),
 }
-
-
-def _above(clip: Clip) -> str:
-    """Slightly above the rate of the pictures: those beyond are dropped, and clocks are not exact."""
-    return f"fps_max={1.2 * clip.fps:g}"
 
 
 def _jpeg(store: Any, ns: int, picture: np.ndarray) -> Any:
