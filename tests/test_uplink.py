@@ -258,6 +258,16 @@ def test_without_predictions_the_cap_follows_a_link_that_becomes_narrow(kbps: fl
     assert done.kbps(15, 45) >= 0.9 * kbps
 
 
+def test_losses_with_a_short_queue_are_no_sign_of_competing_flows() -> None:
+    """Every report repeats them; three of these would refute a proof that the link has become narrow."""
+    cap = LinkCap(kbps=Fraction(2000), alone=True, most=Most(Fraction(2000), 10), changed=8, measured=10, short=10)
+    for i in range(1, 6):
+        t = 10 + 0.04 * i
+        link = LinkMeasured(t=t, kbps=Fraction(1900), queue_ms=25, loss=0.05, state=LinkState.FILLING, rtt_ms=100)
+        cap = update_cap(cap, link, t, Fraction(4000))
+    assert cap.proofs.times == ()
+
+
 def laps(t: float) -> PositionReported:
     """500 m northwards at 10 m/s, repeatedly."""
     return PositionReported(t=t, lat=48 + 10 * t % 500 / METRES_PER_DEGREE, lon=11)

@@ -74,10 +74,14 @@ class Lowering(NamedTuple):
 
 
 class Proofs(NamedTuple):
-    """When the link seemed to be narrow in the last OFTEN_S, once per long queue, and the most that arrived before."""
+    """When the link seemed to be narrow in the last OFTEN_S, once per long queue.
+
+    most  kbit/s that arrived before the first proof, losses with a short queue included; t: of the last proof
+    """
 
     times: tuple[float, ...]
     most: Kbps
+    t: float
 
 
 class Stall(NamedTuple):
@@ -111,7 +115,7 @@ class LastLimit(NamedTuple):
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
 NOT_LOWERED = Lowering(-float("inf"), Fraction(0))
-NO_PROOFS = Proofs((), Fraction(0))
+NO_PROOFS = Proofs((), Fraction(0), -float("inf"))
 NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
@@ -302,14 +306,17 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
-def _note_proof(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
-    """Count a proof that the link is narrow; many show that it is contested instead, and refute the earlier ones."""
-    times = tuple(each for each in cap.proofs.times if t - each <= OFTEN_S)
-    most = max(cap.proofs.most, cap.most.kbps) if times else cap.most.kbps
-    if times and times[-1] > cap.short:
-        return replace(cap, proofs=Proofs(times, most))
-    cap = replace(cap, proofs=Proofs((*times, t)[-OFTEN:], most))
-    if not _is_contested(cap) or cap.kbps is None:
+def _note_proof(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+    """Count a proof that the link is narrow; many show that it is contested instead, and refute the earlier ones.
+
+    One is counted for each long queue. Losses with a short one repeat in every report, and are not counted.
+    """
+    proofs = cap.proofs
+    times = tuple(each for each in proofs.times if t - each <= OFTEN_S)
+    most = max(proofs.most, cap.most.kbps) if t - proofs.t <= OFTEN_S else cap.most.kbps
+    is_new = not _is_short(link) and not (times and times[-1] > cap.short)
+    cap = replace(cap, proofs=Proofs((*times, t)[-OFTEN:] if is_new else times, most, t))
+    if not is_new or not _is_contested(cap) or cap.kbps is None:
         return cap
     least = _short(CONTESTED * YIELDED * min(most, limit))
     return replace(cap, most=cap.most._replace(kbps=most), kbps=max(cap.kbps, least))
@@ -362,7 +369,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
     is_proof = lossy or _is_narrow(cap, link, t, limit)
     if is_proof and cap.alone:
-        cap = _note_proof(cap, t, limit)
+        cap = _note_proof(cap, link, t, limit)
     most, burst = min(cap.most.kbps, limit), _burst(cap, link, t)
     if is_proof and not burst:
         most = min(most, PROVEN * carried)
