@@ -27,8 +27,8 @@ test: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 timed: $(TEST_READY)
+	$(BIN)/pytest tests/integration -m "alone and not soak" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
-	$(BIN)/pytest tests/integration -m "alone and not soak" -n $$(nproc) --dist worksteal --durations=10
 
 untimed: $(TEST_READY) $(NODE_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units

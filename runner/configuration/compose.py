@@ -26,8 +26,6 @@ KEPT_KEYS = (
     *("device", "address", "clip", "bag", "topic", "capture", "credentials"),
 )
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
-# Groups that Hydra needs only for applications that it launches itself: a tenth of the time.
-HYDRAS_OWN = ("output", "launcher", "sweeper", "help", "hydra_help", "hydra_logging", "job_logging", "env")
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
 
 
@@ -146,17 +144,17 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from runner.configuration.hydra_files import search
+    from runner.configuration.hydra_files import search, without_hydras_own_groups
 
     # OmegaConf's resolver for environment variables is not supported: only files define values.
     OmegaConf.clear_resolver("oc.env")
     search(directories)
     root = find_file(directories, "", "config")
     chosen = {key for key, _ in chosen_by(root)}
-    words = [*(o.hydra(chosen) for o in overrides), *(f"~hydra/{group}" for group in HYDRAS_OWN)]
+    words = [o.hydra(chosen) for o in overrides]
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(directories[-1]), version_base="1.3"):
+        with initialize_config_dir(str(directories[-1]), version_base="1.3"), without_hydras_own_groups():
             config = hydra_compose("config", words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None

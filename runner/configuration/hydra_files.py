@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import deepcopy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.conf import HydraConf
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
 
 from runner.configuration.yaml_file import load_node, read
 
@@ -31,8 +35,7 @@ class CheckedFiles(FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """raises ConfigError"""
         path = Path(self.path) / self._normalize_file_name(config_path)
-        # A copy, since Hydra removes the defaults list and merges other files into it.
-        return ConfigResult(self.provider, self.full_path(), deepcopy(load_node(path)), {"package": read(path).package})
+        return ConfigResult(self.provider, self.full_path(), load_node(path), {"package": read(path).package})
 
 
 class Directories(SearchPathPlugin):
@@ -50,3 +53,21 @@ def search(directories: Sequence[Path]) -> None:
     Directories.directories = directories
     for plugin in (CheckedFiles, Directories):
         Plugins.instance().register(plugin)
+
+
+@contextmanager
+def without_hydras_own_groups() -> Iterator[None]:
+    """Compose without Hydra's launcher, logging and so on, which nothing here uses: they take a fifth of the time."""
+    group = ConfigStore.instance().repo["hydra"]
+    own = group["config.yaml"]
+    group["config.yaml"] = _hydra_without_groups()
+    try:
+        yield
+    finally:
+        group["config.yaml"] = own
+
+
+@cache
+def _hydra_without_groups() -> ConfigNode:
+    node = OmegaConf.structured(HydraConf(defaults=[]))
+    return ConfigNode(name="config.yaml", node=node, package=None, group="hydra", provider="hydra")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Iterator
 from contextlib import suppress
@@ -58,17 +59,21 @@ def label(path: Path) -> str:
 
 
 def load_node(path: Path) -> DictConfig:
-    """Content of a configuration file as Hydra merges it; must not be modified.
+    """Content of a configuration file as Hydra merges it, which the caller may modify.
 
     raises  ConfigError as `load_file`, and if it is not a configuration
     """
     file = read(path)
-    if path not in _nodes or _nodes[path][0] is not file:
-        _nodes[path] = file, _node(path, file.content)
-    return _nodes[path][1]
+    of, pickled = _nodes.get(path, (None, b""))
+    if of is file and pickled:
+        node: DictConfig = pickle.loads(pickled)  # takes a third of the time of a deep copy
+        return node
+    node = _node(path, file.content)
+    _nodes[path] = file, pickle.dumps(node, pickle.HIGHEST_PROTOCOL) if of is file else b""
+    return node
 
 
-_nodes: dict[Path, tuple[YamlFile, DictConfig]] = {}  # by path, the content read and its node
+_nodes: dict[Path, tuple[YamlFile, bytes]] = {}  # by path, the content read and, from the second time on, its node
 
 
 def _node(path: Path, content: Any) -> DictConfig:

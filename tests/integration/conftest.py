@@ -1,8 +1,8 @@
 """Everything here needs GStreamer, and most of it depends on real time.
 
-`pytest -m "not gst"` leaves out the tests that need GStreamer. `make test` runs those marked `timed`, a few files at a
-time, then those marked `alone`, whose limits are tight, three at a time. Everything else runs on the processor
-time that these leave over.
+`pytest -m "not gst"` leaves out the tests that need GStreamer. `make test` runs those marked `alone`, whose limits are
+tight, at most two drives and one other test at a time, then those marked `timed`, a few files at a time. All others
+run on the processor time that these leave over.
 """
 
 from collections.abc import Iterator
@@ -30,6 +30,9 @@ LONGEST = (
     "test_ip_camera",
 )
 
+# Files of drives among the tests marked `alone`: those of a group run one after the other.
+DRIVES = {"test_link": "1", "test_feedback": "1", "test_live": "2", "test_page_sides": "2"}
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {name: place for place, name in enumerate(LONGEST)}
@@ -38,7 +41,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("gst")
-    if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
+    if item.get_closest_marker("alone"):
+        if item.path.stem in DRIVES:
+            item.add_marker(pytest.mark.xdist_group(DRIVES[item.path.stem]))
+    elif item.path.stem not in UNTIMED:
         item.add_marker("timed")
 
 
