@@ -79,7 +79,7 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
         (("graph.effort=most",), "'most': must be one of lowest, low, medium, high, did you mean lowest?"),
         (
             ("graph.effort=high", "~graph.efforts.high"),
-            "high: must be lowest or low or medium, which this graph's encoder supports",
+            "high: must be one of lowest, low, medium, which this graph's encoder supports",
         ),
         (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],

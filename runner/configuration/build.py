@@ -443,7 +443,8 @@ def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
     known = list(efforts) if is_used else [ONLY_EFFORT]
     effort = data.get("effort", ONLY_EFFORT)
     if effort not in known:
-        raise ModelError("effort", effort, f"must be {' or '.join(known)}, which this graph's encoder supports")
+        expected = f"one of {', '.join(known)}" if known[1:] else known[0]
+        raise ModelError("effort", effort, f"must be {expected}, which this graph's encoder supports")
     return dict(efforts.get(effort, {}))
 
 

@@ -30,8 +30,22 @@ LONGEST = (
     "test_ip_camera",
 )
 
-# Files of drives among the tests marked `alone`: those of a group run one after the other.
+# Files of drives among the tests marked `alone`, in two groups: the tests of a group run one after the other.
 DRIVES = {"test_link": "1", "test_feedback": "1", "test_live": "2", "test_page_sides": "2"}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    if config.getvalue("dist") != "loadgroup":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByGroup(LoadScopeScheduling):
+        # xdist's own loadgroup appends groups to node ids, which pytest 9 ignores.
+        def _split_scope(self, nodeid: str) -> str:
+            return DRIVES.get(Path(nodeid.partition("::")[0]).stem, nodeid)
+
+    return ByGroup(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -41,10 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("gst")
-    if item.get_closest_marker("alone"):
-        if item.path.stem in DRIVES:
-            item.add_marker(pytest.mark.xdist_group(DRIVES[item.path.stem]))
-    elif item.path.stem not in UNTIMED:
+    if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
         item.add_marker("timed")
 
 
