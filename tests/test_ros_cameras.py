@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from dataclasses import replace
 
 import pytest
@@ -14,7 +15,7 @@ from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
 from runner.ros.cameras import CameraStream
 from runner.ros.node import pictures, ros1
-from runner.ros.process import check_discovery
+from runner.ros.process import NodeProcess, check_discovery
 
 WORDS = ["vehicle=delivery_robot", "source=ros", "fps_max=10"]
 TOPICS = [f"cameras.{name}.topic=/{name}" for name in ("front", "rear", "mast")]
@@ -236,3 +237,23 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
         counted.add(None, None)
     lost = "1 of 10 pictures were lost, 1 between publisher and node, 0 since the node ran late"
     assert losses(monkeypatch, [], lost_in_transport=1, counted=counted).startswith(lost)
+
+
+def test_a_node_is_started_again_after_any_error(monkeypatch):
+    monkeypatch.setattr("runner.ros.process.RETRY_S", (0.0, 0.0))
+    reports, again = [], threading.Event()
+    node = NodeProcess(configuration([*WORDS, *TOPICS]).vehicle().ros, print, lambda _, text: reports.append(text))
+
+    def run_once():
+        if not reports:
+            raise OSError(24, "Too many open files")
+        again.set()
+        node._closing.wait(10)
+        return "ended"
+
+    node._run_once = run_once
+    node._tried.set()  # it has worked before
+    node._thread.start()
+    assert again.wait(10)
+    node.close()
+    assert reports == ["the ROS node ended: OSError: [Errno 24] Too many open files; starting it again"]

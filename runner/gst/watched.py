@@ -13,6 +13,7 @@ from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.source import fixed_rate
+from runner.system.backoff import pause_s
 
 CHECK_MS = 100
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
@@ -125,8 +126,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         """After an attempt that has not delivered a frame yet."""
         if self._error:
             self.outage.report_failure(f"source: {self._error}", self._progress[1])
-        first, longest = BACKOFF_S
-        pause = min(first * 2 ** (self._attempts - 1), longest)
+        pause = pause_s(self._attempts - 1, *BACKOFF_S)
         if now - self._last_attempt[1] > (pause if self._error else max(pause, FIRST_FRAME_S)):
             self._replace(now)
 

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from runner.errors import RunError, UserError
 from runner.ros.node.port import MAX_MESSAGE_BYTES, shared_memory
 from runner.security.exposure import is_loopback
 from runner.system import children
+from runner.system.backoff import pause_s
 
 START_S = 30.0  # the node usually starts within a second, but takes much longer while a machine boots
 RETRY_S = (1.0, 10.0)  # between two starts: exponential backoff from the first value up to the second
@@ -188,7 +189,10 @@ class NodeProcess:
         """Main loop of the thread; it must live as long as the processes that it starts, see `children.bound`."""
         failed = 0
         while not self._closing.is_set():
-            why = self._run_once()
+            try:
+                why = self._run_once()
+            except Exception as error:  # the thread must continue: nothing else starts the node again
+                why = f"{type(error).__name__}: {error}"
             if self._closing.is_set():
                 return
             failed = 0 if self._is_ready else failed + 1
@@ -196,8 +200,7 @@ class NodeProcess:
             if not self._tried.is_set():
                 self._tried.set()
                 return
-            first, longest = RETRY_S
-            self._closing.wait(min(first * 2**failed, longest))
+            self._closing.wait(pause_s(failed, *RETRY_S))
 
     def _fail(self, why: str) -> None:
         if why != self._fault:
@@ -209,7 +212,7 @@ class NodeProcess:
         """Start a process and serve it until it ends; returns why it did."""
         self._is_ready, self._fatal = False, ""
         own, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with own, its:
+        with ExitStack() as stack, own, its:
             own.send(json.dumps(self._task).encode())
             process = subprocess.Popen(
                 children.bound([self._settings.interpreter, "-P", str(SCRIPT), str(its.fileno())]),
@@ -220,14 +223,16 @@ class NodeProcess:
                 pass_fds=[its.fileno()],
                 start_new_session=True,
             )
+            stack.callback(children.end, process, END_S)  # once the connection is closed
             its.close()
             with self._lock:
                 self._socket = None if self._closing.is_set() else own
-            if self._socket:
-                self._receive(own)
-            with self._lock:
-                self._socket = None
-        children.end(process, END_S)
+            try:
+                if self._socket:
+                    self._receive(own)
+            finally:
+                with self._lock:
+                    self._socket = None
         return self._fatal or children.ending(process.wait())
 
     def _receive(self, own: socket.socket) -> None:
