@@ -55,3 +55,14 @@ def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("text", [b'"\\ud800"', b'"\\uDFFF x"', b'"\xed\xa0\x80"', b'"\\ude00\\ud83d"'])
+def test_text_that_is_not_unicode_is_refused(text: bytes) -> None:
+    """It cannot be printed: one message would end the operator's side."""
+    with pytest.raises(ValueError, match="contains half of a surrogate pair"):
+        read_message(b'{"online": [' + text + b"]}")
+
+
+def test_pairs_are_one_character() -> None:
+    assert read_message(b'{"a": "\\ud83d\\ude00 \xf0\x9f\x98\x80"}') == {"a": "\U0001f600 \U0001f600"}
