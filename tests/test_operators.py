@@ -76,6 +76,17 @@ def test_control_passes_when_only_its_holder_is_silent() -> None:
     assert operators.in_control == "onlooker"
 
 
+def test_control_passes_when_its_holder_may_no_longer_have_it() -> None:
+    """An operator whose keys were revoked may go on sending reports until the broker drops it."""
+    revoked = set[str]()
+    operators = Operators(1.0, lambda name: name not in revoked)
+    operators.connected("driver", 0.0)
+    operators.connected("other", 1.0)
+    revoked.add("driver")
+    operators.message_received("driver", 5.0)
+    assert operators.in_control == "other"
+
+
 def test_control_passes_after_an_outage_if_its_holder_does_not_return() -> None:
     operators = Operators(1.0)
     operators.connected("driver", 0.0)

@@ -54,14 +54,16 @@ class Operators:
         """Control stays with an operator while it is present, then passes to the one that has been present longest.
 
         An operator that falls silent keeps control until another one has been present for SILENT_S since. If all fell
-        silent, the link was down, and the first one to return must not take control from the one that drives.
+        silent, the link was down, and the first one to return must not take control from the one that drives. One that
+        may no longer be in control, as its keys were revoked, loses it immediately.
         """
         present = {name: o.since for name, o in self._known.items() if o.present and self._may_control(name)}
         if not present or self._control in present:
             return
         longest = min(present, key=lambda name: present[name])
         last = self._known.get(self._control)
-        if last is None or last.signed_off or t - max(last.last_message, present[longest]) >= SILENT_S:
+        revoked = not self._may_control(self._control)
+        if last is None or last.signed_off or revoked or t - max(last.last_message, present[longest]) >= SILENT_S:
             self._control = longest
 
     def connected(self, name: str, t: float) -> bool:
