@@ -24,7 +24,8 @@ from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
-from runner.page.server import PageServer
+from runner.page.login import PageLogin
+from runner.page.server import PageServer, hosts
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, Outcome, Position, Sample
 
@@ -52,13 +53,14 @@ def sent(viewer):
 
 
 @contextmanager
-def served(*overrides, layouts=None):
-    """Port of a page, and its station."""
+def served(*overrides, layouts=None, login=None):
+    """Port of a page, and its station; with a login, browsers must expect HTTPS, although it is not encrypted."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     station = SimpleNamespace(state=None, note=print, answer_s=1.0, attention=None)
     page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts)
+    page._login = login
     page.start()
     try:
         yield port, station
@@ -74,6 +76,28 @@ def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
         with suppress(ConnectionResetError):
             while line.recv(65536):  # the response to the finished request, then the end
                 pass
+
+
+def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
+    """The body is read before anybody has logged in."""
+    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    login = PageLogin(lambda: b"token")
+    with served(login=login) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
+        line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 100\r\n\r\n".encode())
+        assert line.recv(1) == b""
+
+
+@pytest.mark.parametrize(
+    ("port", "scheme", "accepted"),
+    [
+        (8090, "https", {"station.example.org:8090", "10.0.0.1:8090"}),
+        (443, "https", {"station.example.org", "10.0.0.1", "station.example.org:443", "10.0.0.1:443"}),
+        (443, "http", {"station.example.org:443", "10.0.0.1:443"}),
+    ],
+)
+def test_a_page_is_known_by_the_names_that_browsers_send(port, scheme, accepted):
+    assert hosts(("Station.example.org", "10.0.0.1"), port, scheme) == accepted
 
 
 @pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])

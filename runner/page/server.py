@@ -10,7 +10,7 @@ import ssl
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -47,6 +47,7 @@ REPORTED = tuple(attention.value for attention in Attention if attention is not 
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
 STOP_S = 0.5  # how long open connections may take to close
+DEFAULT_PORTS = {"http": 80, "https": 443}
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
 PING_S = 0.5
 SILENT_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
@@ -214,10 +215,11 @@ class PageServer(Listener):
         rebinding).
         """
         sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
-        allowed = {f"{name}:{sockname[1]}" for name in self._names}
         scheme, origin = "https" if self._login else "http", request.headers.get("Origin")
+        allowed = hosts(self._names, sockname[1], scheme)
         foreign = origin is not None and origin not in {f"{scheme}://{name}" for name in allowed}
-        if request.headers.get("Host") not in allowed or foreign or (request.method == "POST" and origin is None):
+        host = request.headers.get("Host", "").lower()
+        if host not in allowed or foreign or (request.method == "POST" and origin is None):
             raise web.HTTPForbidden(text="accepted only from this server's own pages\n")
         if not self._has_access(request):
             if request.path == "/":
@@ -236,7 +238,11 @@ class PageServer(Listener):
     async def _on_login(self, request: web.Request) -> web.Response:
         assert self._login
         try:
-            document = read_message(await request.read())
+            async with asyncio.timeout(REQUEST_S):
+                document = read_message(await request.read())
+        except TimeoutError:
+            request.protocol.force_close()
+            raise web.HTTPRequestTimeout from None
         except ValueError as problem:
             raise web.HTTPBadRequest(text=f"{problem}\n") from None
         challenge, answer = (str(document.get(key, "")) for key in ("challenge", "answer"))
@@ -464,6 +470,12 @@ class PageServer(Listener):
         if not problem:
             self._broadcast("layout", self._layout())
         answer("refused" if problem else "applied", problem)
+
+
+def hosts(names: Iterable[str], port: int, scheme: str) -> set[str]:
+    """What browsers send as Host: a name in lower case, without the port if it is the scheme's own."""
+    known = {name.lower() for name in names}
+    return {f"{name}:{port}" for name in known} | (known if port == DEFAULT_PORTS[scheme] else set())
 
 
 def _recent(camera: Camera) -> RecentUnits:
