@@ -249,7 +249,7 @@ class VehicleSide:
                 self._wanted[name] |= values
             pipeline = self._pipeline(name)
             if pipeline:
-                pipeline.turn(self._wanted_of(name), values)
+                pipeline.turn(values)
 
     def copies(self) -> dict[str, int]:
         """By camera, the number of viewers outside the vehicle: each is sent a copy of the stream."""
@@ -339,7 +339,7 @@ class VehicleSide:
         return CameraPipeline(
             pipeline,
             plan,
-            self._wanted_of(name),
+            lambda: self._wanted_of(name),
             self._on_knobs_turned,
             lambda what: self._on_report(name, what),
             source,

@@ -28,7 +28,7 @@ CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with 
 class CameraPipeline:
     """Sets up a newly built pipeline, then turns its knobs.
 
-    wanted     the wanted knob values
+    wanted     returns the wanted knob values
     on_turned  called, from any thread, after knobs were set
     on_report  called, from a streaming thread, with a fault of the source, and on its recovery
     source     the source, if it is watched
@@ -40,13 +40,13 @@ class CameraPipeline:
         self,
         pipeline: Gst.Bin,
         plan: Plan,
-        wanted: Mapping[str, KnobValue],
+        wanted: Callable[[], Mapping[str, KnobValue]],
         on_turned: Callable[[], None],
         on_report: Callable[[str], None],
         source: WatchedSource | None = None,
     ) -> None:
         self._pipeline, self._plan, self._source = pipeline, plan, source
-        self._wanted = wanted
+        self._wanted, self._first = wanted, wanted()
         self.untimed = False
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
         if plan.loops:
@@ -62,7 +62,7 @@ class CameraPipeline:
         self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._add_capture_time(last.get_parent_element())
-        self.knobs.set_now(self._allowed(wanted))
+        self.knobs.set_now(self._allowed(self._first))
         last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
         last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
 
@@ -72,12 +72,15 @@ class CameraPipeline:
         failed = self._source.outage.reason if self._source else None
         return failed or self._repeats.outage.reason
 
-    def turn(self, wanted: Mapping[str, KnobValue], changed: Mapping[str, KnobValue]) -> None:
-        """Set the knobs to the wanted values; `changed` has the new ones."""
-        self._wanted = wanted
+    def turn(self, changed: Mapping[str, KnobValue]) -> None:
+        """Set the knobs whose wanted values have changed."""
         allowed = self._allowed(changed)
         if allowed:
             self.knobs.turn(allowed)
+
+    def catch_up(self) -> None:
+        """Set the knobs that were turned while the pipeline was built, before `turn` could reach it."""
+        self.turn({knob: value for knob, value in self._wanted().items() if self._first.get(knob) != value})
 
     def _allowed(self, values: Mapping[str, KnobValue]) -> Mapping[str, KnobValue]:
         """Until the first frame has been sent, `sending` is not changed.
@@ -156,8 +159,9 @@ class CameraPipeline:
     def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         self._started = True
         self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _drop_reconfigure)
-        if "sending" in self._wanted:
-            self.knobs.turn({"sending": self._wanted["sending"]})
+        wanted = self._wanted()
+        if "sending" in wanted:
+            self.knobs.turn({"sending": wanted["sending"]})
         return Gst.PadProbeReturn.REMOVE
 
     def _add_capture_time(self, payloader: Gst.Element) -> None:

@@ -213,6 +213,7 @@ class CameraServer:
         with self._changed:
             camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
             self.pipelines[camera.name] = built
+        built.catch_up()
         media.connect(MEDIA_ERROR, _on_media_error, camera)
         media.connect("prepared", self._on_prepared, camera)
         media.connect("target-state", self._on_target_state, camera)

@@ -169,6 +169,7 @@ class CameraCaller:
         if self._passphrase:
             encrypt(pipeline, self._passphrase)
         self.pipeline = self._build(pipeline, self._plan)
+        self.pipeline.catch_up()
         caller = pipeline.get_by_name(self._plan.vehicle[-1].name)
         self._acknowledgements = _AcknowledgementWatch(caller)
         return caller.get_static_pad("sink")

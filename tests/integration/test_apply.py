@@ -14,6 +14,7 @@ from rig import CLIPS, NOISE, Client, streaming, until, watching
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.errors import RunError
+from runner.gst.knobs import KnobPanel
 
 CAMERA = "front_left"
 
@@ -34,6 +35,24 @@ def test_size_changes_without_a_break():
             assert client.errors == []
             assert side.applied()[CAMERA] == {"size": (480, 260), "bitrate": 545}
             assert side.faults() == []
+
+
+def test_a_knob_turned_while_a_pipeline_is_built_is_set(monkeypatch):
+    """A pipeline is built for the first viewer, and takes milliseconds, in which a decision may change."""
+    set_now = KnobPanel.set_now
+
+    def turned_meanwhile(self, values):
+        set_now(self, values)
+        turn(sides[0], bitrate=777, size=(240, 130))
+
+    sides = []
+    with streaming() as (side, _, (plan,), _reported):
+        sides.append(side)
+        turn(side, size=(480, 260), bitrate=545)
+        monkeypatch.setattr(KnobPanel, "set_now", turned_meanwhile)
+        with watching(plan) as client:
+            until(lambda: client.sizes[-1:] == [(240, 130)])
+            assert side.applied()[CAMERA]["bitrate"] == 777
 
 
 def test_bitrate_is_read_back_and_on_the_wire():
