@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from runner.operator.meter import ReceptionMeter, middle, percentile
+from runner.operator.meter import MOST_WINDOWS, ReceptionMeter, middle, percentile
 
 
 @dataclass
@@ -53,14 +53,14 @@ def test_windows_count_once_the_decision_is_settled() -> None:
     meter = ReceptionMeter(fps=20)
     feed(meter, 5, decided=Decided())
     assert meter.windows == 4  # at 1.5, 2.5, 3.5 and 4.5 s
-    assert meter.followed == [pytest.approx(1.0)] * 4
-    assert (meter.short, meter.sizes, meter.latencies_ms) == (0, {(480, 260): 4}, [12.0] * 4)
+    assert list(meter.followed) == [pytest.approx(1.0)] * 4
+    assert (meter.short, meter.sizes, list(meter.latencies_ms)) == (0, {(480, 260): 4}, [12.0] * 4)
 
 
 def test_windows_that_fall_short_of_the_decision_are_counted() -> None:
     meter = ReceptionMeter(fps=40)
     feed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
-    assert meter.followed == [pytest.approx(0.5)] * 4
+    assert list(meter.followed) == [pytest.approx(0.5)] * 4
     assert (meter.short, meter.sizes) == (4, {})
 
 
@@ -75,6 +75,14 @@ def test_a_new_decision_has_time_to_settle() -> None:
     for sample in range(13):
         meter.add(sample / 4, Counters(5 * sample, 25_000 * sample), Decided(kbps=800 + sample // 4))
     assert meter.windows == 0
+
+
+def test_memory_does_not_grow_for_weeks() -> None:
+    meter = ReceptionMeter(fps=20)
+    for t in range(MOST_WINDOWS + 100):
+        meter.add(t, Counters(20 * t, 100_000 * t), Decided())
+    assert meter.windows > MOST_WINDOWS
+    assert len(meter.followed) == len(meter.latencies_ms) == MOST_WINDOWS
 
 
 def test_percentiles() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Protocol
 
 WINDOW_S = 1.0
+MOST_WINDOWS = 10_800  # three hours: a side may run for weeks
 SETTLE_S = 1.5  # a window is compared only if the decision is older: window length plus settling of the rate control
 
 
@@ -68,12 +69,13 @@ class MeasuredRates:
 class ReceptionMeter:
     """Watches one camera: rates over a sliding window, and how well reception follows the decisions.
 
-    followed  kbit/s received over kbit/s allocated, one entry per settled window
+    followed  kbit/s received over kbit/s allocated, one entry per settled window, of the last MOST_WINDOWS; likewise
+              latencies_ms
     """
 
     fps: float
-    followed: list[float] = field(default_factory=list)
-    latencies_ms: list[float] = field(default_factory=list)
+    followed: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_WINDOWS))
+    latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_WINDOWS))
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that were received, with counts
     short: int = 0  # settled windows with too few frames for the camera's rate
     windows: int = 0
@@ -122,5 +124,5 @@ def percentile(values: Iterable[float], share: float) -> float | None:
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
 
 
-def middle(values: list[float]) -> float | None:
+def middle(values: Collection[float]) -> float | None:
     return median(values) if values else None
