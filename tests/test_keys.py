@@ -95,6 +95,18 @@ def test_vehicle_and_operator_derive_the_same_passwords(authority):
     assert {name: person.role for name, person in car.people().items()} == {f"a-{role}": role for role in PEOPLE}
 
 
+def test_an_empty_secret_is_none_and_the_last_one_stays_in_force(authority, monkeypatch):
+    """A file that is copied in place is empty for a moment; anybody could compute what is derived from nothing."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    ring, notes = Keyring.of(authority.directory / "a-controller"), []
+    token, known = ring.watched_token(notes.append), ring.read(keyring.TOKEN)
+    (ring.directory / keyring.TOKEN).write_bytes(b"")
+    with pytest.raises(UserError, match=f"{keyring.TOKEN}: .*: is empty"):
+        ring.read(keyring.TOKEN)
+    assert token.get() == known
+    assert [note.endswith("is empty; the previous content stays in force") for note in notes] == [True]
+
+
 def test_issuing_again_changes_nothing(authority):
     before = certificate(authority, "car").serial_number
     assert not authority.issue("car", Role.VEHICLE, [])

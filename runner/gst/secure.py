@@ -7,6 +7,7 @@ not by the address at which it is reached.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from secrets import token_urlsafe
 
 from cryptography import x509
 from cryptography.x509.oid import NameOID
@@ -89,12 +90,15 @@ class StreamLogin:
 
         returns  why it cannot connect, for example while new files are being copied; None if it can
         """
+        is_rtsp = client.find_property("tls-interaction")
         try:
-            if client.find_property("tls-interaction"):
+            if is_rtsp:
                 self._prepare_rtsp(client)
             else:
                 encrypt(pipeline, srt_passphrase(self._keyring.read(MEDIA_SECRET), self._vehicle))
         except (RunError, UserError, GLib.Error) as error:
+            if not is_rtsp:
+                encrypt(pipeline, token_urlsafe())  # that nobody knows: without one, anybody could connect
             return str(error)
         return None
 

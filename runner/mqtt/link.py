@@ -18,7 +18,7 @@ from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.core.model import Endpoint
-from runner.errors import RunError
+from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
 
@@ -52,7 +52,7 @@ class _Client(Client):
             except Exception as error:
                 self.on_broken(error)
                 time.sleep(RETRY_S[-1])
-                with suppress(OSError):  # the loop tries again
+                with suppress(Exception):  # the loop tries again, and reports what fails
                     self.reconnect()
 
 
@@ -180,11 +180,18 @@ class ControlLink:
     def _log_in(self, client: Client, _data: object) -> None:
         """Use the current keys, which may have been replaced since the last connection."""
         assert self._login
-        client.username_pw_set(self._login.user, self._login.refresh())
+        try:
+            client.username_pw_set(self._login.user, self._login.refresh())
+        except UserError as error:
+            raise ConnectionError(str(error)) from None  # the loop tries again after an OSError only
 
     def _check_broker(self, client: Client, data: object, sock: Any) -> None:
         assert self._login
-        self._login.check(sock)
+        try:
+            self._login.check(sock)
+        except RunError as error:
+            sock.close()  # nothing that this peer sends is read
+            raise ConnectionError(str(error)) from None
         _configure_socket(client, data, sock)
 
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:

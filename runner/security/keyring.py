@@ -184,9 +184,12 @@ class Keyring:
         raises  UserError
         """
         try:
-            return read_file(self.directory / name, MOST_BYTES).strip()
+            content = read_file(self.directory / name, MOST_BYTES).strip()
         except ValueError as error:
             raise UserError("keys", name, str(self.directory), str(error)) from None
+        if not content:  # for example while it is being copied; anybody could compute what is derived from it
+            raise UserError("keys", name, str(self.directory), "is empty")
+        return content
 
     def revoked(self) -> frozenset[int]:
         """Serial numbers of revoked certificates."""

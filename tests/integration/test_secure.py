@@ -6,6 +6,7 @@ import json
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -19,8 +20,11 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
+from runner.gst.secure import StreamLogin
 from runner.link import Limit, limited_link
 from runner.mqtt.broker import private_broker
+from runner.mqtt.link import ControlLink
+from runner.mqtt.login import Login
 from runner.operator.live import live_operator
 from runner.records import Sample
 from runner.security import keyring
@@ -335,6 +339,44 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
     }
     secret = (keys / "alice" / keyring.SECRET).read_text()
     assert not any(secret in what for what in reports)
+
+
+def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):
+    """A listener without a passphrase would show the pictures of anybody who connects."""
+    from gi.repository import Gst
+
+    passphrases = []
+    monkeypatch.setattr("runner.gst.secure.encrypt", lambda _, passphrase: passphrases.append(passphrase))
+    login = StreamLogin(Keyring.of(keys / "alice"), NAME, print)
+    (keys / "alice" / keyring.MEDIA_SECRET).unlink()
+    pipeline = Gst.parse_launch("srtsrc name=client ! fakesink")
+    for _ in range(2):
+        assert "no such file" in login.prepare(pipeline, pipeline.get_by_name("client"))
+    assert len(set(passphrases)) == 2
+    assert all(10 <= len(passphrase) <= 79 for passphrase in passphrases)
+
+
+def test_a_peer_that_is_not_the_broker_is_left_until_the_broker_is_back(keys):
+    impostor = keys.parent / "impostor"
+    shutil.copytree(keys / "broker", impostor)
+    for name in (keyring.CERTIFICATE, keyring.KEY):
+        shutil.copy(keys / "alice" / name, impostor)
+    endpoint, notes, connected = Endpoint("127.0.0.1", free_port()), [], threading.Event()
+    will = (f"tod/{NAME}/state", {"online": False})
+    login = Login(Keyring.of(keys / NAME), notes.append)
+    attempts, check = [], login.check
+    login.check = lambda connection: (attempts.append(1), check(connection))
+    listen = {f"tod/{NAME}/request/+": print}
+    link = ControlLink(endpoint, will, listen, lambda is_up: is_up and connected.set(), notes.append, login)
+    with private_broker(endpoint, impostor):
+        link.connect()
+        until(lambda: len(attempts) > 3)
+        assert not connected.is_set()
+    with private_broker(endpoint, keys / "broker"):
+        assert connected.wait(20), notes
+    link.close()
+    refused = "the peer is not the broker: its certificate is of another role; retrying"
+    assert len([note for note in notes if note.endswith(refused)]) == 1
 
 
 def test_an_operator_knows_its_vehicle(keys):
