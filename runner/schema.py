@@ -147,7 +147,7 @@ def referred(reference: str, schema: str) -> tuple[Any, str]:
 def read_json(text: str | bytes) -> Any:
     """Parse untrusted JSON; numbers must be finite: NaN, Infinity and 1e999 are rejected.
 
-    raises  ValueError, also if it is nested deeper than any of our messages, or contains text that is not Unicode
+    raises  ValueError, also if it is nested deeper than any of our messages
     """
     try:
         document = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
@@ -156,16 +156,7 @@ def read_json(text: str | bytes) -> Any:
     brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
     if brackets > DEEPEST_JSON and _depth(document) > DEEPEST_JSON:
         raise ValueError("nested too deeply")
-    if _may_hold_surrogates(text):
-        try:
-            json.dumps(document, ensure_ascii=False).encode()
-        except UnicodeEncodeError:
-            raise ValueError("contains half of a surrogate pair") from None
     return document
-
-
-def _may_hold_surrogates(text: str | bytes) -> bool:
-    return bool(re.search(r"\\u[dD]", text) if isinstance(text, str) else re.search(rb"\\u[dD]|\xed[\xa0-\xbf]", text))
 
 
 def _depth(document: Any) -> int:

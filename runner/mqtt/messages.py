@@ -19,6 +19,7 @@ operator_disconnected. schemas/control.schema.json describes the vehicle's messa
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping
@@ -39,6 +40,7 @@ from runner.schema import message_problem, read_json
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
+_SURROGATE = re.compile(rb"\\u[dD]|\xed[\xa0-\xbf]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
@@ -92,6 +94,11 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
         raise ValueError(f"not JSON: {error}") from None
     if not isinstance(document, dict):
         raise ValueError("must be a mapping with id and event")
+    if _SURROGATE.search(payload):
+        try:
+            json.dumps(document, ensure_ascii=False).encode()
+        except UnicodeEncodeError:  # it could not be printed
+            raise ValueError("contains half of a surrogate pair") from None
     return document
 
 
