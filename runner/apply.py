@@ -219,7 +219,7 @@ class VehicleSide:
         keyring: Keyring | None = None,
     ) -> None:
         self._on_report, self._video = on_report, video
-        passphrase = keyring.passphrase if keyring else None
+        passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_video(plans, video, "vehicle")
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}

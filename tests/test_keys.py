@@ -107,6 +107,30 @@ def test_an_empty_secret_is_none_and_the_last_one_stays_in_force(authority, monk
     assert [note.endswith("is empty; the previous content stays in force") for note in notes] == [True]
 
 
+@pytest.mark.parametrize("action", ["rotate", "revoke"])
+@pytest.mark.parametrize(("name", "changes"), [("a-watcher", True), ("car", True), ("a-predictor", False)])
+def test_srt_gets_a_new_secret_with_the_keys_that_reveal_it(authority, action, name, changes):
+    """SRT has no certificates: whoever knows the passphrase may watch, or send."""
+    authority.issue("truck", Role.VEHICLE, [])
+    files = (
+        authority.directory / "a-controller" / keyring.MEDIA_SECRET,
+        authority.directory / "truck" / "srt.passphrase",
+    )
+    before = [file.read_bytes() for file in files]
+    getattr(authority, action)(name)
+    secret, passphrase = (file.read_bytes() for file in files)
+    assert [secret != before[0], passphrase != before[1]] == [changes, changes]
+    assert passphrase.decode() == keyring.srt_passphrase(secret, "truck")
+
+
+def test_hosts_that_no_certificate_can_name_change_nothing(authority):
+    before = certificate(authority, "car").serial_number
+    with pytest.raises(UserError, match=r"host: münchen\.example: must be addresses or names in ASCII"):
+        authority.issue("car", Role.VEHICLE, ["münchen.example"])
+    assert certificate(authority, "car").serial_number == before
+    assert [each.revoked for each in authority.holders() if each.name == "car"] == [None]
+
+
 def test_issuing_again_changes_nothing(authority):
     before = certificate(authority, "car").serial_number
     assert not authority.issue("car", Role.VEHICLE, [])

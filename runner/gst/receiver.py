@@ -161,8 +161,8 @@ class Receiver:
             self._foreign_reported = True
             self._on_report(self._name, "packets from hosts other than the vehicle are dropped")
         now = time.monotonic()
-        if self._login and self._login.is_withdrawn():
-            self._supervised.restart("the vehicle's keys are no longer accepted")
+        if self._login and (withdrawn := self._login.withdrawn()):
+            self._supervised.restart(withdrawn)
         expected = self._was_expected = self._is_expected()
         if not expected:
             self._last_unexpected = now

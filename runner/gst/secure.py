@@ -16,7 +16,7 @@ from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
-from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, rtsp_password, srt_passphrase
+from runner.security.keyring import Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
 VIEWER = "viewer"  # role in the server library that may open and watch a camera
 
@@ -84,6 +84,9 @@ class StreamLogin:
         self._keyring, self._vehicle, self._expected = keyring, vehicle, Holder(vehicle, Role.VEHICLE)
         self._check = PeerCheck(keyring, on_report)
         self._accepted: Gio.TlsCertificate | None = None  # the last one
+        self._on_report = on_report
+        self._media_secret: Watched[bytes] | None = None  # of SRT
+        self._used = b""  # the secret of the last pipeline
 
     def prepare(self, pipeline: Gst.Bin, client: Gst.Element) -> str | None:
         """Set up a new pipeline and its client with the current keys.
@@ -95,7 +98,9 @@ class StreamLogin:
             if is_rtsp:
                 self._prepare_rtsp(client)
             else:
-                encrypt(pipeline, srt_passphrase(self._keyring.read(MEDIA_SECRET), self._vehicle))
+                self._media_secret = self._media_secret or self._keyring.watched_media_secret(self._on_report)
+                self._used = self._media_secret.get()
+                encrypt(pipeline, srt_passphrase(self._used, self._vehicle))
         except (RunError, UserError, GLib.Error) as error:
             if not is_rtsp:
                 encrypt(pipeline, token_urlsafe())  # that nobody knows: without one, anybody could connect
@@ -115,9 +120,11 @@ class StreamLogin:
         self._accepted = certificate if self._check.verify(certificate) == self._expected else None
         return self._accepted is not None
 
-    def is_withdrawn(self) -> bool:
-        """Whether the certificate that the vehicle uses has been revoked."""
-        return self._accepted is not None and isinstance(self._check.holder(self._accepted), str)
+    def withdrawn(self) -> str | None:
+        """Why the stream must end: a revoked certificate of the vehicle, or a new secret of SRT; None: it need not."""
+        if self._accepted is not None and isinstance(self._check.holder(self._accepted), str):
+            return "the vehicle's keys are no longer accepted"
+        return "there are new keys" if self._media_secret and self._media_secret.get() != self._used else None
 
 
 class ViewerCheck:

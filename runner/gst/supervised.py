@@ -140,34 +140,42 @@ class CameraCaller:
     """One camera's supervised pipeline on the vehicle.
 
     build       makes a `CameraPipeline` from each new pipeline
-    passphrase  that encrypts the stream; None: it is not encrypted
+    passphrase  returns what encrypts the stream, and may change; None: it is not encrypted
     """
 
     def __init__(
-        self, plan: Plan, build: Build, on_report: Callable[[str, str], None], passphrase: str | None = None
+        self,
+        plan: Plan,
+        build: Build,
+        on_report: Callable[[str, str], None],
+        passphrase: Callable[[], str] | None = None,
     ) -> None:
         self._plan, self._build, self._passphrase = plan, build, passphrase
+        self._used = ""  # the passphrase of the current pipeline
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: on_report(name, what))
 
     def start(self) -> None:
         self._supervised.start()
-        self._watch = GLib.timeout_add(WATCH_MS, self._check_acknowledgements)
+        self._watch = GLib.timeout_add(WATCH_MS, self._check)
 
     def stop(self) -> None:
         GLib.source_remove(self._watch)
         self.pipeline = None
         self._supervised.stop()
 
-    def _check_acknowledgements(self) -> bool:
-        if self._acknowledgements.are_missing(time.monotonic()):
+    def _check(self) -> bool:
+        if self._passphrase and self._passphrase() != self._used:
+            self._supervised.restart("there are new keys")
+        elif self._acknowledgements.are_missing(time.monotonic()):
             self._supervised.restart(f"nothing was acknowledged for {UNACKNOWLEDGED_S:g} s")
         return True
 
     def _on_built(self, pipeline: Any) -> Gst.Pad:
         if self._passphrase:
-            encrypt(pipeline, self._passphrase)
+            self._used = self._passphrase()
+            encrypt(pipeline, self._used)
         self.pipeline = self._build(pipeline, self._plan)
         self.pipeline.catch_up()
         caller = pipeline.get_by_name(self._plan.vehicle[-1].name)

@@ -115,6 +115,7 @@ class Authority:
         raises  UserError for an unknown name
         """
         known = self._known(name, "rotate")
+        self._renew_media_secret(known.role)
         self._renew(known.name, known.role, known.hosts)
 
     def revoke(self, name: str) -> None:
@@ -122,7 +123,7 @@ class Authority:
 
         raises  UserError for an unknown name
         """
-        self._known(name, "revoke")
+        self._renew_media_secret(self._known(name, "revoke").role)
         self._write_issued(self._revoked(name))
         self._distribute()
         shutil.rmtree(self.directory / name, ignore_errors=True)
@@ -171,28 +172,34 @@ class Authority:
         return not issued.revoked and certificate.exists() and serial_of(_read(certificate)) == int(issued.serial, 16)
 
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
-        # Listed before it exists: a serial number unknown to the authority could never be revoked.
+        # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
+        try:
+            pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
+        except ValueError:
+            rule = "must be addresses or names in ASCII: an international one begins with xn--"
+            raise UserError("command line", "host", ", ".join(hosts), rule) from None
         self._write_issued([*self._revoked(name), Issued(name, role, f"{serial:x}", hosts, until)])
-        pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
         files = {
             keyring.AUTHORITY: self._pair.certificate,
             keyring.CERTIFICATE: pair.certificate,
             keyring.KEY: pair.key,
             keyring.SECRET: _secret(),
             keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role, hosts)),
-            **self._files_of(name, role),
+            **self._files_of(role),
         }
         self._replace(name, files)
         self._distribute()
 
-    def _files_of(self, name: str, role: Role) -> dict[str, bytes]:
-        """Files that holders of a role have in addition to those that all have."""
-        media_secret = _read(self._own / keyring.MEDIA_SECRET)
-        if role is Role.VEHICLE:
-            return {keyring.PASSPHRASE: keyring.srt_passphrase(media_secret, name).encode()}
+    def _renew_media_secret(self, role: Role) -> None:
+        """Withdraw what the keys of a role reveal about SRT streams: SRT has no certificates that could be revoked."""
+        if role is Role.VEHICLE or role in VIEWERS:
+            _write(self._own / keyring.MEDIA_SECRET, _secret())
+
+    def _files_of(self, role: Role) -> dict[str, bytes]:
+        """Files that holders of a role have in addition to those that all have and those that `_distribute` writes."""
         if role in VIEWERS:
-            return {keyring.MEDIA_SECRET: media_secret, keyring.TOKEN: _secret()}
+            return {keyring.TOKEN: _secret()}
         if role is Role.BROKER:
             return {ACCESS: ACL.encode(), SETTINGS: broker_settings(self.installed).encode()}
         return {}
@@ -213,7 +220,8 @@ class Authority:
         shutil.rmtree(old, ignore_errors=True)
 
     def _distribute(self) -> None:
-        """Write the accepted holders and revocations to all directories that need them."""
+        """Write the accepted holders, revocations and secrets of SRT to all directories that need them."""
+        media_secret = _read(self._own / keyring.MEDIA_SECRET)
         issued, holders = self._issued(), list(filter(self._in_use, self.holders()))
         revoked = [each for each in issued if each.revoked and each.until > self.now()]
         serials = [(int(each.serial, 16), each.revoked) for each in revoked if each.revoked]
@@ -222,7 +230,10 @@ class Authority:
         for holder in holders:
             directory = self.directory / holder.name
             _write(directory / keyring.REVOKED, crl)
+            if holder.role in VIEWERS:
+                _write(directory / keyring.MEDIA_SECRET, media_secret)
             if holder.role is Role.VEHICLE:
+                _write(directory / keyring.PASSPHRASE, keyring.srt_passphrase(media_secret, holder.name).encode())
                 _write(directory / keyring.PEOPLE, self._people(holder.name, holders, passwords))
             elif holder.role is Role.BROKER:
                 lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())

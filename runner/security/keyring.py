@@ -173,10 +173,13 @@ class Keyring:
     def watched_token(self, on_report: Callable[[str], None]) -> Watched[bytes]:
         return Watched(self.directory / TOKEN, lambda: self.read(TOKEN), on_report)
 
-    @property
-    def passphrase(self) -> str:
+    def watched_passphrase(self, on_report: Callable[[str], None]) -> Watched[str]:
         """The passphrase that encrypts this vehicle's SRT streams."""
-        return self.read(PASSPHRASE).decode()
+        return Watched(self.directory / PASSPHRASE, lambda: self.read(PASSPHRASE).decode(), on_report)
+
+    def watched_media_secret(self, on_report: Callable[[str], None]) -> Watched[bytes]:
+        """The secret from which viewers derive each vehicle's passphrase."""
+        return Watched(self.directory / MEDIA_SECRET, lambda: self.read(MEDIA_SECRET), on_report)
 
     def read(self, name: str) -> bytes:
         """Content of a file, without a trailing newline that an editor may have added.

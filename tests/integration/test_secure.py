@@ -312,6 +312,25 @@ def test_only_key_holders_receive_pictures(keys, graph):
         assert not messages, messages
 
 
+def test_a_revoked_viewer_receives_no_pictures_over_srt(keys, tmp_path):
+    """Both sides use the new secret without a restart; what the revoked holder knows opens nothing."""
+    revoked = tmp_path / "revoked"
+    shutil.copytree(keys / "carol", revoked)
+    with sending(keys, "graph=h264_srt", f"graph.first_port={free_port(3)}") as (plans, reports):
+        with watching(plans, keys / "bob") as (seen, messages):
+            until(lambda: min(seen().values()) > 10, every_s=0.1)
+            changed(keys, "revoke", "carol")
+            until(lambda: seen() and any("there are new keys" in what for what in messages), every_s=0.1)
+            before = seen()
+            until(lambda: all(frames > before[name] + 10 for name, frames in seen().items()), every_s=0.1)
+        assert any("there are new keys" in what for what in reports)
+        with watching(plans, revoked) as (seen, _):
+            end = time.monotonic() + 4
+            while time.monotonic() < end:
+                assert set(seen().values()) == {0}
+                time.sleep(0.1)
+
+
 def test_rtsp_refuses_intruders(keys, tmp_path):
     others = issue(tmp_path / "others", alice="controller")
     shutil.copy(keys / "alice" / keyring.AUTHORITY, others / "alice")  # otherwise it would itself refuse the vehicle
