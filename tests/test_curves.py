@@ -129,6 +129,12 @@ def test_points_that_all_miss_their_target_are_refused():
         draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
 
 
+def test_single_points_of_each_factor_are_too_few():
+    points = [point(Fraction(1, 2), 100), point(Fraction(1), 400)]
+    with pytest.raises(ValueError, match="no factor has two encodings that meet their target bitrates"):
+        best_ladder(draw_curves(points, SCORE), 5e-4, 1.25)
+
+
 def test_the_confidence_interval_contains_the_crossing_and_grows_with_noise():
     widths = []
     for noise in (0.0, 0.002):

@@ -68,7 +68,9 @@ def to_json(measured: Measured) -> dict[str, Any]:
         "version": VERSION,
         "tod_runner": version("tod-runner"),
         "name": measured.name,
-        "content": digest([clip.sha256 for clip in measured.clips.values()], measured.encoder, measured.masks),
+        "content": digest(
+            [clip.sha256 + clip.topic for clip in measured.clips.values()], measured.encoder, measured.masks
+        ),
         "sequences": sequences,
         "masks": dict(measured.masks),
         "encoder": dict(measured.encoder),

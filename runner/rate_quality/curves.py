@@ -167,6 +167,8 @@ def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Lad
     If no set meets both, the one that loses least is returned.
     """
     ladders = [ladder for chosen in _choices(curves) if (ladder := build_ladder(curves, chosen)) is not None]
+    if not ladders:
+        raise ValueError("no factor has two encodings that meet their target bitrates: add bitrates_kbps")
     wide = [ladder for ladder in ladders if ladder.width_min >= narrowest] or ladders
     by_size: dict[int, Ladder] = {}
     for ladder in sorted(wide, key=lambda one: (one.regret_max, one.regret_mean)):

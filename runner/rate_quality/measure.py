@@ -160,8 +160,8 @@ def _measure(
         cores=study.cpu_cores,
         fps=sweeps[0].plan.camera.fps,
     )
-    points = _points(study, criteria, sweeps, lambda share: progress(name, share))
     try:
+        points = _points(study, criteria, sweeps, lambda share: progress(name, share))
         choice = choose(points, criteria)
     except ValueError as error:
         raise RunError(f"{name}: {error}") from None
