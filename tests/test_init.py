@@ -205,3 +205,13 @@ def test_an_editor_checks_and_explains_keys(fleet: Path, name: str, right: str, 
         other = path.with_name(f"misspelt_{path.name}")
         found = one.opened(other, text.replace(f"{right}:", f"{wrong}:", 1))
         assert any(wrong in message for message in found), found
+
+
+def test_an_empty_directory_is_filled_and_stays_the_same(tod: Command, tmp_path: Path, monkeypatch: Any) -> None:
+    """The user's shell may be in it, and it may be a mount point."""
+    tmp_path.chmod(0o750)
+    monkeypatch.chdir(tmp_path)
+    before = tmp_path.stat()
+    assert tod("init", ".").status == 0
+    assert tod("validate", "conf=.").status == 0
+    assert (tmp_path.stat().st_ino, tmp_path.stat().st_mode) == (before.st_ino, before.st_mode)

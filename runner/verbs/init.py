@@ -68,8 +68,8 @@ def _problems(place: Path, texts: Mapping[str, str]) -> Iterator[Problem]:
 
 
 def _write(place: Path, texts: Mapping[str, str]) -> None:
-    """Write all files or none. A new or empty directory is built under a temporary name and then renamed."""
-    if place.is_dir() and any(place.iterdir()):
+    """Write all files or none. A new directory is built under a temporary name and then renamed."""
+    if place.is_dir():
         _fill(place, texts)
         return
     place = place.resolve()
