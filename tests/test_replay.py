@@ -315,6 +315,16 @@ def test_a_drive_replays_to_its_own_decisions(tod: Command, drive: Path, story: 
     assert decisions[-1]["cause"] == "weights_set weights {'front_right': 2}"
 
 
+def test_dropped_lines_are_reported(tod: Command, drive: Path, tmp_path: Path) -> None:
+    """Events may be among them."""
+    first, second, *rest = (drive / "drive.jsonl").read_text().splitlines()
+    incomplete = tmp_path / "drive.jsonl"
+    incomplete.write_text("\n".join([first, second, '{"log": "dropped", "t": 0.5, "lines": 3}', *rest, ""]))
+    result = tod("replay", f"input={incomplete}")
+    assert (result.status, result.out) == (0, tod("replay", f"input={drive}").out)
+    assert result.err == f"{incomplete}: line 3: 3 lines were dropped: decisions may differ from the drive's\n"
+
+
 def test_a_drive_replayed_into_a_drive_is_identical(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert tod("replay", f"input={drive}", f"log={tmp_path / 'again'}").status == 0
     assert (tmp_path / "again" / "drive.jsonl").read_text() == (drive / "drive.jsonl").read_text()

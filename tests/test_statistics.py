@@ -79,6 +79,8 @@ def test_no_freeze_is_judged_by_fewer_than_five_gaps() -> None:
 
 def test_a_stream_that_never_starts_or_stops_early_freezes() -> None:
     assert freezes(np.empty(0), [(0.0, 50.0), (60.0, 100.0)]) == [Freeze(0.0, 50.0), Freeze(60.0, 40.0)]
+    assert freezes(arrivals(*[0.025] * 40, first=9.0), [(0.0, 10.0)]) == [Freeze(0.0, 9.0)]
+    assert freezes(arrivals(*[0.025] * 40, first=1.9), [(0.0, 2.9)]) == []
     assert freezes(arrivals(0.025, 0.025), [(0.0, 10.0)])[-1].seconds == pytest.approx(9.95, abs=0.1)
 
 

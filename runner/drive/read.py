@@ -31,7 +31,7 @@ from runner.system.clocks import KEPT_S
 T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
-OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "dropped", "ended")
+OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "ended")
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
 

@@ -313,7 +313,8 @@ def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> li
     returns   the whole gap of each, as in totalFreezesDuration
 
     The definition counts a freeze when the next frame arrives. A stream that stops for good while it should be sent is
-    counted too, up to the end of the span, and one that never begins: otherwise the worst case would look perfect.
+    counted too, up to the end of the span, and one that begins late or never: otherwise the worst case would look
+    perfect.
     """
     found = []
     for begin, until in sending:
@@ -321,6 +322,8 @@ def freezes(arrivals: FloatSeries, sending: Iterable[tuple[float, float]]) -> li
         if not inside.size:
             found += [Freeze(begin, until - begin)] if until - begin >= FREEZE_STALLED_S else []
             continue
+        if inside[0] - begin >= FREEZE_STALLED_S:
+            found.append(Freeze(begin, float(inside[0] - begin)))
         ends = np.append(inside[1:], until)
         gaps = ends - inside
         sums = np.concatenate([[0.0], np.cumsum(gaps)])

@@ -254,6 +254,10 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
     skipped = OTHER_KINDS if uplink else (*OTHER_KINDS, REPORTS)
     for number, document in read_lines(lines, name, warnings, skipped=skipped):
         if is_log(document):
+            if document["log"] == "dropped":
+                lost = f"{document['lines']} lines were dropped: decisions may differ from the drive's"
+                warnings.append(f"{name}: line {number}: {lost}")
+                continue
             record = line_from_json(document) if uplink else None
             if uplink and isinstance(record, ReceptionReported) and (measured := uplink.take(record)):
                 yield to_json(measured), measured
