@@ -14,6 +14,7 @@ from runner.configuration.config import configuration
 from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
 from runner.ros.cameras import CameraStream
+from runner.ros.inputs import check_names
 from runner.ros.node import pictures, ros1
 from runner.ros.process import NodeProcess, check_discovery
 
@@ -257,3 +258,11 @@ def test_a_node_is_started_again_after_any_error(monkeypatch):
     assert again.wait(10)
     node.close()
     assert reports == ["the ROS node ended: OSError: [Errno 24] Too many open files; starting it again"]
+
+
+def test_cameras_with_one_name_in_ros_are_refused():
+    vehicle = configuration(["vehicle=delivery_robot"]).vehicle()
+    front = vehicle.cameras["front"]
+    check_names(vehicle)
+    with pytest.raises(UserError, match="cameras: a_b: has the same name in ROS as a-b: rename one of them"):
+        check_names(replace(vehicle, cameras={"a-b": front, "a_b": front}))

@@ -382,6 +382,25 @@ def test_a_run_whose_rules_fail_at_once_does_not_start() -> None:
         start(replace(drive.vehicle, modes=lists))
 
 
+def test_a_rule_may_give_whole_numbers() -> None:
+    """They are halved exactly, and shared exactly among copies."""
+
+    def whole(vehicle: Any, state: Any, draft: Any, memory: Any) -> Any:
+        demand = draft.demand and dict.fromkeys(draft.demand, 701)
+        return draft.replaced(total=4001, demand=demand), memory
+
+    mine = rules.RuleCall(rules.Rule("mine", whole, frozenset(), frozenset({"total", "demand"}), frozenset()))
+    drive = Drive("modes=safe")
+    calls = []
+    for call in drive.vehicle.modes[Mode.AUTOMATIC]:
+        calls += [mine, call] if call.rule.name in ("fade_when_stale", "share_above_floors") else [call]
+    drive.vehicle = replace(drive.vehicle, modes={**drive.vehicle.modes, Mode.AUTOMATIC: tuple(calls)})
+    drive.run = start(drive.vehicle)
+    drive.accept("bitrate_predicted", t=1, kbps=4001)
+    assert drive.accept("copies_counted", copies={"front_left": 2}).fault is None
+    assert drive.accept("clock_advanced", t=9).fault is None
+
+
 def test_rules_may_read_the_attention_of_the_person_who_drives() -> None:
     """It belongs to one operator, and is unknown once control passes or nobody is in control."""
     drive = predicted(3000)

@@ -95,7 +95,7 @@ def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
         try:
             override, _ = _parsed(parser, text)
             swept.append(list(islice(_values(override), MAX_RUNS + 1)))
-        except HydraException as error:
+        except (HydraException, ValueError) as error:  # a range with steps of 0
             problems.append(_problem(text, error))
     if problems:
         raise ConfigError(problems)

@@ -181,7 +181,7 @@ def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: K
     of_all = {name: own * copies[name] for name, own in wanted.items()}
     lowest = {name: floor * copies[name] for name, floor in floors.items()}
     shares = allocation.allocate_above_floors(of_all, total, state.weights, lowest)
-    return {name: share / copies[name] for name, share in shares.items()}
+    return {name: Fraction(share) / copies[name] for name, share in shares.items()}
 
 
 def _given_up(vehicle: Vehicle, state: State, draft: Draft, before: tuple[str, ...]) -> tuple[str, ...]:
@@ -307,7 +307,7 @@ def fade_when_stale(
         return draft, memory
     halvings = int((age - limit) / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
-    total = max(draft.total / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
+    total = max(Fraction(draft.total) / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
     return draft.noted(note, total=total, uncapped=None if draft.uncapped is None else total), memory

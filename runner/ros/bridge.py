@@ -25,7 +25,7 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
-from runner.ros.inputs import PRESENCE, OperatorInput, input_services, input_topics, ros_name
+from runner.ros.inputs import PRESENCE, OperatorInput, check_names, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
 from runner.security.keyring import Keyring
 
@@ -45,6 +45,7 @@ class Bridge:
     """
 
     def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
+        check_names(vehicle)
         self._vehicle, self._on_report = vehicle, on_report
         login = Login(keyring, on_report) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]

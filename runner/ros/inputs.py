@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from runner.core.model import Camera, Mode, Vehicle
+from runner.errors import UserError
 
 InputValues = Mapping[str, Any]
 PRESENCE = "~/operator_connected"
@@ -29,6 +30,15 @@ def ros_name(camera: str) -> str:
     """A camera's name as part of a topic name, which may not contain hyphens or begin with a digit."""
     name = camera.replace("-", "_")
     return f"_{name}" if name[0].isdigit() else name
+
+
+def check_names(vehicle: Vehicle) -> None:
+    """Check that no two cameras have the same name in ROS; raises UserError."""
+    taken: dict[str, str] = {}
+    for camera in vehicle.cameras:
+        other = taken.setdefault(ros_name(camera), camera)
+        if other != camera:
+            raise UserError("cameras", camera, None, f"has the same name in ROS as {other}: rename one of them")
 
 
 def input_topics(vehicle: Vehicle) -> dict[str, OperatorInput]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from runner.core.intrinsics import Intrinsics, delivered_intrinsics
 from runner.core.model import Camera, Roi, Vehicle
 from runner.records import CameraState
-from runner.ros.inputs import ros_name
+from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
 
 
@@ -21,6 +21,7 @@ class DecodedPictures:
 
     def __init__(self, vehicle: Vehicle, on_report: Callable[[str], None]) -> None:
         check_discovery(vehicle.ros, vehicle.insecure)
+        check_names(vehicle)
         settings = replace(vehicle.ros, node=f"{vehicle.ros.node}_operator")
         self._cameras = vehicle.cameras
         self._node = NodeProcess(
