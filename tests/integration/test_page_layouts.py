@@ -222,8 +222,11 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         assert sum(box["width"] for box in pictures.values()) > 0.9 * monitor.evaluate("innerWidth")
         shot(monitor, "monitor")
 
+        page.click("[data-camera=front] .picture")
         monitor.click("[data-camera=mast] .picture")
         until(lambda: page.evaluate("tod.selected") == "mast")
+        # Otherwise the front camera would be selected again when the page's window is activated.
+        assert page.evaluate("document.activeElement.dataset.camera") == "mast"
         page.keyboard.press("2")
         until(lambda: monitor.evaluate("tod.selected") == "rear")
         monitor.keyboard.press("o")

@@ -4,7 +4,7 @@ export const MOVING = ["live", "late", "damaged"];
 export const STALLED = ["frozen", "lost"]; // no new pictures although they are due
 
 const LOST_MS = 1000;
-const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
+export const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
  * @typedef {object} Times the known state of a stream

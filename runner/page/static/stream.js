@@ -7,7 +7,7 @@ import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
 import { pictureOf } from "./picture.js";
 import { GuideLayer } from "./guide_layer.js";
-import { alarmText, judge, MOVING, STALLED } from "./status.js";
+import { alarmText, INTERVALS, judge, MOVING, STALLED } from "./status.js";
 import { drawOverlay } from "./overlay.js";
 import { straightOptics } from "./straight.js";
 import { StraightView } from "./straight_view.js";
@@ -24,7 +24,7 @@ const RESYNC_MIN_MS = 2000; // doubled each time it does not help: a burst costs
 const RESYNC_MAX_MS = 16000;
 const SETTLE_MS = 2000; // after a restart the decoder may take this long for the burst
 const REFUSED_RETRY_MS = 5000; // between two checks whether the browser can decode a refused stream
-const LATE_HOLD_MS = 500; // how long one late picture is indicated
+const LATE_HOLD_MS = 500; // how long one late picture is indicated, at least until it counts as frozen
 const STAGES = 1200;
 const NEW_REGION = "NEW REGION"; // while it is unknown which part of the image a picture shows
 const UNTIMED_MS = 1000; // longest transit of a picture without a capture time
@@ -91,7 +91,7 @@ export class Stream {
     this.region = null; // the part of the full image that pictures show; null: unknown, or about to change
     /** @type {import("./framing.js").Size|null} */
     this.expected = null; // size of these pictures; null: likewise
-    this.region_since = Infinity; // pictures captured from this time on show the region
+    this.region_since = Infinity; // page time: pictures captured from this time on show the region
     this.size_since = Infinity;
     /** @type {StraightView|null} */
     this.straight = null; // shows the picture straightened
@@ -123,7 +123,7 @@ export class Stream {
     const isApplied = x === roi.x && y === roi.y && wide === roi.width && high === roi.height;
     const region = isApplied ? { x, y, width: wide, height: high } : null;
     const expected = isApplied && size.width === width && size.height === height ? size : null;
-    const since = this.station.clock.toStation(now());
+    const since = now(); // the station's clock may be unknown yet, or be set
     if (JSON.stringify(region) !== JSON.stringify(this.region)) Object.assign(this, { region, region_since: since });
     if (JSON.stringify(expected) !== JSON.stringify(this.expected)) Object.assign(this, { expected, size_since: since });
   }
@@ -134,10 +134,10 @@ export class Stream {
     return shown && region && this.capturedAt() >= this.region_since && hasAspectOf(shown.picture, region) ? region : null;
   }
 
-  /** When the displayed picture was captured; if unknown, the earliest possible time. */
+  /** Page time at which the displayed picture was captured; if unknown, the earliest possible time. */
   capturedAt() {
     const { captured = NaN, arrived = NaN } = this.shown?.meta ?? {};
-    return Number.isFinite(captured) ? captured : arrived - UNTIMED_MS;
+    return (Number.isFinite(captured) ? captured : arrived - UNTIMED_MS) - this.station.clock.offset;
   }
 
   attach(canvas) {
@@ -155,7 +155,8 @@ export class Stream {
     this.counts.received++;
     // The first units may have reached the station long ago, if the camera has stopped sending.
     const reached = unit.arrived - this.station.clock.offset + this.station.clock.bound;
-    this.arrived = this.drawn || !Number.isFinite(reached) ? received : Math.min(received, reached);
+    const isLatest = !(unit.flags & CATCH_UP); // those before it are older, however recent the newest picture is
+    this.arrived = this.drawn || !isLatest || !Number.isFinite(reached) ? received : Math.min(received, reached);
     if (this.refused && unit.flags & KEY && isKnown(this.camera.codec)) this.retryRefused(unit.data);
     if (!this.station.video || this.refused) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
     if (unit.flags & RESTART) this.restart();
@@ -358,7 +359,7 @@ export class Stream {
   checkAge({ captured }, time) {
     const { clock, limits, bound } = this.station;
     const age = clock.toStation(time) - captured + bound + clock.bound; // upper bound; not finite if a clock is unknown
-    if (Number.isFinite(age) && age > limits.late_ms) Object.assign(this, { late_until: time + LATE_HOLD_MS, late_age: age });
+    if (Number.isFinite(age) && age > limits.late_ms) Object.assign(this, { late_until: time + Math.max(LATE_HOLD_MS, (1000 * INTERVALS) / this.camera.fps), late_age: age });
   }
 
   recordStages(meta, drawn) {

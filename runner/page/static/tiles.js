@@ -42,8 +42,8 @@ const sizes = new ResizeObserver((entries) => {
 
 // --- building ---------------------------------------------------------------------------------------------------------
 
-function build({ cameras }) {
-  const key = JSON.stringify(cameras);
+function build({ cameras, dimensions }) {
+  const key = JSON.stringify([cameras, dimensions]); // as in the worker, whose new streams need new canvases
   if (key !== camerasKey) {
     camerasKey = key;
     bandsKey = "";
@@ -318,6 +318,7 @@ export function startTiles() {
   listen("state sample requests control socket theme selected straight", refreshAll);
   listen("status", onStatus);
   listen("view birdseye", layOut);
+  listen("selected", moveFocus);
   listen("enlarged", (name) => {
     layOut();
     if (name && !wasHinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });
@@ -325,6 +326,20 @@ export function startTiles() {
   });
   if (!canShowVideo) showNoVideo();
   new ResizeObserver(layOut).observe(scene);
+  watchPixelRatio();
+}
+
+/** Let the focus follow a selection by another window: a focused tile selects its camera again when its window is activated. */
+function moveFocus(name) {
+  const focused = document.activeElement, tile = tiles.get(name)?.element;
+  if (!(focused instanceof HTMLElement) || !focused.classList.contains("tile") || focused === tile) return;
+  focused.blur();
+  tile?.focus({ preventScroll: true });
+}
+
+/** Report sizes again on a screen with another scale: boxes keep their sizes in CSS pixels. */
+function watchPixelRatio() {
+  matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => { layOut(); watchPixelRatio(); }, { once: true });
 }
 
 /** Move the focus to the tile of a camera. */

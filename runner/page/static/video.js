@@ -103,6 +103,7 @@ function dropConnection() {
 async function reconnect() {
   const response = await fetch("/static/video.js", { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(CONNECT_MS) }).catch(() => null);
   attempts++;
+  if (response?.status === 401) return toPage({ kind: "login" }); // the session has ended
   if (response?.ok) connect();
   else setTimeout(reconnect, RECONNECT_MS);
 }
