@@ -234,6 +234,12 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         monitor.keyboard.press("t")
         until(lambda: "not its monitors" in monitor.inner_text("#toasts"))
         assert page.evaluate("tod.control") == "you"
+        page.keyboard.press("v")
+        page.keyboard.press("1")
+        until(lambda: monitor.evaluate("tod.selected") == "front")
+        monitor.keyboard.press("r")  # reverse, which only the page shows
+        until(lambda: page.evaluate("tod.selected") == "rear")
+        page.keyboard.press("v")
 
         until(lambda: station.attention in ("watching", "unfocused"))
         monitor.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")

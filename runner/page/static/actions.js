@@ -1,6 +1,6 @@
 /** The operator's actions; `inputs` in the configuration assigns them to keys and buttons. */
 
-import { enlarge, publish, select, store } from "./store.js";
+import { enlarge, inControl, publish, select, store } from "./store.js";
 import { selectMode, toggleControl } from "./header.js";
 import { focusTile, switchCamera } from "./tiles.js";
 import { scaleTotal } from "./total.js";
@@ -50,6 +50,18 @@ export const ACTIONS = {
   theme: { description: "night or day theme", run: toggleTheme },
   help: { description: "show this list", run: () => publish("help") },
 };
+
+// Only the page shows what these change, so a monitor passes them on to it.
+const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "birdseye", "drawer", "map", "full_image"];
+const channel = new BroadcastChannel("tod-actions");
+
+export function startActions() {
+  for (const name of OF_PAGE) {
+    const { run } = ACTIONS[name];
+    ACTIONS[name].run = () => (store.view === "monitor" ? channel.postMessage(name) : run());
+  }
+  channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && ACTIONS[data]?.run();
+}
 
 /** @param {"left"|"front"|"right"|"rear"} role */
 function selectRole(role) {

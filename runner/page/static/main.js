@@ -18,6 +18,7 @@ import { startNews } from "./news.js";
 import { startCharts } from "./charts.js";
 import { startMonitors } from "./monitors.js";
 import { startEdit } from "./edit.js";
+import { startActions } from "./actions.js";
 import { startKeys } from "./keys.js";
 import { startGamepads } from "./gamepads.js";
 
@@ -31,6 +32,7 @@ startStraight();
 startNews();
 startMonitors();
 startEdit();
+startActions();
 startKeys();
 startGamepads();
 if (store.view !== "monitor") for (const part of [startSound, startTotal, startPanel, startTabs, startCharts]) part();

@@ -3,6 +3,9 @@
 import { straightMesh } from "./straight.js";
 import { FILLS, Warp } from "./warp.js";
 
+/** @type {Warp|null} of all straightened pictures: Chromium drops the oldest of more than four contexts in a worker */
+let shared = null;
+
 export class StraightView {
   /**
    * @param {any} camera as in hello
@@ -11,10 +14,15 @@ export class StraightView {
   constructor(camera) {
     const { places, points, shares, triangles } = straightMesh(camera);
     const { width, height } = camera;
-    this.warp = new Warp(new OffscreenCanvas(1, 1));
+    if (!shared || shared.lost) shared = new Warp(new OffscreenCanvas(1, 1));
+    this.warp = shared;
     this.layer = this.warp.layer(places.map(({ x, y }) => ({ x, y: -y })), points);
     this.layer.share(shares, triangles);
     this.frame = { x: width / 2, y: -height / 2, width, height };
+  }
+
+  dispose() {
+    this.layer.dispose();
   }
 
   /**

@@ -341,6 +341,7 @@ export class Stream {
    */
   straighten(on) {
     if (on === Boolean(this.straight)) return;
+    this.straight?.dispose();
     this.straight = on ? new StraightView(this.camera) : null;
     this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
     this.painted_text = null; // repaint at the next tick
@@ -509,6 +510,7 @@ export class Stream {
 
   dispose() {
     this.close();
+    this.straight?.dispose();
     this.shown?.picture.close();
     this.shown = null;
   }

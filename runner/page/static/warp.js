@@ -93,6 +93,14 @@ export class Layer {
     this.count = triangles.length;
   }
 
+  dispose() {
+    const { gl } = this;
+    gl.deleteVertexArray(this.vertices);
+    gl.deleteBuffer(this.buffer);
+    gl.deleteBuffer(this.corners);
+    gl.deleteTexture(this.texture);
+  }
+
   /** Upload a picture to the texture, unless it is there already. @param {Picture} picture */
   load(picture) {
     const { gl } = this;
