@@ -199,6 +199,20 @@ def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module
         all_live(page)
 
 
+def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture):
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        monitor = page.context.new_page()
+        visit(monitor, f"{server.url}?show=front,mast")
+        controlling(monitor)
+        for key in "v1":
+            page.keyboard.press(key)
+        until(lambda: monitor.evaluate("tod.selected") == "front")
+        monitor.keyboard.press("r")  # reverse
+        until(lambda: page.evaluate("tod.selected") == "rear")
+
+
 def test_monitors_share_selection_control_and_attention_with_their_page(chromium, picture):
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         all_live(page)
@@ -234,12 +248,6 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         monitor.keyboard.press("t")
         until(lambda: "not its monitors" in monitor.inner_text("#toasts"))
         assert page.evaluate("tod.control") == "you"
-        page.keyboard.press("v")
-        page.keyboard.press("1")
-        until(lambda: monitor.evaluate("tod.selected") == "front")
-        monitor.keyboard.press("r")  # reverse, which only the page shows
-        until(lambda: page.evaluate("tod.selected") == "rear")
-        page.keyboard.press("v")
 
         until(lambda: station.attention in ("watching", "unfocused"))
         monitor.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import threading
 import time
@@ -536,6 +537,8 @@ def test_a_vehicle_without_the_library_does_not_start(ros):
     remedy = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}[ros.version]
     assert refused(ros, "ros.python=no/python") == (1, [f"ros.python: no/python: no such program; {remedy}"])
     library, other = {1: ("rospy", ROS2_PYTHON), 2: ("rclpy", "/usr/bin/python3")}[ros.version]
+    if not shutil.which(other):
+        pytest.skip("needs the other version of ROS, too")
     status, lines = refused(ros, f"ros.python={other}")
     assert status == 1
     why = f"the ROS node does not start: ros.python: {other} cannot load {library} for Python 3."
