@@ -387,13 +387,17 @@ class OperatorSide:
         plans = _with_video(plans, video, "operator")
         self._glib = _Glib()
         self._reports = reports = ReportMerger(on_report)
-        login: StreamLogin | None = None
-        if keyring:
+
+        def login() -> StreamLogin | None:
+            """One for each receiver: it remembers what its last pipeline used."""
+            if keyring is None:
+                return None
             from runner.gst.secure import StreamLogin
 
-            login = StreamLogin(keyring, vehicle, lambda what: reports("keys", what))
+            return StreamLogin(keyring, vehicle, lambda what: reports("keys", what))
+
         self._receivers = {
-            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login)
+            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login())
             for plan in plans
         }
 

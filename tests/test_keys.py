@@ -107,7 +107,7 @@ def test_an_empty_secret_is_none_and_the_last_one_stays_in_force(authority, monk
     assert [note.endswith("is empty; the previous content stays in force") for note in notes] == [True]
 
 
-@pytest.mark.parametrize("action", ["rotate", "revoke"])
+@pytest.mark.parametrize("action", ["rotate", "revoke", "issue"])
 @pytest.mark.parametrize(("name", "changes"), [("a-watcher", True), ("car", True), ("a-predictor", False)])
 def test_srt_gets_a_new_secret_with_the_keys_that_reveal_it(authority, action, name, changes):
     """SRT has no certificates: whoever knows the passphrase may watch, or send."""
@@ -117,7 +117,8 @@ def test_srt_gets_a_new_secret_with_the_keys_that_reveal_it(authority, action, n
         authority.directory / "truck" / "srt.passphrase",
     )
     before = [file.read_bytes() for file in files]
-    getattr(authority, action)(name)
+    known = next(each for each in authority.holders() if each.name == name)
+    getattr(authority, action)(name, *([known.role, ["10.9.9.9"]] if action == "issue" else []))
     secret, passphrase = (file.read_bytes() for file in files)
     assert [secret != before[0], passphrase != before[1]] == [changes, changes]
     assert passphrase.decode() == keyring.srt_passphrase(secret, "truck")

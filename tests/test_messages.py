@@ -57,11 +57,17 @@ def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("text", [b'"\\ud800"', b'"\\uDFFF x"', b'"\xed\xa0\x80"', b'"\\ude00\\ud83d"'])
+@pytest.mark.parametrize("text", [b'"\\ud800"', b'"\\uDFFF x"', b'"\\ude00\\ud83d"'])
 def test_text_that_is_not_unicode_is_refused(text: bytes) -> None:
     """It cannot be printed: one message would end the operator's side."""
     with pytest.raises(ValueError, match="contains half of a surrogate pair"):
         read_message(b'{"online": [' + text + b"]}")
+
+
+@pytest.mark.parametrize("payload", [b'{"a": "\xed\xa0\x80"}', '{"a": "\\ud800"}'.encode("utf-16"), b'{"a": "\xff"}'])
+def test_only_utf_8_is_json(payload: bytes) -> None:
+    with pytest.raises(ValueError, match="not JSON: "):
+        read_message(payload)
 
 
 def test_pairs_are_one_character() -> None:

@@ -322,7 +322,7 @@ def test_dropped_lines_are_reported(tod: Command, drive: Path, tmp_path: Path) -
     incomplete.write_text("\n".join([first, second, '{"log": "dropped", "t": 0.5, "lines": 3}', *rest, ""]))
     result = tod("replay", f"input={incomplete}")
     assert (result.status, result.out) == (0, tod("replay", f"input={drive}").out)
-    assert result.err == f"{incomplete}: line 3: 3 lines were dropped: decisions may differ from the drive's\n"
+    assert result.err == f"{incomplete}: dropped lines: 3; decisions may differ from the drive's\n"
 
 
 def test_a_drive_replayed_into_a_drive_is_identical(tod: Command, drive: Path, tmp_path: Path) -> None:

@@ -95,7 +95,9 @@ def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
         try:
             override, _ = _parsed(parser, text)
             swept.append(list(islice(_values(override), MAX_RUNS + 1)))
-        except (HydraException, ValueError) as error:  # a range with steps of 0
+        except ValueError:  # from Python's own range
+            problems.append(Problem(COMMAND_LINE, "", schema.shortened(text), "the step of a range must not be 0"))
+        except HydraException as error:
             problems.append(_problem(text, error))
     if problems:
         raise ConfigError(problems)

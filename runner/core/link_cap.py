@@ -76,7 +76,8 @@ class Lowering(NamedTuple):
 class Proofs(NamedTuple):
     """When the link seemed to be narrow in the last OFTEN_S, once per long queue.
 
-    most  kbit/s that arrived before the first proof, losses with a short queue included; t: of the last proof
+    most  kbit/s that had arrived before the first proof
+    t     of the last proof; here losses with a short queue are proofs, too
     """
 
     times: tuple[float, ...]

@@ -80,7 +80,10 @@ class CameraPipeline:
 
     def catch_up(self) -> None:
         """Set the knobs that were turned while the pipeline was built, before `turn` could reach it."""
-        self.turn({knob: value for knob, value in self._wanted().items() if self._first.get(knob) != value})
+        known, wanted = self._first, self._wanted()
+        while wanted != known:  # again: `turn` may have been called with newer values meanwhile
+            self.turn({knob: value for knob, value in wanted.items() if known.get(knob) != value})
+            known, wanted = wanted, self._wanted()
 
     def _allowed(self, values: Mapping[str, KnobValue]) -> Mapping[str, KnobValue]:
         """Until the first frame has been sent, `sending` is not changed.

@@ -75,7 +75,7 @@ def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
 
 
 class StreamLogin:
-    """Mutual authentication of an operator's receivers and the vehicle.
+    """Mutual authentication of an operator's receiver and the vehicle.
 
     vehicle  its name
     """
@@ -92,6 +92,7 @@ class StreamLogin:
         """Set up a new pipeline and its client with the current keys.
 
         returns  why it cannot connect, for example while new files are being copied; None if it can
+        raises   RunError for a graph whose client cannot be encrypted
         """
         is_rtsp = client.find_property("tls-interaction")
         try:

@@ -40,7 +40,7 @@ from runner.schema import message_problem, read_json
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
-_SURROGATE = re.compile(rb"\\u[dD]|\xed[\xa0-\xbf]")  # perhaps half of a pair
+_SURROGATE = re.compile(rb"\\u[dD]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
@@ -89,7 +89,7 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
     if len(payload) > limit:
         raise ValueError(f"{len(payload)} bytes: must be at most {limit}")
     try:
-        document = read_json(payload)
+        document = read_json(payload.decode())  # bytes might be UTF-16, or hold surrogates
     except ValueError as error:
         raise ValueError(f"not JSON: {error}") from None
     if not isinstance(document, dict):

@@ -28,7 +28,7 @@ from runner.core.roles import VIEWERS, Role
 from runner.errors import RunError, UserError
 from runner.security import keyring
 from runner.security.broker_files import ACL, broker_settings
-from runner.security.certificates import Pair, new_authority, new_certificate, revocation_list, serial_of
+from runner.security.certificates import Pair, is_host, new_authority, new_certificate, revocation_list, serial_of
 from runner.system.files import read_file, unfinished
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
@@ -115,7 +115,6 @@ class Authority:
         raises  UserError for an unknown name
         """
         known = self._known(name, "rotate")
-        self._renew_media_secret(known.role)
         self._renew(known.name, known.role, known.hosts)
 
     def revoke(self, name: str) -> None:
@@ -174,11 +173,12 @@ class Authority:
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
         # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
-        try:
-            pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
-        except ValueError:
+        if not all(map(is_host, hosts)):
             rule = "must be addresses or names in ASCII: an international one begins with xn--"
-            raise UserError("command line", "host", ", ".join(hosts), rule) from None
+            raise UserError("command line", "host", ", ".join(hosts), rule)
+        pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
+        if any(issued.name == name for issued in self.holders()):
+            self._renew_media_secret(role)
         self._write_issued([*self._revoked(name), Issued(name, role, f"{serial:x}", hosts, until)])
         files = {
             keyring.AUTHORITY: self._pair.certificate,

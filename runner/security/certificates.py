@@ -132,6 +132,15 @@ def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_
     )
 
 
+def is_host(host: str) -> bool:
+    """Whether a certificate can name a host: by an address, or a name in ASCII."""
+    try:
+        _general_name(host)
+    except ValueError:
+        return False
+    return True
+
+
 def _general_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))

@@ -175,7 +175,13 @@ class Keyring:
 
     def watched_passphrase(self, on_report: Callable[[str], None]) -> Watched[str]:
         """The passphrase that encrypts this vehicle's SRT streams."""
-        return Watched(self.directory / PASSPHRASE, lambda: self.read(PASSPHRASE).decode(), on_report)
+        return Watched(self.directory / PASSPHRASE, self._passphrase, on_report)
+
+    def _passphrase(self) -> str:
+        try:
+            return self.read(PASSPHRASE).decode()
+        except UnicodeDecodeError as error:
+            raise self._error(PASSPHRASE, error) from None
 
     def watched_media_secret(self, on_report: Callable[[str], None]) -> Watched[bytes]:
         """The secret from which viewers derive each vehicle's passphrase."""

@@ -250,13 +250,12 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
     uplink  measures the link again from the drive's reception reports, in place of the drive's own measurements
     raises  UserError with the number of the line
     """
-    last, warnings = 0.0, list[str]()
+    last, dropped, warnings = 0.0, 0, list[str]()
     skipped = OTHER_KINDS if uplink else (*OTHER_KINDS, REPORTS)
     for number, document in read_lines(lines, name, warnings, skipped=skipped):
         if is_log(document):
             if document["log"] == "dropped":
-                lost = f"{document['lines']} lines were dropped: decisions may differ from the drive's"
-                warnings.append(f"{name}: line {number}: {lost}")
+                dropped += document["lines"]
                 continue
             record = line_from_json(document) if uplink else None
             if uplink and isinstance(record, ReceptionReported) and (measured := uplink.take(record)):
@@ -269,6 +268,8 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
             raise UserError(f"{name}: line {number}", "", None, problem)
         last = document["t"]
         yield document, parse(document)
+    if dropped:
+        warnings.append(f"{name}: dropped lines: {dropped}; decisions may differ from the drive's")
     print("\n".join(warnings), end="\n" if warnings else "", file=sys.stderr)
 
 

@@ -13,6 +13,7 @@ import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
+import { showProblem, whyNoControl } from "./requests.js";
 import { isEditing } from "./edit.js";
 
 /**
@@ -58,7 +59,10 @@ const channel = new BroadcastChannel("tod-actions");
 export function startActions() {
   for (const name of OF_PAGE) {
     const { run } = ACTIONS[name];
-    ACTIONS[name].run = () => (store.view === "monitor" ? channel.postMessage(name) : run());
+    ACTIONS[name].run = () => {
+      if (store.view !== "monitor") return run();
+      return inControl() ? channel.postMessage(name) : showProblem(whyNoControl());
+    };
   }
   channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && ACTIONS[data]?.run();
 }
