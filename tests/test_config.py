@@ -81,6 +81,20 @@ def test_modes_safe_is_the_default_and_automatic_the_mode() -> None:
     assert not paper & {"fade_when_stale", "cap_at_lower_bound", "pause_without_operator", "hold_upscaling"}
 
 
+@pytest.mark.parametrize(
+    ("fps", "rate"),
+    [
+        ("29.97", "2997/100"),
+        ("29.97002997002997", "30000/1001"),
+        ("33.333333333", "100/3"),
+        ("0.001", "1/1000"),
+    ],
+)
+def test_rates_fit_into_caps(fps: str, rate: str) -> None:
+    """GStreamer's fractions have 32 bits."""
+    assert str(vehicle(f"fps_max={fps}").cameras["front_left"].fps) == rate
+
+
 def test_numbers_are_exact_and_fps_max_limits_every_camera() -> None:
     cameras = vehicle("fps_max=33.3", "cameras.front_left.weight=0.1").cameras
     assert str(cameras["front_left"].weight) == "1/10"

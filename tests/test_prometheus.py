@@ -78,3 +78,15 @@ def test_every_figure_has_a_valid_name_of_its_own() -> None:
     names: list[Any] = [metric.name for parts in METRICS.values() for part in parts for metric in part]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"[a-z][a-z_]*", name) for name in names)
+
+
+def test_a_vehicle_whose_state_never_arrived_is_offline():
+    """Otherwise no alert could name it."""
+    from runner.metrics.prometheus import Metrics
+    from runner.metrics.side import SideMetrics
+    from runner.operator.live import _MetricsListener
+
+    metrics = Metrics("car")
+    _MetricsListener(SideMetrics(metrics, None))
+    (online,) = metrics.collect()
+    assert (online.name, [sample.value for sample in online.samples]) == ("tod_vehicle_online", [0.0])

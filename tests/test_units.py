@@ -43,6 +43,17 @@ def test_an_incomplete_picture_is_dropped_and_an_incomplete_idr_becomes_grey():
     assert [u.arrived for u in shown if u.exact] == [2.5 + tenth / 10 for tenth in range(20, 30)]
 
 
+def test_a_clock_that_is_set_back_keeps_no_more_units():
+    recent = RecentUnits(refresh_s=1.0)
+    recent.add(unit(5000, key=True))
+    for tenth in range(1, 101):
+        recent.add(unit(5000 + tenth / 10))
+    for tenth in range(201):
+        recent.add(unit(1400 + tenth / 10))
+    _, *rest = recent.burst()
+    assert [u.arrived for u in rest] == [1400 + tenth / 10 for tenth in range(180, 201)]
+
+
 @pytest.mark.parametrize(
     ("message", "frames"),
     [

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -254,7 +255,7 @@ class Builder:
         model = self.part((*path, "rate_quality"), _rate_quality)
         if graph is None or source is None or model is None or not (self.is_valid(*path) and self.is_valid("fps_max")):
             return None
-        fps, limit = exact(data["fps"]), document.get("fps_max")
+        fps, limit = _rate(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
         options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated"))
@@ -265,7 +266,7 @@ class Builder:
                 name=name,
                 width=data["width_px"],
                 height=data["height_px"],
-                fps=fps if limit is None else min(fps, exact(limit)),
+                fps=fps if limit is None else min(fps, _rate(limit)),
                 rate_quality=model,
                 graph=graph,
                 source=source,
@@ -416,7 +417,7 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
             raise ModelError("capture.format", "null", f"must be given where {key} is")
     fps = requested.get("fps")
     size = _given(requested, ("format", "width", "height"))
-    return Capture(**size, fps=None if fps is None else exact(fps), controls=controls)
+    return Capture(**size, fps=None if fps is None else _rate(fps), controls=controls)
 
 
 def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
@@ -425,6 +426,12 @@ def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
         b_min=tuple(map(exact, data["b_min_kbps"])),
         b_full=exact(data["b_full_kbps"]),
     )
+
+
+def _rate(fps: float) -> Fraction:
+    """A frame rate in Hz. Fractions of caps have 32 bits: 29.97002997002997 stands for 30000/1001."""
+    rate = exact(fps)
+    return rate if max(rate.as_integer_ratio()) < 2**31 else rate.limit_denominator(1001)
 
 
 def _crop(native: Mapping[str, int], width: int, height: int) -> Roi:

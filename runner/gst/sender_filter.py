@@ -17,6 +17,7 @@ from pathlib import Path
 
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
+PROC_NET = Path("/proc/self/net")  # /proc/net is hidden from services with ProcSubset=pid
 SO_ATTACH_FILTER, SO_MEMINFO = 26, 55  # asm-generic/socket.h
 MAX_WAITING = 100_000  # packets in a socket before its filter is attached; more than any buffer holds
 MEMINFO_QUEUED, MEMINFO_BUFFER, MEMINFO_DROPS, MEMINFO_VALUES = 0, 1, 8, 9  # linux/sock_diag.h
@@ -120,13 +121,16 @@ def _memory_info(sock: socket.socket) -> tuple[int, ...]:
 
 
 def _overflows() -> int:
-    """UDP packets dropped at full receive buffers on this machine so far, over IPv4 and IPv6."""
-    names, values = (
-        line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")
-    )
-    six = dict(line.split() for line in Path("/proc/net/snmp6").read_text().splitlines()) if _has_ipv6() else {}
+    """UDP packets dropped at full receive buffers on this machine so far, over IPv4 and IPv6; 0 if unknown."""
+    try:
+        names, values = (
+            line.split() for line in (PROC_NET / "snmp").read_text().splitlines() if line.startswith("Udp:")
+        )
+        six = dict(line.split() for line in (PROC_NET / "snmp6").read_text().splitlines()) if _has_ipv6() else {}
+    except OSError:
+        return 0
     return int(dict(zip(names, values, strict=True))["RcvbufErrors"]) + int(six.get("Udp6RcvbufErrors", 0))
 
 
 def _has_ipv6() -> bool:
-    return Path("/proc/net/snmp6").exists()
+    return (PROC_NET / "snmp6").exists()

@@ -129,6 +129,7 @@ class RecentUnits:
             self._exact_from = unit.arrived + self._window
         if self._key is None:
             return unit._replace(exact=False)
+        self._follow_clock(unit.arrived)
         self._since.append(unit)
         self._forget(unit.arrived)
         if unit.arrived < self._exact_from and self._wave() is not None:
@@ -136,6 +137,13 @@ class RecentUnits:
         if unit.arrived < self._exact_from:
             self._since[-1] = unit = unit._replace(exact=False)
         return unit
+
+    def _follow_clock(self, now: float) -> None:
+        """Shift the stored units if the clock was set back: otherwise all are kept until it has caught up."""
+        back = self._since[-1].arrived - now if self._since else 0.0
+        if back > 0:
+            self._since = deque(each._replace(arrived=each.arrived - back) for each in self._since)
+            self._exact_from -= back
 
     def _forget(self, now: float) -> None:
         """Drop units older than the window, but keep waves whole that take longer because frames are late."""

@@ -187,6 +187,7 @@ class _MetricsListener(Listener):
 
     def __init__(self, metrics: SideMetrics) -> None:
         self._metrics = metrics
+        metrics.show_online(False)  # until its state arrives, if it ever does: alerts need a value
 
     def on_state(self, state: VehicleState | None) -> None:
         self._metrics.show_online(state is not None)
