@@ -143,7 +143,8 @@ def test_a_link_and_an_experiment_need_not_be_chosen() -> None:
 def test_an_experiment_may_build_on_another(tod: Command, conf: UserConf) -> None:
     conf.write(
         "experiment/mine.yaml",
-        HEAD + "defaults: [driving_test, _self_]\nlog: {video: true}\nexperiment: {about: x, duration_s: 9}\n",
+        HEAD + "defaults: [driving_test, _self_]\nlog: {video: true}\nlatency: {fixed_ms: 60}\ninsecure: true\n"
+        "experiment: {about: x, duration_s: 9}\n",
     )
     result = tod("validate", conf.word, *NARROW)
     assert result.status == 0, result.err
