@@ -16,6 +16,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
+from math import inf
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -114,11 +115,11 @@ class Paths(threading.Thread):
         return after[1] - since if len(after) > 1 else None
 
     def missed(self, name: str, begin: float, end: float) -> float:
-        """Frames missing between two times, extrapolated from those before and after."""
+        """Frames missing between two times, extrapolated from those before and after; inf if there are none."""
         frames = list(self.frames[name])
         before = [number - FPS * at for at, number in frames if begin - QUIET_S < at < begin]
         after = [number - FPS * at for at, number in frames if end < at < end + QUIET_S]
-        return median(before) - median(after)
+        return median(before) - median(after) if before and after else inf
 
 
 def soak(seed: int, scale: float) -> list[str]:
