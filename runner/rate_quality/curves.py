@@ -165,6 +165,7 @@ def best_ladder(curves: Curves, tolerance: float, narrowest: float) -> tuple[Lad
     returns    the ladder, and for each number of factors the best one, to show what fewer factors would lose
 
     If no set meets both, the one that loses least is returned.
+    raises  ValueError if no factor has two points that meet their targets
     """
     ladders = [ladder for chosen in _choices(curves) if (ladder := build_ladder(curves, chosen)) is not None]
     if not ladders:

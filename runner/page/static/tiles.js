@@ -331,10 +331,10 @@ export function startTiles() {
 
 /** Let the focus follow a selection by another window: a focused tile selects its camera again when its window is activated. */
 function moveFocus(name) {
-  const focused = document.activeElement, tile = tiles.get(name)?.element;
-  if (!(focused instanceof HTMLElement) || !focused.classList.contains("tile") || focused === tile) return;
-  focused.blur();
-  tile?.focus({ preventScroll: true });
+  const focused = document.activeElement;
+  if (!(focused instanceof HTMLElement) || !focused.classList.contains("tile") || focused.dataset.camera === name) return;
+  focused.blur(); // also where this window does not show the camera
+  focusTile(name);
 }
 
 /** Report sizes again on a screen with another scale: boxes keep their sizes in CSS pixels. */
