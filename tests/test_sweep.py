@@ -43,7 +43,8 @@ def test_the_runs_are_those_of_hydras_own_sweeper(words: list[str]) -> None:
         (["hydra.run.dir=a,b"], ["hydra.run.dir=a,b: no such key"]),
         (["total_kbps=range(0,1e9)"], [f"-m: {MAX_RUNS + 1} runs or more: must be at most {MAX_RUNS}"]),
         (["fps_max=range(1,41)", "total_kbps=range(0,30)"], ["-m: 1200 runs or more: must be at most 1000"]),
-        (["total_kbps=range(1000,9000,0)"], ["total_kbps=range(1000,9000,0): the step of a range must not be 0"]),
+        (["fps_max=range(1,9,0)"], ["fps_max=range(1,9,0): a range needs numbers, and a step other than 0"]),
+        (["fps_max=range(1,9,nan)"], ["fps_max=range(1,9,nan): a range needs numbers, and a step other than 0"]),
         (["fps_max=0,-1,10"], ["fps_max: 0: must be above 0", "fps_max: -1: must be above 0"]),  # of all runs
     ],
 )

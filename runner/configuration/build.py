@@ -431,7 +431,7 @@ def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
 def _rate(fps: float) -> Fraction:
     """A frame rate in Hz. Fractions of caps have 32 bits: 29.97002997002997 stands for 30000/1001."""
     rate = exact(fps)
-    return rate if max(rate.as_integer_ratio()) < 2**31 else rate.limit_denominator(1001)
+    return rate if max(rate.as_integer_ratio()) < 2**31 else rate.limit_denominator(1001) or rate
 
 
 def _crop(native: Mapping[str, int], width: int, height: int) -> Roi:

@@ -95,8 +95,9 @@ def sweep(words: Sequence[str]) -> list[tuple[str, ...]]:
         try:
             override, _ = _parsed(parser, text)
             swept.append(list(islice(_values(override), MAX_RUNS + 1)))
-        except ValueError:  # from Python's own range
-            problems.append(Problem(COMMAND_LINE, "", schema.shortened(text), "the step of a range must not be 0"))
+        except (ValueError, ArithmeticError):  # from Python's own range and decimal
+            rule = "a range needs numbers, and a step other than 0"
+            problems.append(Problem(COMMAND_LINE, "", schema.shortened(text), rule))
         except HydraException as error:
             problems.append(_problem(text, error))
     if problems:
