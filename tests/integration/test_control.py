@@ -204,7 +204,7 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
             time.sleep(0.05)
         assert int(flood.communicate()[0]) > 20_000
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
-    assert sorted(waits)[len(waits) * 9 // 10] < 0.2
+    assert sorted(waits)[len(waits) * 9 // 10] < 0.5
     assert max(waits) < 1  # when the flood begins, everything on the machine is delayed
     assert until(lambda: good.telemetry[-1]["refused"]) > 10_000
 
