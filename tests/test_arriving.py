@@ -107,6 +107,27 @@ def test_a_missing_last_packet_is_detected_by_timeout_and_by_the_next_frame() ->
     assert stream.counted == (8, 2)
 
 
+def test_a_frame_lost_whole_is_overdue_before_the_next_one() -> None:
+    stream = Stream()
+    stream.send(0)
+    assert not stream.frames.is_late(stream.at(9)), "the frame rate is unknown"
+    stream.send(1)
+    assert not stream.frames.is_late(stream.at(2, 10))
+    assert stream.frames.is_late(stream.at(2, 20))
+    assert stream.frames.next_number() == 65_534
+    assert stream.taken(2, 20) == [(0, 2, 2000, True), (1, 2, 2000, True)], "it has not arrived"
+    stream.send(3)
+    assert stream.taken(3) == [(3, 2, 2000, False)]
+    assert stream.frames.is_late(stream.at(4, 20)), "the missing frame does not count as a lower frame rate"
+
+
+def test_frames_that_all_arrive_late_are_not_overdue() -> None:
+    stream = Stream()
+    for frame in range(5):
+        stream.send(frame, after_ms=25 * frame)  # the link carries two thirds of what is sent
+        assert frame < 2 or not stream.frames.is_late(stream.at(frame + 1, 25 * (frame + 1)))
+
+
 def test_a_reordered_packet_is_not_missing() -> None:
     stream = Stream()
     stream.send(0)

@@ -57,6 +57,24 @@ def test_a_queue_that_was_full_before_the_first_picture_is_seen_by_its_losses(fp
     assert done.kbps(4, 20) >= 0.85 * 2300
 
 
+@pytest.mark.parametrize("fps", [7, 10])
+def test_a_link_with_a_short_queue_is_seen_by_its_losses_even_with_few_packets(fps: float) -> None:
+    """Less than a hundred packets a second, of which the link drops a third rather than delay them."""
+    done = drive(Link(steps((0, 250)), queue_s=0.05, loss=0.005), steps((0, 400)), 20, fps=fps)
+    assert done.first(0, lambda cap: cap <= 250) < 5
+
+
+@pytest.mark.parametrize("received", [20, 60, 300])
+def test_losses_are_counted_for_up_to_two_seconds(received: int) -> None:
+    """Packets a second, a quarter of which is lost."""
+    uplink, last = UplinkMemory(), None
+    for number in range(1, 61):
+        unit = ReceivedUnit("front", number / 20, number / 20 + 0.03, 1000)
+        uplink, last = estimate(uplink, LinkReport(number / 20, (unit,), received // 20, received // 60))
+    assert last
+    assert last.loss == pytest.approx(0.25 if received > 20 else 0.0, abs=0.01)
+
+
 @pytest.mark.parametrize("fps", [15, 30])
 def test_a_start_at_half_of_a_prediction_that_is_too_high_loses_less(fps: float) -> None:
     link, limit = Link(steps((0, 4000)), queue_s=0.2), steps((0, HIGH))

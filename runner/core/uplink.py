@@ -41,7 +41,8 @@ LONG_S = 0.060  # a queue from here on is too long unless it drains
 UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, measurement of the rate restarts
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
-FEW_PACKETS = 100  # with fewer packets the loss share is not reported
+COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few packets for longer ...
+FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
 OVERFLOWING = 0.04  # packets lost per packet received, more than usual on the radio link: the queue overflows
 STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
 STUCK_S = 0.6  # a queue that has not drained for this long ...
@@ -97,7 +98,7 @@ class LinkEstimate:
 
     kbps      received kbit/s; while the queue is filling or draining, the capacity. None: too little has arrived
     queue_ms  wait in the queue
-    loss      share of packets lost in the last second, 0 to 1
+    loss      share of packets lost in the last second or, with few packets, two; 0 to 1
     """
 
     kbps: float | None
@@ -157,7 +158,7 @@ class UplinkMemory:
     intervals  by camera, s between its last two units
     units      of the last second, in order of arrival
     queues     (time of the report, wait in the queue, packets received, lost) of the last STUCK_S
-    packets    (time of the report, received, lost) of the last second
+    packets    (time of the report, received, lost) for the share of losses
     resumed    when units arrived again after the last gap
     onset      when the queue was last empty; None: it is empty
     peak       kbit/s, highest rate since the onset
@@ -182,7 +183,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     returns  None before the first unit has arrived
     """
     before, uplink = uplink, _add_units(uplink, report.units)
-    packets = (*_entries_since(uplink.packets, report.at - 1.0), (report.at, report.packets, report.lost))
+    packets = _recent_packets((*uplink.packets, (report.at, report.packets, report.lost)))
     if uplink.resumed != before.resumed:
         packets = ()  # losses in a stall say nothing about the link after it
     uplink = replace(uplink, packets=packets)
@@ -310,6 +311,16 @@ def _lengthen_path(uplink: UplinkMemory) -> UplinkMemory:
     }
     units = tuple(replace(unit, queue=max(0.0, unit.queue - longer)) for unit in uplink.units)
     return replace(uplink, paths=paths, onset=None, queues=(), units=units)
+
+
+def _recent_packets(packets: Sequence[tuple[float, int, int]]) -> tuple[tuple[float, int, int], ...]:
+    """Those from which the loss share is calculated, the newest last."""
+    now, count, begin = packets[-1][0], 0, len(packets)
+    for at, received, lost in reversed(packets):
+        if at <= now - (COUNTED_S if count >= FEW_PACKETS else LONGEST_S):
+            break
+        count, begin = count + received + lost, begin - 1
+    return tuple(packets[begin:])
 
 
 def _loss(packets: Sequence[tuple[float, int, int]]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import dataclass
+from math import inf
 
 from runner.records import Arrival
 
@@ -12,6 +13,7 @@ MAX_FRAMES = 1024  # unread frames; beyond that the oldest are dropped
 TAIL_S = 0.01  # a frame whose last packet is missing counts as ended after this long without a packet ...
 TAIL_GAPS = 2  # ... and after this many times the longest recent gap within a frame: a slow link spreads packets out
 GAP_DECAY = 0.99  # factor by which that gap decays with each packet
+INTERVALS = 1.3  # a frame is overdue this many frame intervals after the previous one; less is jitter
 NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
 HEADER_BYTES = 32  # of a packet: enough for the header without contributing sources, and the capture time
@@ -80,6 +82,7 @@ class ArrivingFrames:
         self._whole = False  # no packet of the frame is missing so far
         self._open = self._emitted = False  # the frame has not ended; its arrival is in `_frames`
         self._gap = 0.0
+        self._began, self._interval = 0.0, inf  # of the current frame; s between two frames
         self._missing: deque[int] = deque(maxlen=MISORDER)  # sequence numbers
         self._restarted: int | None = None  # the sequence number that confirms a restart
         self.received = self.missing = 0  # packets received, and packets missing when a later one arrived
@@ -105,8 +108,10 @@ class ArrivingFrames:
             return True
 
     def is_late(self, now: float) -> bool:
-        """Whether the current frame is overdue, so that its last packets are missing."""
-        return self._open and now - self._arrived > max(TAIL_S, TAIL_GAPS * self._gap)
+        """Whether the rest of the current frame, or all of the next one, is overdue, so that packets are missing."""
+        if self._open:
+            return now - self._arrived > max(TAIL_S, TAIL_GAPS * self._gap)
+        return now - self._began > INTERVALS * self._interval
 
     def next_number(self) -> int:
         """Sequence number of the next packet expected."""
@@ -136,7 +141,7 @@ class ArrivingFrames:
         """Add a packet that is newer than all earlier ones. whole: no packet is missing before it."""
         self.received, self.missing = self.received + (not retransmitted), self.missing + retransmitted
         if self._newest is None or packet.stamp != self._newest.stamp:
-            self._begin(packet)
+            self._begin(packet, now, regular=whole and not retransmitted)
         elif not retransmitted:
             self._gap = max(now - self._arrived, GAP_DECAY * self._gap)
         self._whole &= whole and not retransmitted
@@ -150,11 +155,17 @@ class ArrivingFrames:
         self.missing += count
         self._missing.extend(each % (2 * HALF) for each in range(number - min(count, MISORDER), number))
 
-    def _begin(self, packet: Packet) -> None:
+    def _begin(self, packet: Packet, now: float, *, regular: bool) -> None:
+        """Begin a frame. regular: no packet is missing since the previous one, and it arrives as first sent."""
         if self._open and not self._emitted:
             self._whole = False
             self._emit()
+        before = self._clock.seconds
         self._clock.tick(packet.stamp)
+        if regular and self._newest:
+            # Frames that all arrive late are queued, not lost: requesting them again would lengthen the queue.
+            self._interval = max(self._clock.seconds - before, now - self._began)
+        self._began = now
         self._captured = self._clock.seconds if packet.captured is None else packet.captured
         self._whole = True
 

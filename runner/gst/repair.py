@@ -27,7 +27,7 @@ class RepairBuffer:
     """An rtpjitterbuffer with retransmission of missing packets (RFC 4585, 4588).
 
     The buffer itself detects a loss when the next packet arrives. After the last packet of a frame, that is up to 66 ms
-    later; so a frame whose end is missing is detected here by a timeout.
+    later; so a frame whose end, or all of it, is missing is detected here by a timeout.
 
     reorder_ms  minimum wait
     """
@@ -97,7 +97,7 @@ class RepairBuffer:
             self._buffer.set_property("do-retransmission", not self._congested)
 
     def request_tail(self) -> None:
-        """Request the next packet of an overdue frame; to be called a hundred times a second."""
+        """Request the next packet if a frame is overdue; to be called a hundred times a second."""
         if self._tail_requested or self._congested or not self.frames.is_late(time.monotonic()):
             return
         self._tail_requested = True
