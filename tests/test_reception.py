@@ -254,9 +254,23 @@ def test_floors_come_first_in_mode_s_too() -> None:
     assert drive.sent("rear")[0] < 300
 
 
+SHED = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
+
+
+def test_in_mode_s_a_camera_is_given_up_for_the_floors_of_others_and_returns() -> None:
+    drive = single(*SHED)
+    measured(drive, 0.1, 800, "filling", 60)
+    assert drive["front"].kbps >= 600
+    assert (drive["front"].sending, drive["rear"].sending) == (True, False)
+    assert drive["front"].reason.endswith("rear given up for the floors of others")
+    for t in range(10, 400):
+        measured(drive, t / 25, 3200)
+    assert {drive.sent(name) for name in NAMES} == {(1000, 1.0)}
+    assert "given up" not in drive["front"].reason
+
+
 def test_a_camera_is_given_up_for_the_floors_of_others() -> None:
-    floors = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
-    drive = Drive("vehicle=delivery_robot", "modes=safe", *floors)
+    drive = Drive("vehicle=delivery_robot", "modes=safe", *SHED)
     drive.accept("bitrate_predicted", kbps=800)
     assert (drive["front"].sending, drive["rear"].sending) == (True, False)
     assert drive["front"].reason.endswith("rear given up for the floors of others")

@@ -8,7 +8,7 @@ Memory is frozen and keyed by rule; only rules that need history use it.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cache
@@ -162,13 +162,8 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     """
     total = draft.total
     assert total is not None
-    given_up = _given_up(vehicle, state, draft, memory.get("share_above_floors", ()))
-    if given_up != memory.get("share_above_floors", ()):
-        memory = {**memory, "share_above_floors": given_up}
-    wanted = draft.demand
-    if given_up:
-        wanted = {name: allocation.ZERO if name in given_up else own for name, own in wanted.items()}
-        draft = draft.noted(f"{', '.join(given_up)} given up for the floors of others")
+    draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory, "share_above_floors")
+    wanted = _without(given_up, draft.demand)
     return draft.replaced(bitrate=_shared(vehicle, state, wanted, total)), memory
 
 
@@ -184,13 +179,31 @@ def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: K
     return {name: Fraction(share) / copies[name] for name, share in shares.items()}
 
 
-def _given_up(vehicle: Vehicle, state: State, draft: Draft, before: tuple[str, ...]) -> tuple[str, ...]:
-    order = _shed_order(vehicle)
-    if not order or draft.total is None:
-        return ()
-    floors = {name: floor * state.copies.get(name, 1) for name, floor in _floors(vehicle).items()}
-    of_all = {name: own * state.copies.get(name, 1) for name, own in draft.demand.items()}
-    return allocation.shed(of_all, draft.total, floors, order, before)
+def _give_up(
+    vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps], memory: Memory, key: str
+) -> tuple[Draft, tuple[str, ...], Memory]:
+    """The draft with a note of the cameras given up for the floors of others, these cameras, and the memory with them.
+
+    key  of the memory, where they are kept
+    """
+    before: tuple[str, ...] = memory.get(key, ())
+    order, given_up = _shed_order(vehicle), before[:0]
+    if order and draft.total is not None:
+        floors = {name: floor * state.copies.get(name, 1) for name, floor in _floors(vehicle).items()}
+        of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
+        given_up = allocation.shed(of_all, draft.total, floors, order, before)
+    if given_up != before:
+        memory = {**memory, key: given_up}
+    return (
+        draft.noted(f"{', '.join(given_up)} given up for the floors of others") if given_up else draft,
+        given_up,
+        memory,
+    )
+
+
+def _without(given_up: Collection[str], wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+    """What the cameras want, nothing for those given up."""
+    return {name: allocation.ZERO if name in given_up else own for name, own in wanted.items()} if given_up else wanted
 
 
 @cache
@@ -253,11 +266,15 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
 
     Where the bitrate falls into a lower range of Eq. (4), the factor falls with it, never above the operator's own.
     What the operator has set stays stored, and returns with the total.
+
+    Memory: the cameras given up.
     """
-    assert draft.total is not None
-    if draft.total >= sum(own * state.copies.get(name, 1) for name, own in draft.bitrate.items()):
-        return draft, memory
-    bitrates = _shared(vehicle, state, draft.bitrate, draft.total)
+    total = draft.total
+    assert total is not None
+    if total >= sum(own * state.copies.get(name, 1) for name, own in draft.bitrate.items()):
+        return draft, {**memory, "fit_to_total": ()} if memory.get("fit_to_total") else memory
+    draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory, "fit_to_total")
+    bitrates = _shared(vehicle, state, _without(given_up, draft.bitrate), total)
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, own in factors.items():
         camera, roi = vehicle.cameras[name], state.rois[name]
