@@ -3,9 +3,9 @@
   sudo python bench/reaction.py OUT                    6 minutes; one transport: --only SRT
 
 Three cameras, predictions of 4 Mbit/s that never change, 20 ms each way. The link carries 4.4 Mbit/s, and every 12 s
-half of that for 4 s. A row for each transport: time from each fall until the total is at most the new rate, the longest
-queue after the fall, and packets lost. OUT keeps the drives; existing ones are not repeated. Run it on an otherwise
-idle machine.
+half of that for 4 s. A row for each transport: time from each fall until the total, with packet headers, is at most the
+new rate, the longest queue after the fall, and packets lost. OUT keeps the drives; existing ones are not repeated. Run
+it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from uplinks import ensure_drive, row
+from uplinks import ensure_drive, row, totals
 
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.records import DecisionMade, LinkSample
+from runner.records import LinkSample
 from runner.system.files import write_whole
 
 WIDE_KBPS, NARROW_KBPS = 4400, 2200
@@ -92,10 +92,10 @@ def main() -> None:
 def reactions(drive: Drive) -> list[Reaction]:
     """To each fall of the link."""
     samples = list(drive.sides["link"].of(LinkSample))
-    decisions = list(drive.sides["vehicle"].of(DecisionMade))
-    end = decisions[-1].t - NARROW_S
+    decided = totals(drive)
+    end = decided[-1][0] - NARROW_S
     falls = [after.t for before, after in pairwise(samples) if after.kbps < before.kbps and after.t < end]
-    return [_reaction(fall, decisions, samples) for fall in map(_as_planned, falls)]
+    return [_reaction(fall, decided, samples) for fall in map(_as_planned, falls)]
 
 
 def _as_planned(t: float) -> float:
@@ -104,12 +104,12 @@ def _as_planned(t: float) -> float:
     return period * (t // period) + WIDE_S
 
 
-def _reaction(fall: float, decisions: list[DecisionMade], samples: list[LinkSample]) -> Reaction:
+def _reaction(fall: float, decided: list[tuple[float, float]], samples: list[LinkSample]) -> Reaction:
     until = fall + NARROW_S
-    in_force = [line.total_kbps for line in decisions if line.t <= fall][-1]
+    in_force = [kbps for t, kbps in decided if t <= fall][-1]
     if in_force <= NARROW_KBPS:
         raise SystemExit(f"the total was {in_force} kbit/s before the link fell at {fall:g} s: nothing to react to")
-    low = (line.t for line in decisions if fall < line.t < until and line.total_kbps <= NARROW_KBPS)
+    low = (t for t, kbps in decided if fall < t < until and kbps <= NARROW_KBPS)
     seconds = next(low, np.inf) - fall
     return Reaction(seconds, max(sample.queue_ms for sample in samples if fall <= sample.t < until))
 

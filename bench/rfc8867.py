@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, cameras, ensure_drive, queue_ms, row, shown, switches
+from uplinks import SETTLED_S, Figures, cameras, ensure_drive, queue_ms, row, shown, switches, totals
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
@@ -27,7 +27,7 @@ from runner.records import DecisionMade, LinkSample
 EXPERIMENT = "experiment=rfc8867"
 FIGURES = {
     "used": "link used %",
-    "tcp": "by TCP %",
+    "tcp": "of it by TCP %",
     "p50": "queue p50 ms",
     "p95": "p95",
     "p99": "p99",
@@ -40,6 +40,7 @@ FIGURES = {
     "up": "up s",
 }
 SETTLED_SHARE = 0.8  # share of the new rate
+TCP_WIRE = 1500 / 1448  # bytes on the wire of a full TCP segment with time stamps per byte of its payload
 
 
 def main() -> None:
@@ -73,7 +74,7 @@ def figures(drive: Drive) -> Figures:
     first, last = samples[0], samples[-1]
     return {
         "used": 100 * (last.bytes - first.bytes) / capacity_bytes,
-        "tcp": 100 * (last.tcp_bytes - first.tcp_bytes) / capacity_bytes,
+        "tcp": 100 * TCP_WIRE * (last.tcp_bytes - first.tcp_bytes) / capacity_bytes,
         **queue_ms(drive),
         "dropped": last.dropped - first.dropped,
         "lost": float(whole.lost or 0),
@@ -99,17 +100,19 @@ def _below_floor(drive: Drive) -> float:
 def settling(drive: Drive) -> Figures:
     """Time from a step of the link's rate until the total is at most the new rate and at least SETTLED_SHARE of it, s.
 
+    The total counts with its packet headers.
+
     returns  medians by direction; inf: not before the next step; nan: no such step
     """
     ahead = drive.sides["link"].began.time - drive.sides["vehicle"].began.time
     samples = [(sample.t + ahead, sample.kbps) for sample in drive.sides["link"].of(LinkSample)]
-    totals = [(line.t, line.total_kbps) for line in drive.sides["vehicle"].of(DecisionMade)]
     steps = [(t, now, now < was) for (_, was), (t, now) in pairwise(samples) if now != was]
+    decided = totals(drive)
     ends = [*(t for t, _, _ in steps[1:]), np.inf]
     waits: dict[bool, list[float]] = {True: [], False: []}
     for (t, kbps, down), end in zip(steps, ends, strict=False):  # no step, no end
-        in_force = [total for since, total in totals if since <= t][-1:]
-        after = [(t, total) for total in in_force] + [(since, total) for since, total in totals if t < since < end]
+        in_force = [total for since, total in decided if since <= t][-1:]
+        after = [(t, total) for total in in_force] + [(since, total) for since, total in decided if t < since < end]
         settled = (since for since, total in after if SETTLED_SHARE * kbps <= total <= kbps)
         waits[down].append(next(settled, np.inf) - t)
     return {name: median(waits[down]) if waits[down] else np.nan for name, down in (("down", True), ("up", False))}

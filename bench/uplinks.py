@@ -30,12 +30,13 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
-from runner.core.model import Camera, plain
-from runner.drive.quality_file import DOCUMENT, read_quality
+from runner.core.budget import wire_kbps
+from runner.core.model import Camera, exact, plain
+from runner.drive.quality_file import DOCUMENT, DeliveredQuality, read_quality
 from runner.drive.read import Drive, read_drive
-from runner.drive.series import Series, series
+from runner.drive.series import CameraSeries, Series, series
 from runner.drive.statistics import statistics
-from runner.records import LinkSample
+from runner.records import DecisionMade, LinkSample
 from runner.system.files import write_whole
 
 EXPERIMENT = "experiment=wrong_prediction"
@@ -68,6 +69,7 @@ PANELS = {
     "mssim": ("MSSIM of delivered pictures (more is better)", "linear"),
 }
 COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#8C564B", "#7F7F7F", "#000000")
+MARKERS = ("o", "s", "^")  # one for each round through the colours
 Figures = dict[str, float]
 Floats = NDArray[np.float64]
 
@@ -156,10 +158,10 @@ def figures(path: Path) -> Figures:
     ms = np.concatenate([received.arrival_ms for received in arrived])
     usable = _at(link_t, link_kbps, times) >= USABLE_KBPS
     counts = usable & (times > SETTLED_S) & np.isfinite(ms)
-    means = [
-        fmean(score for t, score in zip(camera.t, camera.mssim, strict=True) if t > SETTLED_S)
-        for camera in read_quality(path).values()
-    ]
+    delivered = read_quality(path)
+    if missing := cameras(logged).keys() - delivered.keys():
+        raise SystemExit(f"{path}: no pictures were delivered of {', '.join(sorted(missing))}")
+    means = [_mssim(camera, link_t, link_kbps) for camera in delivered.values()]
     return {
         "frozen": 100 * whole.frozen,
         "back_s": _recovery_s(over_time, link_t, link_kbps),
@@ -174,6 +176,12 @@ def figures(path: Path) -> Figures:
         "switches": switches(over_time),
         "dropped": _dropped(over_time, {name: float(camera.fps) for name, camera in cameras(logged).items()}),
     }
+
+
+def _mssim(camera: DeliveredQuality, link_t: Floats, link_kbps: Floats) -> float:
+    """Mean over the time in which the link carries at least USABLE_KBPS."""
+    t, scores = np.array(camera.t), np.array(camera.mssim)
+    return float(scores[(t > SETTLED_S) & (_at(link_t, link_kbps, t) >= USABLE_KBPS)].mean())
 
 
 def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
@@ -226,6 +234,18 @@ def cameras(drive: Drive) -> Mapping[str, Camera]:
     return configuration([], base=(config, "config"), runnable=False).vehicle().cameras
 
 
+def totals(drive: Drive) -> list[tuple[float, float]]:
+    """The total in force over time with its packet headers: s by the vehicle's log, kbit/s."""
+    mounted = cameras(drive)
+    return [
+        (
+            line.t,
+            float(wire_kbps([mounted[name] for name, own in line.cameras.items() if own.on], exact(line.total_kbps))),
+        )
+        for line in drive.sides["vehicle"].of(DecisionMade)
+    ]
+
+
 def _link_use(drive: Drive, over_time: Series) -> float:
     """Bytes that passed over those that could have: at most what the link carried and the cameras may send."""
     most = float(plain(sum(camera.rate_quality.b_full for camera in cameras(drive).values())))
@@ -235,14 +255,21 @@ def _link_use(drive: Drive, over_time: Series) -> float:
 
 
 def _recovery_s(over_time: Series, t: Floats, kbps: Floats) -> float:
-    """Time from the end of an outage to the next picture, over all cameras and outages: p95, s; nan without one."""
-    waits = [
-        float(came[0] - end)
-        for end in _outages(t, kbps)
-        for camera in over_time.cameras.values()
-        if camera.received and len(came := camera.received.arrival_t[camera.received.arrival_t > end])
-    ]
-    return float(np.percentile(waits, 95)) if waits else float("nan")
+    """Time from the end of an outage until a camera is live again, over all cameras and outages: p95, s.
+
+    A camera is live once a picture arrives that was captured since then. inf: never; nan: there was no outage
+    """
+    waits = [_wait(camera, end) for end in _outages(t, kbps) for camera in over_time.cameras.values()]
+    return float(np.percentile(waits, 95, method="higher")) if waits else float("nan")
+
+
+def _wait(camera: CameraSeries, since: float) -> float:
+    """Time until a picture arrives that was captured since then, s; inf: never."""
+    if camera.received is None:
+        return np.inf
+    t, ms = camera.received.arrival_t, camera.received.arrival_ms
+    arrived = t[t - ms / 1000 >= since]
+    return float(arrived[0] - since) if len(arrived) else np.inf
 
 
 def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
@@ -278,13 +305,14 @@ def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
     """Each run a dot, by uplink and condition, and a line at the median of the runs."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     names = list(dict.fromkeys(name for conditions in found.values() for name in conditions))
-    colours = dict(zip(names, COLOURS, strict=False))
+    colours = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+    markers = {name: MARKERS[number // len(COLOURS)] for number, name in enumerate(names)}
     for axes, (key, (title, scale)) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
         for place, conditions in enumerate(found.values()):
             for number, (name, drives) in enumerate(conditions.items()):
                 x = place + 0.8 * ((number + 0.5) / len(names) - 0.5)
                 values = [drive[key] for drive in drives]
-                axes.plot([x] * len(values), values, "o", color=colours[name], markersize=4, alpha=0.5)
+                axes.plot([x] * len(values), values, markers[name], color=colours[name], markersize=4, alpha=0.5)
                 axes.plot([x - 0.03, x + 0.03], [median(values)] * 2, color=colours[name], linewidth=3)
         axes.set(title=title, yscale=scale, xticks=range(len(found)), xlim=(-0.5, len(found) - 0.5))
         axes.set_xticklabels([fill(re.sub("[_-]", " ", name), 14) for name in found], fontsize=8)
@@ -292,14 +320,15 @@ def picture(found: dict[str, dict[str, list[Figures]]]) -> Figure:
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
         axes.grid(axis="y", alpha=0.3)
-    handles = [Line2D([], [], color=colours[name], marker="o", label=name.replace("_", " ")) for name in names]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(names), title="prediction, or policy")
+    labels = {name: name.replace("_", " ") for name in names}
+    handles = [Line2D([], [], color=colours[name], marker=markers[name], label=labels[name]) for name in names]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(8, len(names)), title="prediction, or policy")
     return figure
 
 
 def shown(key: str, values: Sequence[float]) -> str:
     digits = 3 if key in ("mssim", "worst") else 0 if key in ("p50_ms", "p99_ms", "used", "lost", "switches") else 1
-    known = [value for value in values if np.isfinite(value)]
+    known = [value for value in values if not np.isnan(value)]  # inf: it never happened
     if not known:
         return "–"
     ends = f" ({min(known):.{digits}f} to {max(known):.{digits}f})" if len(known) > 1 else ""

@@ -70,11 +70,13 @@ def measure(
 
     clips       by camera, the clip that its source played; cameras without one are left out
     progress    called a few times a second, from this thread, with the share of the cameras done
-    on_warning  called with a line about each camera that is left out because its files cannot be read
+    on_warning  called with a line about each camera that is left out: nothing was received, or files cannot be read
     """
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
     sent, received_files = files(vehicle), files(operator)
     names = [name for name in cameras if name in sent and name in received_files]
+    for name in cameras.keys() & sent.keys() - received_files.keys() if names else ():
+        on_warning(f"{name} is left out: no picture of it was received, so mean and worst are too high")
     videos = _Videos(drive.path, read_video, decode_video)
 
     def one(name: str) -> DeliveredQuality:

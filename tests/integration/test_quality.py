@@ -100,6 +100,22 @@ def test_a_camera_whose_file_cannot_be_read_is_left_out(tod, drive, tmp_path):
     assert "front_center is left out: " in result.err
 
 
+def test_a_camera_of_which_nothing_was_received_is_reported(tod, drive, tmp_path):
+    path = tmp_path / "blind"
+    shutil.copytree(drive, path)
+    began = json.loads((path / "drive.jsonl").read_text().partition("\n")[0])
+    began["config"]["cameras"]["mast"] = {
+        **began["config"]["cameras"]["front_center"],
+        "place": {"row": 5, "column": 5},
+    }
+    lines = [json.loads(line) for line in (path / "drive.jsonl").read_text().splitlines()[1:]]
+    sent = [{**line, "camera": "mast"} for line in lines if line.get("log") == "video"]
+    (path / "drive.jsonl").write_text("".join(json.dumps(line) + "\n" for line in (began, *sent, *lines)))
+    result = tod("quality", str(path))
+    assert result.status == 0, result.err
+    assert "mast is left out: no picture of it was received, so mean and worst are too high" in result.err
+
+
 def test_without_capture_times_nothing_is_compared(tod, drive, tmp_path):
     def timeless(camera):
         camera["arrivals"] = [[t, None] for t, _ in camera["arrivals"]]
