@@ -182,6 +182,24 @@ def test_the_reverse_direction_has_one_rate(tmp_path: Path) -> None:
             limited("link=relay", back.format(words))
 
 
+def test_delays_over_time_add_to_the_constant_one(tmp_path: Path) -> None:
+    one_way, both = tmp_path / "delay.csv", tmp_path / "rtt.csv"
+    one_way.write_text("t_s,delay_ms\n0,10\n1,200\n")
+    both.write_text("t_s,rtt_ms\n0,30\n0.5,50\n")
+    back = f"link.reverse={{kbps: 70, queue_ms: 100, delay_ms: 5, delay_file: {both}}}"
+    limit = limited("link=netns", "link.loop=false", "link.delay_ms=20", f"link.delay_file={one_way}", back).limit
+    assert [limit.rates(t)[2:] for t in (0, 0.5, 1, 9)] == [(30, 20), (30, 30), (220, 30), (220, 30)]
+    assert limited("link=relay").limit.rates(0)[2:] == (None, None)
+    with pytest.raises(ConfigError, match=r"delay_file: .*: no column delay_ms: must be a header with the columns"):
+        limited("link=relay", f"link.delay_file={_rates(tmp_path)}")
+
+
+def _rates(tmp_path: Path) -> Path:
+    path = tmp_path / "rates.csv"
+    path.write_text("t_s,kbps\n0,500\n1,50\n")
+    return path
+
+
 def test_a_link_needs_a_log_of_its_effect(tod: Command) -> None:
     result = tod("demo", "link=relay", "source=test")
     assert result.status == 2

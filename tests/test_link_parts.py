@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from itertools import pairwise
 
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.link.bucket import Bucket
-from runner.link.direction import LossModel
+from runner.link.direction import Direction, LossModel
 from runner.link.limit import burst_bytes, queue_bytes
 from runner.link.rtsp import Splitter, ports, with_ports
 
@@ -136,6 +138,22 @@ def test_ports_are_read_and_replaced_in_the_transport_header_alone():
     for other in (SDP, PACKET):
         assert ports(other, "client_port") == []
         assert with_ports(other, "client_port", lambda _: 1) == other
+
+
+def test_a_delay_changes_for_later_packets_and_none_overtakes_another():
+    async def deliver():
+        direction, arrived = Direction(10_000, 100, 0), []
+        for number, delay_ms in enumerate((120, 0, 40)):
+            direction.change(None, delay_ms)
+            direction.put(100, lambda number=number: arrived.append((number, time.monotonic() - began)))
+        while len(arrived) < 3:
+            await asyncio.sleep(0.005)
+        return arrived
+
+    began = time.monotonic()
+    arrived = asyncio.run(deliver())
+    assert [number for number, _ in arrived] == [0, 1, 2]
+    assert arrived[0][1] >= 0.12
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.002, 1), (0.01, 1), (0.03, 10), (0.2, 3)])

@@ -87,7 +87,8 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     back = data.get("reverse")
     reverse = _reverse(back, data["loop"], bases) if back else None
     tcp = _tcp(data["tcp"]) if data.get("tcp") else None
-    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), reverse=reverse, tcp=tcp))
+    delay_at = _delays(data, data["loop"], bases)
+    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), delay_at=delay_at, reverse=reverse, tcp=tcp))
 
 
 def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> RateAtTime:
@@ -102,7 +103,22 @@ def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reve
     constant = exact(kbps or 0)
     with within("reverse"):
         rates = _recorded(data, loop, bases) if file else lambda _: constant
-    return Reverse(lambda t: float(rates(t)), **_path(data))
+        delay_at = _delays(data, loop, bases)
+    return Reverse(lambda t: float(rates(t)), **_path(data), delay_at=delay_at)
+
+
+def _delays(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Callable[[float], float] | None:
+    """The delay over time that a file states, ms: `delay_ms`, or half of `rtt_ms`."""
+    if not data.get("delay_file"):
+        return None
+    from runner.pqos.table import DELAY, header
+
+    path = find_file(data, "delay_file", bases)
+    try:
+        delays, share = trace(path, loop, None, DELAY), 1.0 if "delay_ms" in header(path) else 0.5
+    except ModelError as error:
+        raise ModelError("delay_file", error.found, error.rule) from None
+    return lambda t: share * float(delays(t))
 
 
 def _tcp(data: Mapping[str, Any]) -> TcpFlows:

@@ -122,7 +122,7 @@ class ChildShaper:
         if self._tcp and not self._tcp_started:
             self._tcp_started = True
             self._tcp.ask("start")
-        return LinkCounters(**self._child.ask(" ".join(str(kbps) for kbps in rates if kbps is not None)))
+        return LinkCounters(**self._child.ask(json.dumps(rates)))
 
     def check(self) -> None:
         for child in (self._child, self._tcp):

@@ -58,10 +58,14 @@ class Direction:
         self._bucket.put(size, delivery, time.monotonic(), keep=keep)
         self._deliver()
 
-    def set_rate(self, kbps: float) -> dict[str, Any]:
-        """Change the rate. Returns `runner.link.limit.LinkCounters` as a dictionary."""
+    def change(self, kbps: float | None, delay_ms: float | None) -> dict[str, Any]:
+        """Change rate and delay; None: unchanged. Returns `runner.link.limit.LinkCounters` as a dictionary."""
         now = time.monotonic()
-        self._bucket.set_rate(kbps, now)
+        self._deliver()  # what has left by now has the former delay
+        if kbps is not None:
+            self._bucket.set_rate(kbps, now)
+        if delay_ms is not None:
+            self._delay_s = delay_ms / 1000
         self._deliver()
         return asdict(self._bucket.counters(now)) | {"lost": self._lost}
 
@@ -78,7 +82,8 @@ class Direction:
         """Deliver all packets that are due, and set a timer for the rest."""
         now = time.monotonic()
         for left, delivery in self._bucket.take(now):
-            self._delayed.append((left + self._delay_s, delivery))
+            newest = self._delayed[-1][0] if self._delayed else left
+            self._delayed.append((max(newest, left + self._delay_s), delivery))  # packets stay in order
         while self._delayed and self._delayed[0][0] <= now:
             self._delayed.popleft()[1]()
         self._departed.set()
@@ -102,7 +107,7 @@ class Link(NamedTuple):
 
 
 async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -> None:
-    """Set rates from standard input until it ends: each line has those of both directions or of the first one, kbit/s.
+    """Set rates from standard input until it ends: each line has `runner.link.limit.Rates` as a list in JSON.
 
     Each line is answered with the counters of the first direction.
 
@@ -111,10 +116,9 @@ async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     while line := await lines.readline():
-        up, *down = map(float, line.split())
-        for kbps in down:
-            link.down.set_rate(kbps)
-        print(json.dumps({**link.up.set_rate(up), **more()}), flush=True)
+        up, down, up_delay_ms, down_delay_ms = json.loads(line)
+        link.down.change(down, down_delay_ms)
+        print(json.dumps({**link.up.change(up, up_delay_ms), **more()}), flush=True)
 
 
 def exact_loop() -> asyncio.AbstractEventLoop:

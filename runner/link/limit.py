@@ -11,10 +11,12 @@ BURST_S = 0.002  # of data that an idle link passes in a burst; with less, late 
 
 
 class Rates(NamedTuple):
-    """kbit/s in force from vehicle to operator and back; None: unlimited."""
+    """kbit/s in force from vehicle to operator and back, and the delay each way, ms; None: unlimited, unchanged."""
 
     up: float
     down: float | None
+    up_delay_ms: float | None = None
+    down_delay_ms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Reverse:
     delay_ms: float
     loss: float = 0.0
     burst: float = 1.0
+    delay_at: Callable[[float], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,7 @@ class Limit:
     kbps_at   rate in force t seconds after the start of the drive; 0: nothing passes
     queue_ms  packets that would wait longer are dropped
     delay_ms  one way, in addition to the wait
+    delay_at  further delay t seconds after the start of the drive, ms; packets stay in order. None: none
     loss      share of packets lost after the queue; with a relay, of UDP packets
     burst     mean number of packets lost in a row
     reverse   effect on traffic from the operator to the vehicle; None: none
@@ -62,19 +66,27 @@ class Limit:
     delay_ms: float
     loss: float = 0.0
     burst: float = 1.0
+    delay_at: Callable[[float], float] | None = None
     reverse: Reverse | None = None
     tcp: TcpFlows | None = None
 
     def rates(self, t: float) -> Rates:
         """The rates to set; before the start, those at the start."""
-        at = max(0.0, t)
-        return Rates(float(self.kbps_at(at)), float(self.reverse.kbps_at(at)) if self.reverse else None)
+        at, back = max(0.0, t), self.reverse
+        return Rates(
+            float(self.kbps_at(at)), float(back.kbps_at(at)) if back else None, _delay_ms(self, at), _delay_ms(back, at)
+        )
 
     def settings(self) -> dict[str, Any]:
         """Both directions at the start, for a forwarding process (`runner.link.direction`)."""
         rates = self.rates(0)
         back = None if self.reverse is None else _direction(self.reverse, rates.down)
         return {"up": _direction(self, rates.up), "down": back}
+
+
+def _delay_ms(one: Limit | Reverse | None, t: float) -> float | None:
+    """None: it does not change over time."""
+    return one.delay_ms + one.delay_at(t) if one and one.delay_at else None
 
 
 def _direction(one: Limit | Reverse, kbps: float | None) -> dict[str, float | None]:

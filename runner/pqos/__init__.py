@@ -19,6 +19,7 @@ from runner.core.model import Kbps, ModelError, exact
 from runner.pqos.settings import find_file, find_path, number, within
 
 if TYPE_CHECKING:
+    from runner.pqos.table import Column
     from runner.pqos.track import Track
 
 
@@ -90,16 +91,17 @@ class WrongPqos:
         return replace(due, t=event.t, kbps=due.kbps * self._share, lower_kbps=lower)
 
 
-def trace(path: Path, loop: bool, off_trace: Kbps | None) -> Callable[[float], Kbps]:
+def trace(path: Path, loop: bool, off_trace: Kbps | None, column: Column | None = None) -> Callable[[float], Kbps]:
     """Rate in force at a time: that of the last row up to it; `off_trace` before the first row and after the end.
 
     With `off_trace` None, the first and the last rate apply there.
 
-    path  CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop restarts
+    path    CSV with t_s (never decreasing) and a rate; its last row lasts as long as the one before, then a loop begins
+    column  of the file in place of the rate
     """
     from runner.pqos.table import RATE, TIME, read_table
 
-    table = read_table(path, (TIME, RATE))
+    table = read_table(path, (TIME, column or RATE))
     if len(table) < 2:
         raise ModelError("file", path, "must have at least two rows, otherwise the duration of a rate is unknown")
     times, rates = table[:, 0].tolist(), [exact(rate) for rate in table[:, 1].tolist()]

@@ -37,6 +37,7 @@ RATE = Column(("kbps", "bandwidth_kbps", "uplink_kbps"), 0, FINITE, "must be a f
 TIME = Column(
     ("t_s",), -FINITE, FINITE, "must be a finite number of seconds, not below that of the row before", time=True
 )
+DELAY = Column(("delay_ms", "rtt_ms"), 0, 60_000, "must be a number of ms from 0 to 60000")
 SPEED = Column(("speed_mps",), 0, FINITE, "must be a finite number of m/s, 0 or more")
 
 

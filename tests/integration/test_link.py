@@ -76,12 +76,12 @@ def full_rate(lines):
 
 
 @contextmanager
-def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_ms=0):
+def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_at=None):
     """One camera that sends as much as it may, through a link, to a receiver."""
     from runner.apply import OperatorSide
 
     lines = []
-    limit = Limit(kbps_at, queue_ms, delay_ms)
+    limit = Limit(kbps_at, queue_ms, 100, delay_at=delay_at) if delay_at else Limit(kbps_at, queue_ms, 0)
     media, control = (Endpoint("127.0.0.1", free_port()) for _ in range(2))
     words = (*ROBOT, *NOISE, f"pqos.kbps={sent_kbps}", "media.max_viewers=2")
     with (
@@ -208,7 +208,7 @@ def _narrow(client, kbps):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_delay_is_added_to_the_wait(kind):
-    with driving(kind, lambda t: 5000, sent_kbps=1000, delay_ms=300) as drive:
+    with driving(kind, lambda t: 5000, sent_kbps=1000, delay_at=lambda t: 200) as drive:
         drive.settle()
         assert until(lambda: drive.received().latency_ms) >= 300
         assert drive.lines[-1].dropped == 0
