@@ -3,20 +3,34 @@
   sudo python bench/rfc8867.py OUT                            all cases, 25 minutes
   sudo python bench/rfc8867.py OTHER --only 5_6_long_tcp --runs 5 --words modes=paper
 
-A row for each case: medians over the runs, and their range. OUT keeps the drives; existing ones are not repeated.
-Run it on an otherwise idle machine, as root for the cases with TCP.
+A row for each case: medians over the runs, and their range. A row is void if a busy machine dropped frames. OUT keeps
+the drives, existing ones are not repeated, and OUT/rfc8867.png charts the first run of each case. Run it on an
+otherwise idle machine, as root for the cases with TCP.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import numpy as np
-from uplinks import SETTLED_S, Figures, cameras, ensure_drive, queue_ms, row, shown, switches, totals
+from matplotlib.figure import Figure
+from uplinks import (
+    DROPPED,
+    SETTLED_S,
+    Figures,
+    cameras,
+    dropped_share,
+    ensure_drive,
+    queue_ms,
+    row,
+    shown,
+    switches,
+    totals,
+)
 
 from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
@@ -25,6 +39,7 @@ from runner.drive.statistics import statistics
 from runner.records import DecisionMade, LinkSample
 
 EXPERIMENT = "experiment=rfc8867"
+WEIGHTED = "front_center"  # the camera whose weight the case `weights` triples
 FIGURES = {
     "used": "link used %",
     "tcp": "of it by TCP %",
@@ -38,6 +53,8 @@ FIGURES = {
     "below": "below a floor %",
     "down": "settled down s",
     "up": "up s",
+    "front": f"{WEIGHTED} of all cameras %",
+    "busy": "frames dropped by the cameras %",
 }
 SETTLED_SHARE = 0.8  # share of the new rate
 TCP_WIRE = 1500 / 1448  # bytes on the wire of a full TCP segment with time stamps per byte of its payload
@@ -53,10 +70,16 @@ def main() -> None:
     cases = configuration([EXPERIMENT]).experiment().runs
     print(row("case", *FIGURES.values()))
     print(row(*["---"] * (len(FIGURES) + 1)), flush=True)
+    charted: dict[str, Drive] = {}
     for name in options.only or cases:
         paths = [options.output / f"{name}.{number}" for number in range(options.runs)]
-        drives = [figures(_drive(path, (*cases[name], *options.words))) for path in paths]
-        print(row(name, *(shown(key, [drive[key] for drive in drives]) for key in FIGURES)), flush=True)
+        drives = [_drive(path, (*cases[name], *options.words)) for path in paths]
+        found = [figures(drive) for drive in drives]
+        void = median(one["busy"] for one in found) > DROPPED
+        label = f"{name} (void)" if void else name
+        print(row(label, *(shown(key, [one[key] for one in found]) for key in FIGURES)), flush=True)
+        charted[name] = drives[0]
+    picture(charted).savefig(options.output / "rfc8867.png", dpi=100)
 
 
 def _drive(path: Path, words: Sequence[str]) -> Drive:
@@ -82,6 +105,8 @@ def figures(drive: Drive) -> Figures:
         "switches": switches(over_time),
         "below": 100 * _below_floor(drive),
         **settling(drive),
+        "front": 100 * _share(drive, WEIGHTED),
+        "busy": dropped_share(over_time, cameras(drive)),
     }
 
 
@@ -95,6 +120,37 @@ def _below_floor(drive: Drive) -> float:
         if any(own.on and own.kbps < floors[name] for name, own in line.cameras.items())
     )
     return below / (decisions[-1].t - decisions[0].t) if below else 0.0  # with the cameras off nothing may be decided
+
+
+def _share(drive: Drive, camera: str) -> float:
+    """Share of all bitrates that was allocated to a camera; nan: nothing was allocated."""
+    decisions = [line for line in drive.sides["vehicle"].of(DecisionMade) if line.t > SETTLED_S]
+    spans = [(after.t - line.t, line.cameras) for line, after in pairwise(decisions)]
+    of_all = sum(span * sum(own.kbps for own in decided.values()) for span, decided in spans)
+    return sum(span * decided[camera].kbps for span, decided in spans) / of_all if of_all else np.nan
+
+
+def picture(drives: Mapping[str, Drive]) -> Figure:
+    """By case over time: the link's rate and what passed it, and the wait in front of it."""
+    figure = Figure(figsize=(12, 2.4 * len(drives)), layout="constrained")
+    for (rates, waits), (name, drive) in zip(
+        figure.subplots(len(drives), 2, squeeze=False), drives.items(), strict=True
+    ):
+        samples = drive.sides["link"].of(LinkSample)
+        t, kbps, sent, tcp, queue = np.array(
+            [(one.t, one.kbps, one.bytes, TCP_WIRE * one.tcp_bytes, one.queue_ms) for one in samples]
+        ).T
+        seconds = np.arange(np.ceil(t[0]), np.floor(t[-1]))
+        passed, of_tcp = (np.diff(np.interp(seconds, t, each)) * 8 / 1000 for each in (sent, tcp))
+        rates.step(t, kbps, where="post", color="#000000", linewidth=1, label="link")
+        rates.plot(seconds[1:], passed - of_tcp, color="#0072B2", linewidth=1, label="cameras and control")
+        if of_tcp.any():
+            rates.plot(seconds[1:], of_tcp, color="#E69F00", linewidth=1, label="TCP")
+        waits.plot(t, queue, color="#0072B2", linewidth=0.7)
+        rates.set(title=name.replace("_", " "), ylabel="kbit/s", xlabel="s", ylim=(0, None))
+        waits.set(title="wait in the queue", ylabel="ms", xlabel="s", ylim=(0, None))
+        rates.legend(fontsize=8, ncols=3)
+    return figure
 
 
 def settling(drive: Drive) -> Figures:

@@ -174,7 +174,7 @@ def figures(path: Path) -> Figures:
         "worst": min(means),
         **queue_ms(logged, "queue_"),
         "switches": switches(over_time),
-        "dropped": _dropped(over_time, {name: float(camera.fps) for name, camera in cameras(logged).items()}),
+        "dropped": dropped_share(over_time, cameras(logged)),
     }
 
 
@@ -184,7 +184,7 @@ def _mssim(camera: DeliveredQuality, link_t: Floats, link_kbps: Floats) -> float
     return float(scores[(t > SETTLED_S) & (_at(link_t, link_kbps, t) >= USABLE_KBPS)].mean())
 
 
-def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
+def dropped_share(over_time: Series, mounted: Mapping[str, Camera]) -> float:
     """Frames that the cameras should have sent and did not, %: the machine was too busy.
 
     Counted while they send: between two samples in which nothing was sent, nobody watched, or sending was off.
@@ -197,7 +197,7 @@ def _dropped(over_time: Series, fps: Mapping[str, float]) -> float:
             continue
         sends = np.convolve(frames == 0, np.ones(3), "same") == 0  # excludes samples in which it starts or stops
         sends &= camera.sent.t[:-1] >= SETTLED_S
-        sent, due = sent + float(frames[sends].sum()), due + fps[name] * float(seconds[sends].sum())
+        sent, due = sent + float(frames[sends].sum()), due + float(mounted[name].fps) * float(seconds[sends].sum())
     return max(0.0, 100 * (1 - sent / due)) if due else float("nan")
 
 

@@ -41,7 +41,7 @@ SETTINGS = 10
 STEP_S = 5.0  # by which clocks are set, forwards and backwards
 QUICKEST_MS, SLOWEST_MS = 1.0, 1000.0  # possible latencies here, on a busy machine
 PREDICTED = tuple(range(3000, 1500, -100))  # kbit/s, each for a second, repeated
-EXPIRE_S = 8.0  # lifetime of the certificates that expire
+EXPIRE_S = 12.0  # lifetime of the certificates that expire: on a slow machine new ones take seconds to be in use
 
 
 class Fault(NamedTuple):
