@@ -1,15 +1,18 @@
-"""Metrics for Prometheus: those of every record, under valid names, and health."""
+"""Metrics for Prometheus: those of every record, under valid names, and health; the rules of deploy/prometheus."""
 
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 import urllib.error
 import urllib.request
 from typing import Any
 
 import pytest
+import yaml
 
-from rig import free_port
+from rig import CHECKOUT, free_port
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.metrics.side import metrics_of
@@ -44,8 +47,10 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
         assert 'tod_vehicle_online{vehicle="car"} 1.0' in text
         assert "tod_predicted_kbps{" not in text  # unknown
         assert fetch(port, "/health") == (200, "ok\n")
+        assert 'tod_healthy{vehicle="car"} 1.0' in text
         problems.append("the control loop hangs in a rule")
         assert fetch(port, "/health") == (503, "the control loop hangs in a rule\n")
+        assert 'tod_healthy{vehicle="car"} 0.0' in fetch(port, "/metrics")[1]
         assert fetch(port, "/") == (404, "expected /metrics or /health\n")
     finally:
         figures.close()
@@ -90,3 +95,35 @@ def test_a_vehicle_whose_state_never_arrived_is_offline():
     _MetricsListener(SideMetrics(metrics, None))
     (online,) = metrics.collect()
     assert (online.name, [sample.value for sample in online.samples]) == ("tod_vehicle_online", [0.0])
+
+
+def test_free_space_is_that_of_the_disk_of_the_log(tmp_path):
+    from runner.metrics.prometheus import Metrics
+
+    def free(log):
+        return {metric.name: metric.samples[0].value for metric in Metrics("car", log).collect()}
+
+    assert free(None) == {}
+    disk = shutil.disk_usage(tmp_path)
+    assert free(tmp_path)["tod_log_free_bytes"] == pytest.approx(disk.free, abs=0.01 * disk.total)
+    assert free(tmp_path / "removed") == {"tod_log_free_bytes": 0.0}
+
+
+def test_alerts_are_evaluated_often_enough_and_use_nothing_but_figures_of_the_sides():
+    """Names are checked against those of a drive in test_metrics_sides.py."""
+    rules = yaml.safe_load((CHECKOUT / "deploy/prometheus/alerts.yml").read_text())
+    scrape = yaml.safe_load((CHECKOUT / "deploy/prometheus/scrape.yml").read_text())
+    (every,) = {job["scrape_interval"] for job in scrape["scrape_configs"]}
+    for group in rules["groups"]:
+        assert group["interval"] == every == "1s"
+        for rule in group["rules"]:
+            names = re.findall(r"\b[a-z]+_[a-z_]+\b", rule["expr"])
+            assert names
+            assert all(name.startswith("tod_") for name in names), rule
+
+
+@pytest.mark.skipif(not shutil.which("promtool"), reason="needs promtool, of Debian's package prometheus")
+def test_each_alert_fires_when_it_should():
+    command = ["promtool", "test", "rules", CHECKOUT / "tests/alerts_test.yml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

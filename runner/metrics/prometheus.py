@@ -6,9 +6,11 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
@@ -99,10 +101,12 @@ class Metrics(Collector):
     """The newest record of each kind, as metrics. Records are taken from any thread.
 
     vehicle  its name, a label of every metric
+    log      directory that the drive is logged to; None: it is not logged
     """
 
-    def __init__(self, vehicle: str) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: str, log: Path | None = None) -> None:
+        self._vehicle, self._log = vehicle, log
+        self.healthy: Healthy | None = None
         self._newest: dict[type, Any] = {}
         self._online: bool | None = None
 
@@ -120,6 +124,10 @@ class Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         if self._online is not None:
             yield self._family("vehicle_online", "1 while the vehicle is online", [((), float(self._online))])
+        if self._log:
+            yield self._family("log_free_bytes", "Free space for the drive's log", [((), float(_free(self._log)))])
+        if self.healthy:
+            yield self._family("healthy", "1 while the side works", [((), float(self.healthy() is None))])
         for kind, record in list(self._newest.items()):
             of_all, of_camera = METRICS[kind]
             for metric in of_all:
@@ -144,6 +152,14 @@ class Metrics(Collector):
         return metric
 
 
+def _free(directory: Path) -> int:
+    """Bytes that may still be written there; 0 if it cannot be read, for example because it was removed."""
+    try:
+        return shutil.disk_usage(directory).free
+    except OSError:
+        return 0
+
+
 class _Handler(WSGIRequestHandler):
     timeout = 5.0  # s: a client that sends nothing
 
@@ -159,6 +175,7 @@ def served(metrics: Metrics, port: int, healthy: Healthy) -> Iterator[None]:
     """
     endpoint = Endpoint("127.0.0.1", port)
     check_port_free(endpoint)
+    metrics.healthy = healthy
     registry = CollectorRegistry(auto_describe=False)
     registry.register(metrics)
     scrape = make_wsgi_app(registry)

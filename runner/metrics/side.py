@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -38,14 +39,15 @@ class SideMetrics:
         self._open.close()
 
 
-def metrics_of(vehicle: str, port: int | None) -> SideMetrics:
+def metrics_of(vehicle: str, port: int | None, log: Path | None = None) -> SideMetrics:
     """The metrics of a side.
 
     vehicle  name of the vehicle
     port     TCP port on 127.0.0.1; None: nothing is served
+    log      directory that the drive is logged to; None: it is not logged
     """
     if port is None:
         return SideMetrics(None, None)
     from runner.metrics.prometheus import Metrics
 
-    return SideMetrics(Metrics(vehicle), port)
+    return SideMetrics(Metrics(vehicle, log), port)

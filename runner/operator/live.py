@@ -253,7 +253,7 @@ def live_operator(
         )
 
     operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)
-    metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port)
+    metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
     station.listeners.append(_MetricsListener(metrics))
     try:
         if pictures:

@@ -348,7 +348,7 @@ def live_vehicle(
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
     side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
     control = _VehicleControl(vehicle, document, report, keyring)
-    metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port)
+    metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port, log)
 
     def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
         metrics.take(record)
