@@ -51,6 +51,10 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
         (["replay", "conf=/nowhere"], "command line: conf: /nowhere: no such directory"),
         (["replay", "input="], "command line: input: '': must not be empty"),  # from an unset variable of the shell
         (["vehicle", "log="], "command line: log: '': must not be empty"),
+        (
+            ["vehicle", "log=a", "drives=b"],
+            "command line: drives: 'b': names a directory for each drive, so log= must not be given",
+        ),
         (["report", "drive", "output="], "command line: output: '': must not be empty"),
     ],
 )

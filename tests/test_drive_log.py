@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from runner.core.events import CameraSwitched
-from runner.drive.log import Log
+from runner.drive.log import Log, new_drive
 from runner.drive.read import read_drive
 from runner.errors import UserError
 from runner.records import LinesDropped, Note
@@ -76,6 +76,27 @@ def test_a_drive_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert abs(side.began.time - time.time()) < 60
     assert [note.text for note in side.of(Note)] == ["before the beginning", "grün"]
     assert side.ended
+
+
+def test_each_start_below_a_directory_of_drives_has_a_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when the clock stands, and after a start that failed, which leaves nothing."""
+    monkeypatch.setattr(time, "gmtime", lambda: time.struct_time((2026, 11, 25, 23, 5, 9, 2, 329, 0)))
+    parent = tmp_path / "drives"
+    for _ in range(2):
+        begun(new_drive(parent)).close()
+        Log(new_drive(parent), "vehicle", {}, {}, lambda what: None).close()
+    (parent / "2026-11-25T23-05-09Z-3").mkdir()  # made by a user
+    begun(new_drive(parent)).close()
+    names = [f"2026-11-25T23-05-09Z{number}" for number in ("", "-2", "-3", "-4")]
+    assert sorted(path.name for path in parent.iterdir()) == names
+    assert [len(written(parent / name)) for name in names if name[-2:] != "-3"] == [2, 2, 2]
+
+
+def test_a_start_that_failed_leaves_a_directory_that_existed(tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    for name in ("own", "made"):
+        Log(tmp_path / name, "vehicle", {}, {}, lambda what: None).close()
+    assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
 def test_a_killed_process_loses_at_most_its_last_line(tmp_path: Path) -> None:

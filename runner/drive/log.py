@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from importlib.metadata import version
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ class Log:
         versions: Mapping[str, str],
         on_report: Callable[[str], None],
     ) -> None:
-        self._file = None if directory is None else _File(directory / FILES[side], _create(directory, side))
+        self._file = None if directory is None else _new_file(directory, side)
         self._side, self._config, self._versions, self._on_report = side, config, versions, on_report
         self._lock = threading.Lock()
         self._began: float | None = None
@@ -165,10 +166,13 @@ def _encoded(line: Mapping[str, Any]) -> bytes:
 
 
 class _File:
-    """A file of complete lines only: a partly written line is removed."""
+    """A file of complete lines only: a partly written line is removed.
 
-    def __init__(self, path: Path, fd: int) -> None:
-        self.path, self._fd = path, fd
+    new  whether its directory was made for it
+    """
+
+    def __init__(self, path: Path, fd: int, new: bool) -> None:
+        self.path, self._fd, self._new = path, fd, new
         self._size = 0
 
     def append(self, data: bytes) -> str | None:
@@ -186,8 +190,12 @@ class _File:
 
     def close(self, keep: bool) -> None:
         os.close(self._fd)
-        if not keep:
-            self.path.unlink(missing_ok=True)
+        if keep:
+            return
+        self.path.unlink(missing_ok=True)
+        if self._new:
+            with suppress(OSError):  # it holds other files by now
+                self.path.parent.rmdir()
 
 
 class _Writer:
@@ -253,6 +261,18 @@ def check_free(directory: Path, side: str) -> None:
             raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")
     except OSError as error:
         raise _refused(directory, (error.strerror or str(error)).lower()) from None
+
+
+def new_drive(parent: Path) -> Path:
+    """A directory for a drive that begins now, named by the time, which does not exist yet."""
+    name = time.strftime("%Y-%m-%dT%H-%M-%SZ", time.gmtime())
+    names = chain([name], (f"{name}-{number}" for number in count(2)))  # without a clock, machines start at one time
+    return next(parent / each for each in names if not os.path.lexists(parent / each))
+
+
+def _new_file(directory: Path, side: str) -> _File:
+    new = not directory.exists()
+    return _File(directory / FILES[side], _create(directory, side), new)
 
 
 def _create(directory: Path, side: str) -> int:

@@ -67,8 +67,12 @@ VERBS = {
         sweeps=True,
         choices={"link": ("logged", "again")},
     ),
-    "vehicle": Verb("the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "duration_s")),
-    "operator": Verb("the operator's side: video, page, table", "runner.verbs.operator", ("log", "duration_s")),
+    "vehicle": Verb(
+        "the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "drives", "duration_s")
+    ),
+    "operator": Verb(
+        "the operator's side: video, page, table", "runner.verbs.operator", ("log", "drives", "duration_s")
+    ),
     "latency": Verb(
         "measure glass-to-glass latency",
         "runner.verbs.latency",
@@ -247,6 +251,16 @@ class Arguments:
         if self.values.get(key) == "":  # an unset shell variable, which would mean the current directory
             raise UserError("command line", key, "''", "must not be empty")
         return Path(self.values[key]) if key in self.values else None
+
+    def drive(self) -> Path | None:
+        """Where to log a drive: the directory of log=, or a new one below that of drives=; None: nowhere."""
+        from runner.drive.log import new_drive
+
+        parent, log = self.path("drives"), self.path("log")
+        if parent and log:
+            rule = "names a directory for each drive, so log= must not be given"
+            raise UserError("command line", "drives", repr(str(parent)), rule)
+        return new_drive(parent) if parent else log
 
 
 def unknown_flag(word: str) -> UserError:

@@ -1,11 +1,12 @@
-"""usage: tod-runner operator [OVERRIDE ...] [duration_s=N] [log=DIR]
+"""usage: tod-runner operator [OVERRIDE ...] [duration_s=N] [log=DIR | drives=DIR]
 
 The operator's side: receives and decodes every camera with the operator graph of the configuration. A browser on this
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
 bitrates and factors, charts, the drive, and why each decision was made. The terminal shows the same as a table. Ends
 with Ctrl-C or duration_s after the vehicle came online, with a summary of how well the received video followed the
 decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR everything received is written to
-DIR/operator.jsonl, for `report` and `export`. With experiment= it sends that experiment's requests at their times.
+DIR/operator.jsonl, for `report` and `export`; with drives=DIR to DIR/TIME/operator.jsonl, where TIME is the start in
+UTC. With experiment= it sends that experiment's requests at their times.
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
@@ -42,7 +43,7 @@ def run(arguments: Arguments) -> int:
     sys.setswitchinterval(SWITCH_S)
     with (
         LiveTable() as table,
-        live_operator(arguments.overrides, arguments.conf, log=arguments.path("log")) as operator,
+        live_operator(arguments.overrides, arguments.conf, log=arguments.drive()) as operator,
     ):
         station = operator.station
         station.listeners.append(table)

@@ -1,8 +1,9 @@
-"""usage: tod-runner vehicle [OVERRIDE ...] [log=DIR] [duration_s=N]
+"""usage: tod-runner vehicle [OVERRIDE ...] [log=DIR | drives=DIR] [duration_s=N]
 
 The vehicle's side: an RTSP server with one stream per camera at rtsp://HOST:8554/CAMERA, the rules that set bitrate and
 size of each, the prediction source, and the control link. Needs an MQTT broker at control.host. Ends with Ctrl-C or
-after duration_s. With log=DIR events, decisions and telemetry are written to DIR/drive.jsonl, which must not exist.
+after duration_s. With log=DIR events, decisions and telemetry are written to DIR/drive.jsonl, which must not exist;
+with drives=DIR to DIR/TIME/drive.jsonl, where TIME is the start in UTC.
 
   tod-runner vehicle                                        the paper's vehicle with a synthetic drive
   tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link
@@ -25,9 +26,7 @@ def run(arguments: Arguments) -> int:
     sys.setswitchinterval(SWITCH_S)
     with (
         progress_bar() as progress,
-        live_vehicle(
-            arguments.overrides, arguments.conf, log=arguments.path("log"), say=say, progress=progress
-        ) as vehicle,
+        live_vehicle(arguments.overrides, arguments.conf, log=arguments.drive(), say=say, progress=progress) as vehicle,
         stopping(action=vehicle.loop.stop) as stop,
     ):
         vehicle.run(duration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import socket
@@ -10,7 +11,10 @@ import time
 
 import pytest
 
+from recipes import TWO_MACHINES, lines
+
 from rig import CHECKOUT, ROBOT, free_port, process, until
+from runner.drive.read import read_drive
 
 UNITS = sorted((CHECKOUT / "deploy" / "systemd").glob("*.service"))
 
@@ -21,7 +25,8 @@ def test_a_side_reports_to_its_service_manager(verb, tmp_path, broker):
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(20)
         ports = (f"media.port={free_port()}", f"control.port={broker.port}")
-        with process(verb, *ROBOT, *ports, env={"NOTIFY_SOCKET": str(tmp_path / "notify")}) as side:
+        drives = f"drives={tmp_path / 'drives'}"
+        with process(verb, *ROBOT, *ports, drives, env={"NOTIFY_SOCKET": str(tmp_path / "notify")}) as side:
             assert manager.recv(100) == b"READY=1"
             for _ in range(3):
                 assert manager.recv(100) == b"WATCHDOG=1"
@@ -35,6 +40,8 @@ def test_a_side_reports_to_its_service_manager(verb, tmp_path, broker):
             side.send_signal(signal.SIGTERM)
             until(lambda: side.poll() is not None)
             assert b"STOPPING=1" in _drain(manager)
+    (drive,) = (tmp_path / "drives").iterdir()
+    assert list(read_drive(drive).sides) == [verb]
 
 
 def _drain(manager):
@@ -47,6 +54,17 @@ def _drain(manager):
         return found
     finally:
         manager.settimeout(20)
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.name)
+def test_the_example_of_a_unit_is_the_command_of_the_document(unit):
+    """Apart from the paths of keys, and the vehicle, which is the default one."""
+    (example,) = re.findall(r"^#   TOD_OVERRIDES=(.*)$", unit.read_text(), flags=re.MULTILINE)
+    verb = unit.stem.removeprefix("tod-")
+    (command,) = (line.text for line in lines(TWO_MACHINES) if line.text.startswith(f"tod-runner {verb} "))
+    given, documented = ({word for word in text.split() if "keys=" not in word} for text in (example, command))
+    assert given - {"vehicle=tum_q7"} == documented - {"tod-runner", verb}
+    assert "keys=/etc/tod-runner/keys" in example.split()
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd")
