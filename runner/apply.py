@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -78,6 +79,7 @@ __all__ = [
 ]
 
 CALL_S = 10.0  # timeout of a call into GLib's thread, which normally takes milliseconds
+BEAT_MS = 200  # how often GLib's thread shows that it runs
 TAILS_MS = 10  # how often receivers check for frames whose end is missing
 STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
@@ -120,7 +122,10 @@ def _source_problem(plan: Plan) -> str | None:
 
 
 class _Glib:
-    """GLib's main loop in its own thread, where the RTSP server and the buses run."""
+    """GLib's main loop in its own thread, where the RTSP server and the buses run.
+
+    `beat` is when it last ran its timers (time.monotonic).
+    """
 
     def __init__(self) -> None:
         load_types()
@@ -131,6 +136,8 @@ class _Glib:
         self._watch = GLib.unix_fd_add_full(
             GLib.PRIORITY_DEFAULT_IDLE, self._wakeup, GLib.IOCondition.IN, self._on_wakeup
         )
+        self.beat = time.monotonic()
+        self._beating = GLib.timeout_add(BEAT_MS, self._on_beat)
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
         self._thread.start()
 
@@ -159,6 +166,10 @@ class _Glib:
         if raised:
             raise raised[0]
 
+    def _on_beat(self) -> bool:
+        self.beat = time.monotonic()
+        return True
+
     def _on_wakeup(self, *_: object) -> bool:
         os.eventfd_read(self._wakeup)
         while self._calls:
@@ -177,6 +188,7 @@ class _Glib:
         self._loop.quit()
         self._thread.join(timeout=5)
         if not self._thread.is_alive():
+            GLib.source_remove(self._beating)
             GLib.source_remove(self._watch)
             wakeup, self._wakeup = self._wakeup, -1  # its number may soon be reused
             os.close(wakeup)
@@ -238,6 +250,11 @@ class VehicleSide:
                 caller.start()
 
         self._glib.call("starting the cameras", start)
+
+    @property
+    def beat(self) -> float:
+        """When the thread that accepts viewers and watches cameras last ran, time.monotonic."""
+        return self._glib.beat
 
     def turn(self, commands: Iterable[Command]) -> None:
         """Execute commands; those for one camera take effect between the same two frames. Returns immediately."""

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from runner.apply import VehicleSide
     from runner.ros.cameras import RosCameras, SharedPicture
 
-STUCK_S = 2.0  # a loop that finishes nothing for this long is stuck
+STUCK_S = 2.0  # a thread that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
 NAME_CHECK_S = 0.5  # telemetry is sent five times a second; without any within this time, the name is free
@@ -137,21 +137,30 @@ class LiveVehicle:
             self._thread.join(END_S)
 
     def _watch(self) -> None:
-        """Report a loop that hangs, for example in a rule that never returns, and its recovery."""
-        stuck = False
+        """Report a part that hangs, for example a rule that never returns, and its recovery."""
+        before: dict[str, str] = {}
         while not self._ended.wait(WATCH_S):
-            problem = self.problem()
-            if (problem is not None) != stuck:
-                stuck = not stuck
-                self.loop.on_report(problem or "the control loop runs again")
-            if not stuck:
+            hanging = self._hanging()
+            for part in hanging.keys() - before.keys():
+                self.loop.on_report(hanging[part])
+            for part in before.keys() - hanging.keys():
+                self.loop.on_report(f"{part} runs again")
+            before = hanging
+            if not hanging:
                 notify("WATCHDOG=1")
 
     def problem(self) -> str | None:
         """Why the vehicle does not work; None if it works."""
-        if time.monotonic() - self.loop.beat <= STUCK_S:
-            return None
-        return f"the control loop hangs in {self.loop.busy_with or 'nothing'}"
+        return "; ".join(self._hanging().values()) or None
+
+    def _hanging(self) -> dict[str, str]:
+        """By part that makes no progress, what to say about it."""
+        now = time.monotonic()
+        parts = {
+            "the control loop": (self.loop.beat, f" in {self.loop.busy_with or 'nothing'}"),
+            "GStreamer's thread": (self.side.beat, ""),
+        }
+        return {part: f"{part} hangs{where}" for part, (beat, where) in parts.items() if now - beat > STUCK_S}
 
 
 class _Console:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -34,6 +35,10 @@ class RecordingVehicle:
         self.controller = ""
         self.key_frames: list[str] = []
         self.on_turned: Callable[[], None] = lambda: None
+
+    @property
+    def beat(self) -> float:
+        return time.monotonic()
 
     def watch(self, *names: str) -> None:
         self.watched = set(names)

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from contextlib import ExitStack, suppress
 
 import pytest
@@ -339,6 +341,8 @@ def test_differences_between_both_sides_configurations_are_reported(broker, vehi
 
 RULES = """
 import time
+import urllib.error
+import urllib.request
 from fractions import Fraction
 from runner.core.rules import rule
 
@@ -403,6 +407,43 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
     replayed = run("replay", f"input={tmp_path / 'drive'}", f"conf={conf}", env=path)
     faults = {json.loads(line).get("fault") for line in replayed.stdout.splitlines()}
     assert len(faults) == 4, replayed.stderr
+
+
+def test_a_vehicle_whose_gstreamer_thread_hangs_is_not_healthy(broker, monkeypatch):
+    """Neither for /health nor for the service manager, and it says so; the loop itself goes on."""
+    pytest.importorskip("prometheus_client")
+    from gi.repository import GLib
+
+    from runner.vehicle import live
+
+    monkeypatch.setattr(live, "STUCK_S", 0.7)
+    freed, metrics, said, notified = threading.Event(), free_port(), [], []
+    monkeypatch.setattr(live, "notify", notified.append)
+    ports = (f"media.port={free_port()}", f"control.port={broker.port}", f"metrics.vehicle_port={metrics}")
+
+    def health():
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/health", timeout=5) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            return error.code, error.read().decode()
+
+    with live.live_vehicle([*ROBOT, *ports], say=said.append) as vehicle:
+        vehicle.start()
+        until(lambda: health() == (200, "ok\n"))
+        until(lambda: "WATCHDOG=1" in notified)
+        try:
+            GLib.idle_add(lambda: freed.wait(60) and None)
+            until(lambda: health() == (503, "GStreamer's thread hangs\n"))
+            until(lambda: "GStreamer's thread hangs" in said)
+            count = notified.count("WATCHDOG=1")
+            until(lambda: time.monotonic() - vehicle.side.beat > 2)
+            assert notified.count("WATCHDOG=1") == count
+        finally:
+            freed.set()
+        until(lambda: health() == (200, "ok\n"))
+        until(lambda: "GStreamer's thread runs again" in said)
+        assert not any("control loop" in line for line in said)
 
 
 def test_no_message_is_queued_while_the_broker_is_away():

@@ -10,7 +10,6 @@ import subprocess
 import time
 
 import pytest
-
 from recipes import TWO_MACHINES, lines
 
 from rig import CHECKOUT, ROBOT, free_port, process, until
