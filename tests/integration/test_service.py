@@ -66,6 +66,27 @@ def test_the_example_of_a_unit_is_the_command_of_the_document(unit):
     assert "keys=/etc/tod-runner/keys" in example.split()
 
 
+@pytest.mark.skipif(not shutil.which("rsync"), reason="needs rsync")
+def test_the_documented_command_installs_keys_and_new_ones_over_them(tmp_path):
+    commands = [text for _, text in lines("Services") if "rsync" in text]
+    assert [text.split()[-2:] for text in commands] == [
+        ["tod-keys/", "/etc/tod-runner/keys/"],
+        ["keys/alice/", "/etc/tod-runner/keys/"],
+    ]
+    for text in commands:
+        assert text.startswith("sudo rsync -a --delete --chown=tod-runner:tod-runner ")
+        given, installed = tmp_path / text.split()[-2], tmp_path / "installed"
+        words = [word for word in text.split()[1:-2] if not word.startswith("--chown")]  # which needs root
+        given.mkdir(mode=0o700, parents=True)
+        (given / "own.key").write_text("old")
+        (given / "own.key").chmod(0o600)
+        subprocess.run([*words, f"{given}/", f"{installed}/"], check=True)
+        (given / "own.key").write_text(f"new, of {given}")
+        subprocess.run([*words, f"{given}/", f"{installed}/"], check=True)
+        assert [(path.name, path.read_text()) for path in installed.iterdir()] == [("own.key", f"new, of {given}")]
+        assert [path.stat().st_mode & 0o777 for path in (installed, installed / "own.key")] == [0o700, 0o600]
+
+
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.name)
 def test_the_units_are_valid_and_grant_little(unit, tmp_path):
