@@ -83,6 +83,32 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
     assert len(set(messages)) == len(messages) <= 5  # each reason once, however many attempts
 
 
+@pytest.mark.parametrize("fps_max", [15, 30])
+def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
+    """It sends 25 a second. None is repeated, and none waits for the next one."""
+    from runner.gst import Gst
+
+    decoded, sent = [], []
+
+    def noting(times):
+        return lambda _, info: times.append(info.get_buffer().pts) or Gst.PadProbeReturn.OK
+
+    with driving(f"fps_max={fps_max}") as (_, side, _, plan, reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        source = side._pipeline("rear")._pipeline
+        source.get_by_name("rate").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, noting(sent))
+        source.get_by_name("convert").get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, noting(decoded))
+        until(lambda: len(sent) > 20)
+        until(lambda: len(decoded) > 40)
+        own, passed = decoded[1:], [time for time in sent if time >= decoded[1]]
+        assert reported == ["rear: pipeline built"]
+    assert passed == [time for time in own if time in passed]  # the camera's times, in order, none twice
+    if fps_max > 25:
+        assert passed == own[: len(passed)]  # nothing is dropped
+    else:
+        assert len(passed) < len(own)
+
+
 def test_a_camera_that_is_off_is_still_monitored():
     with driving() as (camera, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
