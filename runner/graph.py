@@ -36,6 +36,7 @@ _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
 _PICTURE = "pixel-aspect-ratio=1/1,colorimetry=bt709"
 # Caps of encoded formats that a camera delivers; raw formats are named directly.
 _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
+SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
 Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
 # disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
@@ -185,11 +186,13 @@ def compile_graph(
     index      number of the camera in its vehicle, for ports
     clip       path of the rendered clip, if the source renders one and it exists
     recording  how `record` stores the source's frames
-    raises     ModelError for a placeholder without a value, or a name that the source shares with a later element
+    raises     ModelError for a placeholder without a value, a name that the source shares with a later element, or
+               packets that SRT would cut
     """
     graph, source = camera.graph, camera.source
     recorder = recording.elements if recording else ()
     _check_names(graph, source, recorder)
+    _check_packets(graph)
     values = _values(camera, media, index, clip)
 
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
@@ -331,6 +334,14 @@ def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> N
             raise ModelError(f"recording.elements[{index}].name", repr(element.name), rule)
 
 
+def _check_packets(graph: Graph) -> None:
+    size = int(graph.settings.get("mtu_bytes", 0))
+    uris = (str(e.properties.get("uri")) for e in graph.vehicle if e.factory == "srtsink")
+    if size > SRT_MOST_BYTES and any("payloadsize=" not in uri for uri in uris):
+        rule = f"must be at most {SRT_MOST_BYTES} with srtsink, which cuts longer packets"
+        raise ModelError("graph.mtu_bytes", str(size), rule)
+
+
 def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[str, Value | None]:
     """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
@@ -350,6 +361,9 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "url": rtsp_url(media, camera.name),
         "port": int(camera.graph.settings["first_port"]) + index,
     }
+    if "dscp" in camera.graph.settings:
+        dscp = int(camera.graph.settings["dscp"])
+        values["iptos"] = 4 * dscp if dscp >= 0 else -1  # the byte of the IP header whose upper six bits it is
     values |= dict(_per_frame_rate(camera, key) for key in _PER_FRAME_RATE if key in camera.graph.settings)
     return values if clip is None else values | {"clip": clip}
 

@@ -454,6 +454,14 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         (["media.port=0"], "media.port: 0: must be at least 1"),
         (["media.port=on"], "media.port: 'on': must be a whole number"),
         (["media.rtp_ports=[21000,20000]"], "media.rtp_ports: [21000, 20000]: must be [first, last], first below last"),
+        (
+            ["media.rtp_ports=[20001,20016]"],
+            "media.rtp_ports: [20001, 20016]: must hold two ports, of which the first is even, for each of 8 cameras",
+        ),
+        (
+            ["graph=h264_srt", "graph.mtu_bytes=1317"],
+            "graph.mtu_bytes: 1317: must be at most 1316 with srtsink, which cuts longer packets",
+        ),
         (["media.max_viewers=0"], "media.max_viewers: 0: must be at least 1"),
         (["media.session_timeout_s=1.5"], "media.session_timeout_s: 1.5: must be a whole number"),
         (["media.host=on", "media.port=true"], "media.port: true: must be a whole number"),

@@ -134,6 +134,7 @@ class Builder:
         listening = {"page.port": page.port} if page.serve else {}
         self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
+        self._check_rtp_ports(built, media)
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index, recording)
             if camera.source.render:
@@ -389,6 +390,15 @@ class Builder:
                 rule = f"camera {name} would get port {port}, already the port of {taken[port]}"
                 self._report(own, ModelError("graph.first_port", str(port - index), rule))
             taken[port] = f"camera {name}"
+
+    def _check_rtp_ports(self, cameras: Mapping[str, Camera], media: Media) -> None:
+        """Check that each camera behind the RTSP server finds its ports: an even one for RTP, the next for RTCP."""
+        first, last = media.rtp_ports
+        pairs = (last + 1) // 2 - (first + 1) // 2
+        served = sum(camera.graph.transport == "rtsp" for camera in cameras.values())
+        if pairs < served:
+            rule = f"must hold two ports, of which the first is even, for each of {served} cameras"
+            self._report((), ModelError("media.rtp_ports", f"[{first}, {last}]", rule))
 
 
 def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:

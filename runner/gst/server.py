@@ -189,8 +189,7 @@ class CameraServer:
         factory.set_launch(plan.server)
         factory.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         factory.set_latency(0)
-        if self._addresses:
-            factory.set_address_pool(self._addresses)
+        factory.set_address_pool(self._addresses)
         if int(settings.get("dscp", -1)) >= 0:
             factory.set_dscp_qos(int(settings["dscp"]))
         repairs = int(settings.get("retransmission_ms", 0))
@@ -572,11 +571,9 @@ def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
     return feedback | plain if repairs else plain
 
 
-def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool | None:
-    """Addresses for RTP and RTCP: the server's own. None if it listens on all."""
+def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool:
+    """Addresses for RTP and RTCP: the server's own, or all if it listens on all."""
     address = socket.gethostbyname(media.host)
-    if address == "0.0.0.0":
-        return None
     first, last = media.rtp_ports
     pool = GstRtspServer.RTSPAddressPool()
     pool.add_range(address, address, first, last, 0)

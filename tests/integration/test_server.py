@@ -436,12 +436,13 @@ def test_a_request_that_is_never_finished_times_out(begun):
 # --- sockets ----------------------------------------------------------------------------------------------------------
 
 
-def test_rtp_and_rtcp_sockets_listen_on_the_servers_address_only():
-    with serving("media.rtp_ports=[21000,21999]") as vehicle, watched(vehicle) as viewer:
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_rtp_and_rtcp_sockets_listen_on_the_servers_address_and_ports_only(host):
+    with serving("media.rtp_ports=[21000,21999]", f"media.host={host}") as vehicle, watched(vehicle) as viewer:
         assert 21000 <= viewer.server_port <= 21998
         lines = subprocess.run(["ss", "-Hlun"], capture_output=True, text=True, check=True).stdout.splitlines()
         for port in (viewer.server_port, viewer.server_port + 1):
-            assert [line.split()[3] for line in lines if f":{port} " in line] == [f"127.0.0.1:{port}"]
+            assert [line.split()[3] for line in lines if f":{port} " in line] == [f"{host}:{port}"]
 
 
 def test_a_server_that_stops_during_requests_leaves_no_reading_thread(capfd):
