@@ -15,7 +15,8 @@ from recipes import TWO_MACHINES, lines
 from rig import CHECKOUT, ROBOT, free_port, process, until
 from runner.drive.read import read_drive
 
-UNITS = sorted((CHECKOUT / "deploy" / "systemd").glob("*.service"))
+SYSTEMD = CHECKOUT / "deploy" / "systemd"
+UNITS = sorted(SYSTEMD.glob("*.service"))
 
 
 @pytest.mark.parametrize("verb", ["vehicle", "operator"])
@@ -88,9 +89,16 @@ def test_the_documented_command_installs_keys_and_new_ones_over_them(tmp_path):
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd")
-@pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.name)
-def test_the_units_are_valid_and_grant_little(unit, tmp_path):
+@pytest.mark.parametrize(
+    ("unit", "drop_in"),
+    [*((unit, None) for unit in UNITS), (SYSTEMD / "tod-vehicle.service", SYSTEMD / "nvidia.conf")],
+    ids=lambda path: path and path.name,
+)
+def test_the_units_are_valid_and_grant_little(unit, drop_in, tmp_path):
     installed = tmp_path / unit.name
+    if drop_in:
+        (tmp_path / f"{unit.name}.d").mkdir()
+        shutil.copy(drop_in, tmp_path / f"{unit.name}.d")
     installed.write_text(unit.read_text().replace("/opt/tod-runner/bin/tod-runner", "/bin/true"))
     verified = subprocess.run(["systemd-analyze", "verify", installed], capture_output=True, text=True, check=False)
     assert (verified.returncode, verified.stderr) == (0, "")
