@@ -1,6 +1,12 @@
-"""Cameras: colors, capture times, logins. V4L2 cameras are replaced by other sources in front of the same elements."""
+"""Cameras: colors, capture times, logins.
+
+A V4L2 camera is a device of v4l2loopback; without that in the kernel, only other sources before the same elements.
+"""
 
 from __future__ import annotations
+
+import itertools
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +19,8 @@ from runner.plans import compile_plans
 
 CAMERA = "front_left"
 COLOR = (200, 80, 40)  # red, green, blue
+# Devices of v4l2loopback, by an attribute that only they have.
+LOOPBACKS = [f"/dev/{path.parent.name}" for path in Path("/sys/class/video4linux").glob("video*/max_openers")]
 V4L2 = ("source=v4l2", f"cameras.{CAMERA}.device=/dev/video0", "cameras.front_left.fps=15")
 
 
@@ -86,6 +94,45 @@ def test_frames_of_a_v4l2_camera_keep_their_capture_times(fps):
     pipeline.set_state(Gst.State.NULL)
     assert set(seen) <= set(captured)
     assert len(seen) >= 40 * 15 // fps - 2
+
+
+@pytest.mark.skipif(not LOOPBACKS, reason="no device of v4l2loopback: modprobe v4l2loopback")
+def test_a_v4l2_device_is_streamed_with_the_times_of_its_driver():
+    """The device is checked, its format is requested, and its frames arrive one by one."""
+    from runner.apply import check_machine
+    from runner.gst import Gst
+
+    (device, *_), captured = LOOPBACKS, []
+    caps = "video/x-raw,format=YUY2,width=640,height=360,framerate=15/1"
+    writer = Gst.parse_launch(f"videotestsrc is-live=true pattern=ball ! {caps} ! v4l2sink device={device} sync=false")
+    capture = "{format: YUY2, width: 640, height: 360, fps: 15}"
+    words = (f"cameras.{CAMERA}.device={device}", f"+cameras.{CAMERA}.capture={capture}", f"cameras.{CAMERA}.fps=15")
+    writer.set_state(Gst.State.PLAYING)
+    try:
+        assert writer.get_state(10 * Gst.SECOND)[0] == Gst.StateChangeReturn.SUCCESS
+        with (
+            streaming("source=v4l2", *words, cameras=(CAMERA,)) as (side, _, (plan,), reported),
+            watching(plan) as client,
+        ):
+            assert check_machine([plan]) is None
+            turn(side, sending=True, size=(480, 260), bitrate=500)
+            until(lambda: len(client.sizes) > 10)
+            pad = side._pipeline(CAMERA)._pipeline.get_by_name("raw").get_static_pad("src")
+            pad.add_probe(Gst.PadProbeType.BUFFER, lambda _, info: noted(captured, info.get_buffer().pts))
+            until(lambda: len(captured) > 15)
+            assert set(client.sizes[-5:]) == {(480, 260)}
+            assert reported == [f"{CAMERA}: pipeline built"]
+    finally:
+        writer.set_state(Gst.State.NULL)
+    assert all(earlier < later for earlier, later in itertools.pairwise(captured))
+    assert len({later - earlier for earlier, later in itertools.pairwise(captured)}) > 1  # not rounded to a rate
+
+
+def noted(times, time):
+    from runner.gst import Gst
+
+    times.append(time)
+    return Gst.PadProbeReturn.OK
 
 
 @pytest.fixture
