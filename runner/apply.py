@@ -35,6 +35,7 @@ from runner.gst.registry import (
 )
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
+from runner.gst.timers import every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records import Arrivals
@@ -421,7 +422,7 @@ class OperatorSide:
         def start() -> None:
             for receiver in self._receivers.values():
                 receiver.start()
-            self._tails = GLib.timeout_add(TAILS_MS, self._request_tails)
+            self._tails = every(TAILS_MS, self._request_tails, lambda what: on_report("receivers", what))
 
         self._glib.call("starting the receivers", start)
 
@@ -441,10 +442,9 @@ class OperatorSide:
         self._glib.call("reading the receivers' counters", sample)
         return samples
 
-    def _request_tails(self) -> bool:
+    def _request_tails(self) -> None:
         for receiver in self._receivers.values():
             receiver.request_tails()
-        return True
 
     def take_arrivals(self) -> Arrivals:
         """Arrivals since the last call; to be called from one thread."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +33,20 @@ def shared_cache(factory: pytest.TempPathFactory) -> Path:
     """An empty cache at first, shared by all processes of pytest-xdist: a clip is rendered once."""
     base = factory.getbasetemp()
     return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+
+
+@contextmanager
+def out_of_reach(directory: Path) -> Iterator[None]:
+    """This process may not search a directory, as if it belonged to another user, also if it is root."""
+    mode, user = directory.stat().st_mode, os.geteuid()
+    directory.chmod(0)
+    if user == 0:
+        os.seteuid(65534)  # nobody
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        directory.chmod(mode)
 
 
 class Drive:

@@ -8,10 +8,12 @@ import stat
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from cryptography import x509
 from cryptography.x509.oid import NameOID
+from helpers import out_of_reach
 
 from runner.__main__ import main
 from runner.core.events import EVENTS
@@ -105,6 +107,24 @@ def test_an_empty_secret_is_none_and_the_last_one_stays_in_force(authority, monk
         ring.read(keyring.TOKEN)
     assert token.get() == known
     assert [note.endswith("is empty; the previous content stays in force") for note in notes] == [True]
+
+
+def test_files_out_of_reach_are_read_again_when_they_are_back(authority, monkeypatch):
+    """As while root copies a directory and then hands it to the user of the side."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    ring, notes = Keyring.of(authority.directory / "a-controller"), []
+    token, known = ring.watched_token(notes.append), ring.read(keyring.TOKEN)
+    with out_of_reach(ring.directory):
+        assert [token.get(), token.get()] == [known, known]
+        with pytest.raises(UserError, match="permission denied"):
+            ring.read(keyring.TOKEN)
+    (ring.directory / keyring.TOKEN).write_bytes(b"new")
+    opened = Path.open
+    monkeypatch.setattr(Path, "open", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
+    assert token.get() == known
+    monkeypatch.setattr(Path, "open", opened)  # only its owner has changed, which neither time nor size shows
+    assert token.get() == b"new"
+    assert [note.endswith("permission denied; the previous content stays in force") for note in notes] == [True]
 
 
 @pytest.mark.parametrize("action", ["rotate", "revoke", "issue"])

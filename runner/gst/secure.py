@@ -152,9 +152,6 @@ class ViewerCheck:
 
         raises  RunError if certificate and key do not match
         """
-        if self._used != (own := self._own.get()):
-            self.auth.set_tls_certificate(own_certificate(self._keyring))
-            self._used = own
         people = {name: person.rtsp for name, person in self._people.get().items() if person.rtsp}
         for name in self._known.keys() - people.keys():
             self.auth.remove_digest(name)
@@ -164,6 +161,9 @@ class ViewerCheck:
                 token.set_string(GstRtspServer.RTSP_TOKEN_MEDIA_FACTORY_ROLE, VIEWER)
                 self.auth.add_digest(name, password, token)
         self._known = people
+        if self._used != (own := self._own.get()):  # last: while it is being copied, the others are up to date
+            self.auth.set_tls_certificate(own_certificate(self._keyring))
+            self._used = own
 
     def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
         """The holder of a client's certificate; None if it may no longer watch."""

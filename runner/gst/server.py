@@ -23,6 +23,7 @@ from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
 from runner.gst.memory import give_back
 from runner.gst.pipeline import Build, CameraPipeline
+from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
 from runner.system.ports import check_port_free
@@ -158,7 +159,8 @@ class CameraServer:
         self._attached = self._server.attach(None)
         if not self._attached:
             raise RunError(f"the RTSP server cannot listen on {media.host}:{media.port}; choose another media.port")
-        self._watch = GLib.timeout_add(WATCH_MS, self._watch_connections)
+        watches = (self._watch_connections, *((self._watch_keys,) if self._viewers else ()))
+        self._watches = [every(WATCH_MS, watch, lambda what: on_report("viewers", what)) for watch in watches]
         threading.Thread(target=self._expire_sessions, name="rtsp-sessions", daemon=True).start()
 
     def stop(self) -> None:
@@ -168,8 +170,8 @@ class CameraServer:
         a stream that no longer exists.
         """
         self._stopped.set()
-        GLib.source_remove(self._watch)
-        GLib.source_remove(self._attached)
+        for source in (*self._watches, self._attached):
+            GLib.source_remove(source)
         with self._changed:
             for connection in self._connections.values():
                 connection.close()
@@ -471,7 +473,7 @@ class CameraServer:
             self._on_report(camera, f"disconnected the viewer at {connection}: {why}")
         connection.close()
 
-    def _watch_connections(self) -> bool:
+    def _watch_connections(self) -> None:
         """Close readers that lag, and connections without a complete request."""
         with self._changed:
             connections = list(self._connections.items())
@@ -483,16 +485,25 @@ class CameraServer:
         for name in left:
             self._unblock(name, now)
         if self._viewers:
-            self._refresh_keys()
             self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
-            if self._viewers and connection.cameras and self._viewers.viewer(client) is None:
-                self._close(connection, "its keys are no longer accepted")
-            elif lags.get(connection, 0) > LAG_S:
+            if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
-        return True
+
+    def _watch_keys(self) -> None:
+        """Load new key files, which may arrive one by one, and close the streams of holders that may no longer watch.
+
+        Apart from the other checks, so that no fault of theirs lets a revoked holder go on watching.
+        """
+        assert self._viewers
+        self._refresh_keys(self._viewers)
+        with self._changed:
+            watching = [(client, connection) for client, connection in self._connections.items() if connection.cameras]
+        for client, connection in watching:
+            if self._viewers.viewer(client) is None:
+                self._close(connection, "its keys are no longer accepted")
 
     def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
         """Close those whose client makes no request, to free threads for other handshakes."""
@@ -501,11 +512,9 @@ class CameraServer:
             if idle_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
                 connection.close()
 
-    def _refresh_keys(self) -> None:
-        """Load new key files, which may arrive one by one."""
-        assert self._viewers
+    def _refresh_keys(self, viewers: ViewerCheck) -> None:
         try:
-            self._viewers.refresh()
+            viewers.refresh()
         except RunError as error:
             if self._keys_fault != str(error):
                 self._on_report("keys", str(error))

@@ -13,6 +13,7 @@ from runner.graph import Plan
 from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline, encrypt
+from runner.gst.timers import every
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to release its port
@@ -154,23 +155,23 @@ class CameraCaller:
         self._used = ""  # the passphrase of the current pipeline
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
-        self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, lambda what: on_report(name, what))
+        self._on_fault = lambda what: on_report(name, what)
+        self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, self._on_fault)
 
     def start(self) -> None:
         self._supervised.start()
-        self._watch = GLib.timeout_add(WATCH_MS, self._check)
+        self._watch = every(WATCH_MS, self._check, self._on_fault)
 
     def stop(self) -> None:
         GLib.source_remove(self._watch)
         self.pipeline = None
         self._supervised.stop()
 
-    def _check(self) -> bool:
+    def _check(self) -> None:
         if self._passphrase and self._passphrase() != self._used:
             self._supervised.restart("there are new keys")
         elif self._acknowledgements.are_missing(time.monotonic()):
             self._supervised.restart(f"nothing was acknowledged for {UNACKNOWLEDGED_S:g} s")
-        return True
 
     def _on_built(self, pipeline: Any) -> Gst.Pad:
         if self._passphrase:

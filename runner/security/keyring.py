@@ -83,7 +83,8 @@ def srt_passphrase(media_secret: bytes, vehicle: str) -> str:
 class Watched(Generic[T]):
     """A value read from a file, and again when the file has changed. May be used from any thread.
 
-    A file that cannot be used leaves the last value in force, and is reported once.
+    A file that cannot be used leaves the last value in force, and is reported once; it is read again until it can be
+    used: a change of its owner leaves no trace in `_stat`.
 
     read       reads the value; may raise UserError
     on_report  called with what is wrong with a new file
@@ -94,6 +95,7 @@ class Watched(Generic[T]):
         self._path, self._read, self._on_report = path, read, on_report
         self._lock = threading.Lock()
         self._version, self._checked = self._stat(), time.monotonic()
+        self._problem = ""  # of the file as it is now, as reported
         self._value = read()
 
     def get(self) -> T:
@@ -108,11 +110,13 @@ class Watched(Generic[T]):
         version = self._stat()
         if version == self._version:
             return
-        self._version = version
         try:
             self._value = self._read()
+            self._version, self._problem = version, ""
         except UserError as error:
-            self._on_report(f"{error}; the previous content stays in force")
+            if str(error) != self._problem:
+                self._problem = str(error)
+                self._on_report(f"{error}; the previous content stays in force")
 
     def _stat(self) -> tuple[int, int, int] | None:
         try:

@@ -85,9 +85,9 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
     raises  ValueError with the rule that it breaks
     """
-    if not path.is_file():
-        raise ValueError(file_problem(path))
     try:
+        if not path.is_file():
+            raise ValueError(file_problem(path))
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
     except OSError as error:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
+from helpers import out_of_reach
 
 from rig import free_port, needs_root, process, until
 from rtsp_client import client_hello
@@ -348,6 +349,7 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
                 until(lambda: min(seen().values()) > 30, every_s=0.1)
             for holder, (own, _) in zip(intruders, all_seen, strict=True):
                 assert set(own().values()) == {0}, holder
+            _revoked_while_watching(keys, plans, reports)
     refusals = {what.partition("client: ")[2] for what in reports if "refused an RTSP client" in what}
     assert refusals == {
         "its certificate is not accepted: unknown-ca",
@@ -357,6 +359,17 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
     }
     secret = (keys / "alice" / keyring.SECRET).read_text()
     assert not any(secret in what for what in reports)
+
+
+def _revoked_while_watching(keys, plans, reports):
+    """A watcher's stream ends, although the vehicle could not read its keys for a moment."""
+    with watching(plans, keys / "bob") as (seen, _):
+        until(lambda: min(seen().values()) > 10, every_s=0.1)
+        with out_of_reach(keys):
+            until(lambda: any("permission denied" in what for what in reports))
+        assert not any("no longer accepted" in what for what in reports)
+        changed(keys, "revoke", "bob")
+        until(lambda: len([what for what in reports if "its keys are no longer accepted" in what]) >= len(CAMERAS))
 
 
 def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):
