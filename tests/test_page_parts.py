@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import http.client
 import inspect
 import json
 import math
+import shutil
 import socket
-from contextlib import AsyncExitStack, contextmanager, suppress
+import ssl
+from contextlib import AsyncExitStack, closing, contextmanager, suppress
 from types import SimpleNamespace
 from urllib.parse import urlencode
 
@@ -22,12 +25,16 @@ import aiohttp
 
 from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
+from runner.core.roles import Role
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import PageLogin
-from runner.page.server import PageServer, hosts
+from runner.page.server import POLICY, PageServer, hosts
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, Outcome, Position, Sample
+from runner.security import keyring
+from runner.security.authority import Authority
+from runner.security.keyring import Keyring
 
 UPGRADE = (
     "Connection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -53,14 +60,14 @@ def sent(viewer):
 
 
 @contextmanager
-def served(*overrides, layouts=None, login=None):
+def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     """Port of a page, and its station; with a login, browsers must expect HTTPS, although it is not encrypted."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    station = SimpleNamespace(state=None, note=print, answer_s=1.0, attention=None)
-    page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts)
-    page._login = login
+    station = SimpleNamespace(state=None, note=note, answer_s=1.0, attention=None)
+    page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
+    page._login = login or page._login
     page.start()
     try:
         yield port, station
@@ -86,6 +93,97 @@ def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
         line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 100\r\n\r\n".encode())
         assert line.recv(1) == b""
+
+
+@pytest.fixture
+def keys(tmp_path):
+    """An authority with the keys of alice, whose page is at 127.0.0.1."""
+    authority = Authority(tmp_path / "keys")
+    with authority.opened():
+        authority.issue("alice", Role.CONTROLLER, ["127.0.0.1"])
+        yield authority
+
+
+def answered(port, keys, path="/login", host="", method="GET", **headers):
+    """The serial number of the certificate that a page presents, and its answer."""
+    tls = ssl.create_default_context(cafile=keys.directory / "alice" / keyring.AUTHORITY)
+    connection = http.client.HTTPSConnection("127.0.0.1", port, context=tls, timeout=5)
+    with closing(connection):
+        connection.request(method, path, headers={"Host": host or f"127.0.0.1:{port}", **headers})
+        serial = int(connection.sock.getpeercert()["serialNumber"], 16)
+        return serial, connection.getresponse()
+
+
+def test_new_keys_take_effect_while_the_page_runs(keys, monkeypatch):
+    """The certificate, and the addresses that it names; while only one of two files is new, the old ones serve."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    notes, directory = [], keys.directory / "alice"
+    with served(keyring=Keyring.of(directory), note=notes.append) as (port, _):
+        first, answer = answered(port, keys)
+        assert (answer.status, answered(port, keys, host=f"localhost:{port}")[1].status) == (200, 403)
+        shutil.copytree(directory, keys.directory / "old")
+        keys.issue("alice", Role.CONTROLLER, ["127.0.0.1", "localhost"])
+        new_key = (directory / keyring.KEY).read_bytes()
+        shutil.copy(keys.directory / "old" / keyring.KEY, directory)
+        assert answered(port, keys)[0] == first
+        (directory / keyring.KEY).write_bytes(new_key)
+        second, answer = answered(port, keys, host=f"localhost:{port}")
+        assert (answer.status, second != first) == (200, True)
+    assert len([note for note in notes if note.startswith("page: the previous certificate stays in force")]) == 1
+
+
+def test_a_handshake_that_never_ends_is_closed(keys, monkeypatch):
+    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    with (
+        served(keyring=Keyring.of(keys.directory / "alice")) as (port, _),
+        socket.create_connection(("127.0.0.1", port), timeout=5) as line,
+    ):
+        assert line.recv(1) == b""
+
+
+def test_every_refusal_is_reported_once_without_secrets_and_carries_the_policy(keys):
+    notes, secret = [], (keys.directory / "alice" / keyring.TOKEN).read_text()
+    with served(keyring=Keyring.of(keys.directory / "alice"), note=notes.append) as (port, _):
+        own = {"Origin": f"https://127.0.0.1:{port}"}
+        upgrade = dict(line.split(": ") for line in UPGRADE.split("\r\n"))
+        refused = [
+            ("/login", {"host": "evil.example:8090"}, 403, "Host 'evil.example:8090' is none of this page's"),
+            ("/", {"Origin": "https://evil.example"}, 403, "Origin 'https://evil.example' is another site"),
+            ("/login", {"method": "POST"}, 403, "a POST without Origin"),
+            (f"/live?viewer={secret}", upgrade, 401, "not logged in"),
+            ("/static/../../../etc/passwd", own, 401, "not logged in"),
+            ("/login/challenge", {"method": "PUT", **own}, 405, "method not allowed"),
+        ]
+        for path, headers, status, _ in refused * 3:
+            answer = answered(port, keys, path, **headers)[1]
+            assert (answer.status, answer.headers["Content-Security-Policy"]) == (status, POLICY), path
+        redirect = answered(port, keys, "/?view=drive", **own)[1]
+        assert (redirect.status, redirect.headers["Location"]) == (303, "/login?view=drive")
+        assert redirect.headers["Content-Security-Policy"] == POLICY
+    expected = [
+        f"page: refused {headers.get('method', 'GET')} {path.partition('?')[0]!r} from 127.0.0.1: {why}"
+        for path, headers, _, why in refused
+    ]
+    assert notes == expected
+
+
+def test_a_path_outside_the_page_does_not_exist_and_is_reported():
+    notes = []
+    with served(note=notes.append) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        line.sendall(f"GET /static/%2e%2e/../server.py HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+        assert line.recv(12) == b"HTTP/1.1 404"
+    assert notes == ["page: refused GET '/static/%2e%2e/../server.py' from 127.0.0.1: not found"]
+
+
+def test_wrong_answers_to_the_login_do_not_displace_the_other_notes():
+    notes, login = [], PageLogin(lambda: b"token")
+    with served(login=login, note=notes.append) as (port, _):
+        own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\nConnection: close\r\n"
+        for _ in range(100):
+            with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+                line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 2\r\n\r\n{{}}".encode())
+                assert line.recv(12) == b"HTTP/1.1 403"
+    assert notes == ["page: refused POST '/login' from 127.0.0.1: wrong token"]
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from runner.core.model import Endpoint
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
+from runner.system.reports import LimitedReports
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 1.0)  # between attempts, initially and at most
@@ -28,8 +29,6 @@ STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
 CLOSE_S = 2.0  # for signing off
-FAULTS = 100  # distinct message faults that are reported; further ones are only counted
-LONGEST_FAULT = 1000  # characters of a fault's reason
 PERIODIC = {"telemetry", "reception", "clock", "advice", "steering"}  # the next one follows soon: QoS 0
 SUPERSEDED = PERIODIC | {"state"}  # replaced by a later message, and so not sent ...
 UNSENT_BYTES = 4096  # ... while this much is queued: after an outage it would delay current messages
@@ -81,7 +80,7 @@ class ControlLink:
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._on_report = on_connected, on_report
         self._connection_fault: str | None = None  # why there is no connection, as reported
-        self._faults: set[str] = set()  # as reported
+        self._report_fault = LimitedReports(on_report)  # of a message
         self.dropped = 0
         self._listening, self._closing = threading.Event(), threading.Event()
         self._client = self._new_client()
@@ -207,10 +206,7 @@ class ControlLink:
 
     def _drop(self, message: MQTTMessage, why: str) -> None:
         self.dropped += 1
-        fault = f"a message on {message.topic} was dropped: {why[:LONGEST_FAULT]}"
-        if fault not in self._faults and len(self._faults) < FAULTS:
-            self._faults.add(fault)
-            self._on_report(fault)
+        self._report_fault(f"a message on {message.topic} was dropped: {why}")
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if _is_one_of(PERIODIC, topic) else 1

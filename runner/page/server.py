@@ -6,7 +6,6 @@ import asyncio
 import logging
 import mimetypes
 import socket
-import ssl
 import threading
 import time
 from collections import deque
@@ -32,12 +31,14 @@ from runner.page.control import Control, combined_attention, page_of
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
 from runner.page.login import COOKIE, SESSION_S, PageLogin
+from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
 from runner.schema import shortened
 from runner.security.keyring import Keyring
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
+from runner.system.reports import LimitedReports
 
 STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
@@ -47,12 +48,14 @@ REPORTED = tuple(attention.value for attention in Attention if attention is not 
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
 STOP_S = 0.5  # how long open connections may take to close
+LOOPBACK = ("127.0.0.1", "localhost")  # names of the page without keys
 DEFAULT_PORTS = {"http": 80, "https": 443}
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
 PING_S = 0.5
 SILENT_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
 CLOSE_TYPES = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 MAX_MESSAGE_BYTES = 1_048_576  # a longer message closes the connection
+# Inline styles: Plotly adds style elements and attributes of its own. Inline scripts stay forbidden.
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'self'; object-src 'none'"
@@ -93,10 +96,10 @@ class PageServer(Listener):
     ) -> None:
         self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
         self._layouts, self._is_saving = layouts or Layouts(), False
-        self._keyring = keyring
+        self._report = LimitedReports(station.note)  # of what browsers and others on the network can cause
+        self._tls = PageTls(keyring, self._report) if keyring else None
+        self._holder = keyring.watched_holder(station.note) if keyring else None
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
-        self._names = keyring.holder.hosts if keyring else ("127.0.0.1", "localhost")
-        self._refusals = 0
         check_port_free(vehicle.page.endpoint)
         self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
         self._plotly = plotly_script("page")
@@ -114,9 +117,14 @@ class PageServer(Listener):
     @property
     def url(self) -> str:
         host, port = self._address
-        if self._keyring is None:
+        if self._holder is None:
             return f"http://{host}:{port}/"
         return f"https://{next(iter(self._names), host)}:{port}/"
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Addresses and names at which browsers reach the page."""
+        return self._holder.get().hosts if self._holder else LOOPBACK
 
     def start(self) -> None:
         self._thread.start()
@@ -159,7 +167,7 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        app = web.Application(middlewares=[self._on_request_complete, self._check_access])
+        app = web.Application(middlewares=[self._on_request_complete, self._add_headers, self._check_access])
         app.router.add_get("/live", self._on_viewer)
         app.router.add_get("/plotly.js", lambda _: _send_file(self._plotly))
         app.router.add_get("/", _static_handler(STATIC / "index.html"))
@@ -174,18 +182,23 @@ class PageServer(Listener):
             app, access_log=None, logger=self._logger(), shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
         )
         await self._runner.setup()
-        tls = _tls(self._keyring) if self._keyring else None
-        self._server = await self._loop.create_server(self._new_connection, *self._address, ssl=tls)
+        tls = self._tls.context if self._tls else None
+        handshake_s = REQUEST_S if tls else None  # until it has ended, `_expire` has nothing to close
+        self._server = await self._loop.create_server(
+            self._new_connection, *self._address, ssl=tls, ssl_handshake_timeout=handshake_s
+        )
 
     def _logger(self) -> logging.Logger:
         """Reports the server library's warnings, without its tracebacks."""
         logger = logging.Logger("page")
-        logger.addHandler(_FaultHandler(self._station.note))
+        logger.addHandler(_FaultHandler(self._report))
         return logger
 
     def _new_connection(self) -> asyncio.Protocol:
         """A new connection, closed unless its first request completes in time."""
         assert self._runner.server
+        if self._tls:
+            self._tls.refresh()
         connection = self._runner.server()
         self._awaiting_request.add(connection)
         self._loop.call_later(REQUEST_S, self._expire, connection)
@@ -208,28 +221,56 @@ class PageServer(Listener):
         return response
 
     @web.middleware
+    async def _add_headers(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Add HEADERS to every response, also to one that is raised."""
+        try:
+            response: web.StreamResponse = await handler(request)
+        except web.HTTPException as raised:
+            raised.headers.update(HEADERS)
+            raise
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    @web.middleware
     async def _check_access(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Accept only this server's own pages, under its own name, and from other machines only after login.
 
         No other site in the same browser may read or send anything, by whatever host name it resolves this server (DNS
         rebinding).
         """
-        sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
-        scheme, origin = "https" if self._login else "http", request.headers.get("Origin")
-        allowed = hosts(self._names, sockname[1], scheme)
-        foreign = origin is not None and origin not in {f"{scheme}://{name}" for name in allowed}
-        host = request.headers.get("Host", "").lower()
-        if host not in allowed or foreign or (request.method == "POST" and origin is None):
+        if foreign := self._foreign(request):
+            self._report_refusal(request, foreign)
             raise web.HTTPForbidden(text="accepted only from this server's own pages\n")
         if not self._has_access(request):
             if request.path == "/":
                 raise web.HTTPSeeOther(f"/login?{request.rel_url.raw_query_string}".rstrip("?"))
             if request.path not in UNPROTECTED:
+                self._report_refusal(request, "not logged in")
                 raise web.HTTPUnauthorized(text="login required: see /login\n")
-        response: web.StreamResponse = await handler(request)
-        if not response.prepared:
-            response.headers.update(HEADERS)
+        try:
+            response: web.StreamResponse = await handler(request)
+        except (web.HTTPNotFound, web.HTTPMethodNotAllowed) as refused:
+            self._report_refusal(request, refused.reason.lower())
+            raise
         return response
+
+    def _foreign(self, request: web.Request) -> str | None:
+        """How a request differs from those of this server's own pages; None if it does not."""
+        sockname = request.get_extra_info("sockname") or ("", 0)  # not request.url, which raises for a malformed Host
+        scheme, origin = "https" if self._login else "http", request.headers.get("Origin")
+        allowed = hosts(self._names, sockname[1], scheme)
+        host = request.headers.get("Host", "")
+        if host.lower() not in allowed:
+            return f"Host {shortened(repr(host))} is none of this page's"
+        if origin is None:
+            return "a POST without Origin" if request.method == "POST" else None
+        own = {f"{scheme}://{name}" for name in allowed}
+        return None if origin in own else f"Origin {shortened(repr(origin))} is another site"
+
+    def _report_refusal(self, request: web.Request, why: str) -> None:
+        path = shortened(repr(request.raw_path.partition("?")[0]))  # what follows may be anything, such as a password
+        self._report(f"page: refused {request.method} {path} from {request.remote}: {why}")
 
     async def _on_challenge(self, _request: web.Request) -> web.Response:
         assert self._login
@@ -248,8 +289,7 @@ class PageServer(Listener):
         challenge, answer = (str(document.get(key, "")) for key in ("challenge", "answer"))
         session = self._login.open(challenge, answer, time.monotonic())
         if session is None:
-            self._refusals += 1
-            self._station.note(f"page: login from {request.remote}: wrong token ({self._refusals} refused so far)")
+            self._report_refusal(request, "wrong token")
             raise web.HTTPForbidden(text="wrong token\n")
         response = web.Response(text="logged in\n")
         response.set_cookie(COOKIE, session, max_age=int(SESSION_S), secure=True, httponly=True, samesite="Strict")
@@ -484,18 +524,17 @@ def _recent(camera: Camera) -> RecentUnits:
 
 
 class _FaultHandler(logging.Handler):
-    """Notes each fault of this server once. Invalid HTTP is the client's fault and is answered with 400."""
+    """Reports the faults of this server. Invalid HTTP is the client's fault and is answered with 400."""
 
-    def __init__(self, note: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None]) -> None:
         super().__init__(logging.WARNING)
-        self._note, self._noted = note, set[str]()
+        self._report = report
 
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
         text = f"page: {record.getMessage()}" + (f": {type(error).__name__}: {error}" if error else "")
-        if not isinstance(error, HttpProcessingError) and text not in self._noted and len(self._noted) < NOTES:
-            self._noted.add(text)
-            self._note(text)
+        if not isinstance(error, HttpProcessingError):
+            self._report(text)
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
@@ -552,17 +591,6 @@ def _native(camera: Camera) -> dict[str, int]:
     """Size of the source's image, and where the full image begins in it, px."""
     width, height = camera.source_size
     return {"width": width, "height": height, "left": camera.in_source.x, "top": camera.in_source.y}
-
-
-def _tls(keyring: Keyring) -> ssl.SSLContext:
-    """raises RunError"""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    try:
-        context.load_cert_chain(keyring.certificate, keyring.key)
-    except (OSError, ssl.SSLError) as error:
-        raise RunError(f"{keyring.directory}: {error}") from None
-    return context
 
 
 def _static_handler(file: Path) -> Any:

@@ -220,6 +220,9 @@ class Keyring:
     def watched_people(self, on_report: Callable[[str], None]) -> Watched[Mapping[str, Person]]:
         return Watched(self.directory / PEOPLE, self.people, on_report)
 
+    def watched_holder(self, on_report: Callable[[str], None]) -> Watched[Holder]:
+        return Watched(self.directory / HOLDER, lambda: self.holder, on_report)
+
     def watched_certificate(self, on_report: Callable[[str], None]) -> Watched[bytes]:
         return Watched(self.certificate, lambda: self.read(CERTIFICATE), on_report)
 

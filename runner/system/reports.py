@@ -1,0 +1,43 @@
+"""Reports of what peers can cause in any number: they must not fill a log, a disk or an operator's screen."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+PERIOD_S = 3600.0
+MOST = 20  # texts in a period; further ones, and repeated ones, are only counted
+LONGEST = 1000  # characters of a text
+
+
+class LimitedReports:
+    """Passes on each text once in a period, and MOST of them. May be called from any thread.
+
+    What goes on stays visible: the first text of a later period comes with the number of those left out before it.
+
+    on_report  called with a text
+    clock      returns the time, s
+    """
+
+    def __init__(self, on_report: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._on_report, self._clock = on_report, clock
+        self._lock = threading.Lock()
+        self._ends = float("-inf")  # of this period
+        self._passed_on: set[str] = set()  # in this period
+        self._left_out = 0  # since the last text that was passed on in a new period
+
+    def __call__(self, text: str) -> None:
+        text, left_out = text[:LONGEST], 0
+        with self._lock:
+            if self._clock() >= self._ends:
+                self._ends = self._clock() + PERIOD_S
+                self._passed_on.clear()
+                left_out, self._left_out = self._left_out, 0
+            if text in self._passed_on or len(self._passed_on) >= MOST:
+                self._left_out += 1
+                return
+            self._passed_on.add(text)
+        if left_out:
+            self._on_report(f"{left_out} more such reports were left out before this one")
+        self._on_report(text)
