@@ -27,7 +27,7 @@ import msgspec
 from runner.core.roles import VIEWERS, Role
 from runner.errors import RunError, UserError
 from runner.security import keyring
-from runner.security.broker_files import ACL, broker_settings
+from runner.security.broker_files import access_list, broker_settings
 from runner.security.certificates import Pair, is_host, new_authority, new_certificate, revocation_list, serial_of
 from runner.system.files import read_file, unfinished
 
@@ -201,7 +201,7 @@ class Authority:
         if role in VIEWERS:
             return {keyring.TOKEN: _secret()}
         if role is Role.BROKER:
-            return {ACCESS: ACL.encode(), SETTINGS: broker_settings(self.installed).encode()}
+            return {SETTINGS: broker_settings(self.installed).encode()}
         return {}
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
@@ -238,6 +238,7 @@ class Authority:
             elif holder.role is Role.BROKER:
                 lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())
                 _write(directory / PASSWORDS, "".join(lines).encode())
+                _write(directory / ACCESS, access_list((each.name, each.role) for each in holders).encode())
 
     def _people(self, vehicle: str, holders: Sequence[Issued], secret: Mapping[str, bytes]) -> bytes:
         people = {

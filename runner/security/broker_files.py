@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from runner.core.roles import VIEWERS, Role
+
 PORT = 8883  # IANA: secure-mqtt
 
-# %u is the user name: operators cannot use another id in a topic, and vehicles publish only for themselves. The vehicle
-# checks what an operator's role allows.
-ACL = """\
-pattern write tod/+/request/%u
-pattern write tod/+/reception/%u
-pattern read tod/+/reply/%u
-pattern read tod/+/clock/%u
-pattern read tod/+/state
-pattern read tod/+/telemetry
-pattern read tod/+/configuration
-pattern read tod/+/advice
-pattern read tod/+/steering
-pattern write tod/%u/state
-pattern write tod/%u/telemetry
-pattern write tod/%u/configuration
-pattern write tod/%u/advice
-pattern write tod/%u/steering
-pattern write tod/%u/reply/+
-pattern write tod/%u/clock/+
-pattern read tod/%u/request/+
-pattern read tod/%u/reception/+
-"""
+# Below tod/VEHICLE/; + stands for any name.
+VEHICLE_WRITES = ("state", "telemetry", "configuration", "advice", "steering", "reply/+", "clock/+")
+VEHICLE_READS = ("request/+", "reception/+", "state", "telemetry", "configuration")  # the last three: its own name
+SENDER_READS = ("state", "telemetry")  # of any vehicle: a request must state the vehicle's time
+VIEWER_READS = (*SENDER_READS, "configuration", "advice", "steering")
+
+
+def access_list(holders: Iterable[tuple[str, Role]]) -> str:
+    """Who may use which topic, for mosquitto: everyone only under the own name, and vehicles only their own topics.
+
+    The vehicle checks what the role of a sender allows it to request.
+
+    holders  name and role of each
+    """
+    return "".join(f"user {name}\n{_topics(name, role)}\n" for name, role in holders if role is not Role.BROKER)
+
+
+def _topics(name: str, role: Role) -> str:
+    if role is Role.VEHICLE:
+        return _lines("write", name, *VEHICLE_WRITES) + _lines("read", name, *VEHICLE_READS)
+    if role in VIEWERS:
+        writes = _lines("write", "+", f"request/{name}", f"reception/{name}")
+        return writes + _lines("read", "+", *VIEWER_READS, f"reply/{name}", f"clock/{name}")
+    return _lines("write", "+", f"request/{name}") + _lines("read", "+", *SENDER_READS, f"reply/{name}")
+
+
+def _lines(may: str, vehicle: str, *topics: str) -> str:
+    return "".join(f"topic {may} tod/{vehicle}/{topic}\n" for topic in topics)
 
 
 def broker_settings(directory: str, host: str = "", port: int = PORT) -> str:

@@ -50,7 +50,7 @@ def issue(directory, **names):
 @pytest.fixture
 def keys(tmp_path):
     people = {"alice": "controller", "carol": "controller", "bob": "watcher", "pqos": "predictor", "gnss": "positioner"}
-    return issue(tmp_path / "keys", **people)
+    return issue(tmp_path / "keys", another="vehicle", **people)
 
 
 def issue_expired(keys):
@@ -146,8 +146,8 @@ def broker(keys):
         yield endpoint
 
 
-def published(endpoint, holder, topic, **how):
-    return mosquitto("mosquitto_pub", endpoint, holder, "-t", topic, "-m", "x", **how)
+def published(endpoint, holder, topic, retain=False, **how):
+    return mosquitto("mosquitto_pub", endpoint, holder, "-t", topic, "-m", "x", *(["-r"] if retain else []), **how)
 
 
 @pytest.mark.parametrize(
@@ -163,11 +163,46 @@ def published(endpoint, holder, topic, **how):
         ("alice", f"tod/{NAME}/steering", False),
         (NAME, "tod/another/state", False),
         (NAME, "tod/another/reply/alice", False),
+        (NAME, f"tod/another/request/{NAME}", False),
+        ("pqos", f"tod/{NAME}/request/pqos", True),
+        ("pqos", f"tod/{NAME}/reception/pqos", False),
     ],
 )
 def test_nobody_can_impersonate_another(keys, broker, holder, topic, allowed):
     status, output = published(broker, keys / holder, topic)
     assert (status, "failed: Not authorized" in output) == (0, not allowed), output
+
+
+def topics_received(endpoint, keys, holder, sender, last):
+    """What a holder receives of all topics: their names, from what the broker stores up to the topic `last`."""
+    ring = Keyring(keys / holder)
+    words = ["--cafile", ring.authority, "--cert", ring.certificate, "--key", ring.key, "-u", holder]
+    words += ["-P", keyring.mqtt_password(ring.secret), "-t", "tod/#", "-F", "%t"]
+    command = ["mosquitto_sub", "-h", endpoint.host, "-p", str(endpoint.port), *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as listening:
+        lines = []
+        reader = threading.Thread(target=lambda: lines.extend(map(str.strip, listening.stdout)))
+        reader.start()
+        until(lambda: published(endpoint, keys / sender, last) and last in lines)  # what is stored comes first
+        listening.terminate()
+        reader.join()
+    return sorted(line.removeprefix("tod/") for line in lines[: lines.index(last)])
+
+
+def test_a_vehicle_receives_nothing_of_another_and_operators_what_they_need(keys, broker):
+    told = ("advice", "configuration", "state", "steering", "telemetry")
+    for name in told:
+        assert published(broker, keys / NAME, f"tod/{NAME}/{name}", retain=True) == (0, "")
+    assert published(broker, keys / "another", "tod/another/state", retain=True) == (0, "")
+    own = [f"{NAME}/{name}" for name in told]
+    everything = (
+        ("another", "alice", "tod/another/request/alice", ["another/state"]),
+        (NAME, "alice", f"tod/{NAME}/request/alice", [f"{NAME}/{name}" for name in ("configuration", *told[2::2])]),
+        ("bob", NAME, f"tod/{NAME}/reply/bob", ["another/state", *own]),
+        ("pqos", NAME, f"tod/{NAME}/reply/pqos", ["another/state", *own[2::2]]),
+    )
+    for holder, sender, last, expected in everything:
+        assert topics_received(broker, keys, holder, sender, last) == expected, holder
 
 
 def test_the_broker_refuses_intruders(keys, broker, tmp_path):
