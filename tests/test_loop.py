@@ -7,15 +7,25 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from msgspec import UNSET
+from test_keys import ALLOWED, PRESENCE
 
 from runner.configuration.config import configuration
+from runner.core.events import EVENTS, NAMES
+from runner.core.roles import SETTINGS, Role, denial
+from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import SteeringAngle, Telemetry, VehicleState
+from runner.records import Outcome, SteeringAngle, Telemetry, VehicleState
+from runner.security import keyring
+from runner.security.keyring import Person
+from runner.system.reports import MOST
+from runner.vehicle.access import Access
 from runner.vehicle.inbox import Request
 from runner.vehicle.loop import ControlLoop
 from runner.vehicle.operators import SILENT_S
@@ -27,7 +37,7 @@ pytestmark = pytest.mark.slow  # seconds of real time
 class Watched:
     """A loop with its published records and reports. `publishes` is the result of `publish`."""
 
-    def __init__(self, *words: str) -> None:
+    def __init__(self, *words: str, access: Access | None = None) -> None:
         config = configuration(["vehicle=delivery_robot", "pqos=constant", *words], runnable=False)
         vehicle, (pqos, track) = config.vehicle(), config.pqos()
         self.side = RecordingVehicle(compile_plans(vehicle))
@@ -35,7 +45,8 @@ class Watched:
         self.reports: list[str] = []
         self.publishes: Callable[[Any], bool] = lambda record: True
         log = Log(None, "vehicle", {}, {}, self.reports.append)
-        self.loop = ControlLoop(vehicle, self.side, pqos, track, log, self._publish, self.reports.append)
+        report = self.reports.append
+        self.loop = ControlLoop(vehicle, self.side, pqos, track, log, self._publish, report, access or Access())
 
     def _publish(self, record: Any) -> bool:
         accepted = self.publishes(record)
@@ -177,6 +188,80 @@ def test_a_steering_angle_is_published_immediately_with_its_time_and_at_most_eve
     published = watched.of(SteeringAngle)
     assert all(b.at - a.at >= 0.049 for a, b in pairwise(published))
     assert {angle.rad for angle in published[1:]} == {0.5}
+
+
+EXAMPLES: tuple[dict[str, Any], ...] = (
+    {"event": "mode_selected", "mode": "single"},
+    {"event": "bitrate_predicted", "kbps": 3000},
+    {"event": "position_reported", "lat": 48.26, "lon": 11.66},
+    {"event": "steering_reported", "rad": -0.35},
+    {"event": "total_set", "kbps": 4000},
+    {"event": "camera_switched", "camera": "rear", "on": True},
+    {"event": "roi_set", "camera": "front", "x": 0, "y": 0, "width": 320, "height": 240},
+    {"event": "camera_configured", "camera": "front", "kbps": 800},
+    {"event": "weights_set", "weights": {"front": 2.5}},
+    {"event": "link_measured", "kbps": 780},
+    {"event": "copies_counted", "copies": {"front": 2}},
+    {"event": "control_passed", "operator": "a-watcher"},
+    {"event": "attention_changed", "attention": "hidden"},
+    {"event": "operator_connected"},
+    {"event": "operator_disconnected"},
+    {"event": "clock_advanced"},
+)
+
+
+class Requests:
+    """Requests to a loop whose people are named in `people.json`, and the events that reach the rules."""
+
+    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        named = {"driver": Role.CONTROLLER, "other": Role.CONTROLLER, **{f"a-{role}": role for role in Role}}
+        people = {name: Person(role) for name, role in named.items()}
+        (directory / keyring.PEOPLE).write_bytes(msgspec.json.encode(people))
+        self.watched = Watched(access=Access(keyring.Keyring(directory), print))
+        self._decided: list[str] = []
+        monkeypatch.setattr("runner.vehicle.loop.step", self._step)
+
+    def _step(self, vehicle: Any, run: Any, event: Any) -> Any:
+        self._decided.append(NAMES[type(event)])
+        return step(vehicle, run, event)
+
+    def ask(self, sender: str, document: dict[str, Any]) -> tuple[Outcome, bool]:
+        """The outcome of a request, and whether its event reached the rules."""
+        self._decided.clear()
+        outcomes: list[Outcome] = []
+        self.watched.loop.take(Request(sender, document, outcomes.append))
+        until(lambda: outcomes)
+        return outcomes[0], document["event"] in self._decided
+
+
+def test_the_vehicle_enforces_each_roles_rights_for_every_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is denied does not reach the rules, and is reported; the clock advances by itself."""
+    assert [document["event"] for document in EXAMPLES] == list(EVENTS)
+    requests = Requests(tmp_path, monkeypatch)
+    watched = requests.watched
+    watched.side.watch("front", "rear", "mast")
+    with watched.running():
+        for role in (*Role, None):
+            sender = f"a-{role}" if role else "stranger"
+            for document in EXAMPLES:
+                event = document["event"]
+                outcome, decided = requests.ask(sender, document)
+                if event in ALLOWED[role]:
+                    assert decided or event in PRESENCE, (role, event)
+                    assert outcome.result == "applied" or "is accepted in mode" in outcome.reason, (role, outcome)
+                else:
+                    assert (outcome.result, outcome.reason) == ("refused", denial(role, event)), (role, event)
+                    assert not decided or event == "clock_advanced", (role, event)
+        assert requests.ask("driver", {"event": "operator_connected"})[0].result == "applied"
+        for document in EXAMPLES:
+            outcome, decided = requests.ask("other", document)
+            if document["event"] in SETTINGS:
+                assert (outcome.result, outcome.reason, decided) == ("refused", "driver is in control", False)
+    reported = [report for report in watched.reports if report.startswith("refused ")]
+    assert reported[0] == f"refused mode_selected of a-vehicle: {denial(Role.VEHICLE, 'mode_selected')}"
+    assert len(reported) == MOST
 
 
 def test_attention_of_the_operator_in_control_is_published_until_control_passes() -> None:

@@ -33,6 +33,8 @@ class RtspConnection:
     described    camera of its last DESCRIBE: the library keeps it open for the client
     interleaved  whether this connection also carries video
     last_request monotonic time of its last complete request, s; before the first, of its start
+    peer         its IP address and port
+    refusal      why it may not watch, so far as it has shown; "" if it may
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
@@ -42,6 +44,8 @@ class RtspConnection:
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self.peer = self._socket.getpeername()[:2]
+        self.refusal = ""
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""

@@ -18,6 +18,7 @@ from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
 from runner.security.keyring import Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
+USER = "user"  # field of a token of the server library: whose password it stands for
 VIEWER = "viewer"  # role in the server library that may open and watch a camera
 
 
@@ -129,12 +130,18 @@ class StreamLogin:
 
 
 class ViewerCheck:
-    """Decides who may watch: holders of an accepted certificate, with the password of the user that it names."""
+    """Decides who may watch: holders of an accepted certificate, with the password of the user that it names.
 
-    def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
+    on_report   called with the problem of new files
+    on_refused  called with IP address and port of a client whose certificate is not accepted, and why; from any thread
+    """
+
+    def __init__(
+        self, keyring: Keyring, on_report: Callable[[str], None], on_refused: Callable[[tuple[str, int], str], None]
+    ) -> None:
         self._check = PeerCheck(keyring, on_report)
         self._people = keyring.watched_people(on_report)
-        self._on_report = on_report
+        self._on_refused = on_refused
         self._known: Mapping[str, str] = {}  # by user, the password given to the library
         self._own, self._used = keyring.watched_certificate(on_report), b""
         self._keyring = keyring
@@ -159,6 +166,7 @@ class ViewerCheck:
             if self._known.get(name) != password:
                 token = GstRtspServer.RTSPToken()
                 token.set_string(GstRtspServer.RTSP_TOKEN_MEDIA_FACTORY_ROLE, VIEWER)
+                token.set_string(USER, name)
                 self.auth.add_digest(name, password, token)
         self._known = people
         if self._used != (own := self._own.get()):  # last: while it is being copied, the others are up to date
@@ -173,11 +181,22 @@ class ViewerCheck:
         holder = self._check.holder(certificate) if certificate else None
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 
-    def _accept(self, _auth: object, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
+    def refusal(self, client: GstRtspServer.RTSPClient, token: GstRtspServer.RTSPToken) -> str | None:
+        """Why a request is refused, by the client's certificate and the password that the token stands for.
+
+        The library accepts the password of any user with any certificate.
+        """
+        name, user = self.viewer(client), token.get_string(USER) if token else None
+        if name is None:
+            return "its keys are no longer accepted"
+        return None if name == user else f"its certificate is of {name}, its password of {user}"
+
+    def _accept(self, _auth: object, connection: Gio.TlsConnection, certificate: Gio.TlsCertificate, _: object) -> bool:
         holder = self._check.verify(certificate)
         if isinstance(holder, Holder):
             if holder.name in self._known:
                 return True
             holder = f"{holder.name} may not watch"
-        self._on_report(f"refused an RTSP client: {holder}")
+        address = connection.props.base_io_stream.get_remote_address()
+        self._on_refused((address.get_address().to_string(), address.get_port()), holder)
         return False

@@ -27,6 +27,7 @@ from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
 from runner.system.ports import check_port_free
+from runner.system.reports import LimitedReports
 
 if TYPE_CHECKING:
     from runner.gst.secure import ViewerCheck
@@ -50,11 +51,19 @@ LEFT_S = 10.0  # how long a camera is monitored after a viewer has left
 SESSIONS_EVERY_S = 1.0
 GIVE_BACK_S = 10.0  # interval at which memory of ended pipelines and of replaced encoders is returned to the system
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
-OK, REFUSED, UNAVAILABLE, MOVED = (
+OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.OK,
+    GstRtsp.RTSPStatusCode.FORBIDDEN,
     GstRtsp.RTSPStatusCode.NOT_ENOUGH_BANDWIDTH,
     GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
+)
+
+# Why a client of a vehicle with keys may not watch, as long as it has shown nothing more specific.
+NO_CERTIFICATE, NO_PASSWORD, WRONG_PASSWORD = (
+    "it has not completed a TLS handshake with a certificate",
+    "it has given no password",
+    "its password is wrong",
 )
 
 MEDIA_ERROR = "handle-message::error"  # signal of a media
@@ -132,7 +141,8 @@ class CameraServer:
         if keyring:
             from runner.gst.secure import ViewerCheck
 
-            self._viewers = ViewerCheck(keyring, lambda what: on_report("keys", what))
+            self._viewers = ViewerCheck(keyring, lambda what: on_report("keys", what), self._on_refused)
+        self._report_refusal = LimitedReports(lambda what: on_report("keys", what))
         self._media, self._build, self._on_report = media, build, on_report
         self.controller = ""
         self.pipelines: dict[str, CameraPipeline] = {}
@@ -322,6 +332,8 @@ class CameraServer:
             connection = RtspConnection(client, self._media.session_timeout_s)
         except OSError:  # the client has already disconnected, or there are no descriptors left: it may not watch
             return
+        if self._viewers:
+            connection.refusal = NO_CERTIFICATE
         with self._changed:
             self._connections[client] = connection
             if self._stopped.is_set():
@@ -344,6 +356,15 @@ class CameraServer:
                 self._note_left(connection.cameras)
                 connection.release()
                 self._changed.notify_all()
+        if connection and connection.refusal:
+            self._report_refusal(f"refused an RTSP client at {connection.viewer.address}: {connection.refusal}")
+
+    def _on_refused(self, peer: tuple[str, int], why: str) -> None:
+        """A client's certificate is not accepted: its connection ends."""
+        with self._changed:
+            for connection in self._connections.values():
+                if connection.peer == peer:
+                    connection.refusal = why
 
     def _on_session(self, _client: object, session: GstRtspServer.RTSPSession) -> None:
         session.set_timeout(self._media.session_timeout_s)
@@ -352,11 +373,15 @@ class CameraServer:
         connection = self._connection(client)
         if connection:
             connection.last_request = time.monotonic()
+            if connection.refusal == NO_CERTIFICATE:
+                connection.refusal = NO_PASSWORD
 
     def _on_describe(
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
     ) -> GstRtsp.RTSPStatusCode:
-        camera = self._cameras.get(_path(context))
+        camera, connection = self._cameras.get(_path(context)), self._connection(client)
+        if connection:
+            connection.refusal = ""
         if camera is None:
             return OK  # the library answers 404
         if _has_query(context):
@@ -364,9 +389,10 @@ class CameraServer:
             return MOVED
         if not self._hold(client, camera):
             return UNAVAILABLE
-        connection = self._connection(client)
         if connection:
             connection.described = camera.name
+            if self._viewers:  # until the library has accepted its password
+                connection.refusal = WRONG_PASSWORD if _has_password(context) else NO_PASSWORD
         return OK
 
     def _redirect(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
@@ -382,11 +408,18 @@ class CameraServer:
             connection.close()  # the library would also answer, without a Location
 
     def _on_described(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
+        connection = self._connection(client)
+        if connection:
+            connection.refusal = ""
         self._release(lambda _, holder: holder is client)
 
     def _on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
-        """Admit a viewer, or refuse it if its copy of the stream would overload the uplink."""
+        """Admit a viewer, or refuse it for its keys, or because its copy of the stream would overload the uplink."""
         camera = next((c for c in self._cameras.values() if c.media is context.media), None)
+        connection = self._connection(client)
+        if self._viewers and connection and (refusal := self._viewers.refusal(client, context.token)):
+            connection.refusal = refusal
+            return FORBIDDEN
         with self._changed:
             new_viewer = self._connections.get(client)
             if camera is None or new_viewer is None or not camera.is_open:
@@ -605,6 +638,14 @@ def _path(context: GstRtspServer.RTSPContext) -> str:
 def _has_query(context: GstRtspServer.RTSPContext) -> bool:
     try:
         return context.uri.query is not None
+    except UnicodeDecodeError:
+        return True
+
+
+def _has_password(context: GstRtspServer.RTSPContext) -> bool:
+    """Whether a request gives a password, right or wrong."""
+    try:
+        return bool(context.request.get_header(GstRtsp.RTSPHeaderField.AUTHORIZATION, 0)[0] == GstRtsp.RTSPResult.OK)
     except UnicodeDecodeError:
         return True
 

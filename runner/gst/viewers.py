@@ -1,9 +1,9 @@
 """Decides who may watch a camera over the uplink: each copy of its stream costs the full bitrate again.
 
 A viewer on the vehicle itself (loopback) uses no uplink; it is always admitted and never counted. The controller, the
-operator in control, is always admitted. RTSP has no field for an operator, so an operator's RTSP client states its id
-as User-Agent (RFC 2326, 12.41), which survives address translation and distinguishes operators on one machine. It is a
-name, not a proof; nothing on either link is authenticated yet.
+operator in control, is always admitted. With keys, the certificate of an RTSP client proves which operator it belongs
+to. Without, RTSP has no field for an operator, and the client states its id as User-Agent (RFC 2326, 12.41), which
+survives address translation and distinguishes operators on one machine. It is a name, not a proof.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -10,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,27 +20,43 @@ from runner.errors import RunError
 from runner.security.broker_files import broker_settings
 from runner.system import children, signals
 from runner.system.ports import check_port_free
+from runner.system.reports import LimitedReports
 
 START_S = 5.0
 END_S = 0.3  # the broker has nothing to write to disk
 KEPT_LINES = 20
 OPEN = ("allow_anonymous true", "persistence false", "set_tcp_nodelay true")
-# Log errors only: otherwise each connection adds a line.
 SETTINGS = (
-    "connection_messages false",
     "user root",  # if started by root: after a change of user, the kernel would not end it with this process
     "log_type error",
     "log_timestamp false",
 )
+CONNECTIONS = {
+    False: ("connection_messages false",),
+    True: ("connection_messages true", "log_type notice"),
+}  # with keys?
+
+# What it logs about connections. Only some lines on refused clients name their address.
+CONNECTED = re.compile(r"New connection from (?P<address>\S+):\d+ on port ")
+REFUSED = re.compile(
+    r"Client connection from (?P<address>\S+) failed: (?:error:\w*:)?(?P<failed>.*)"
+    r"|OpenSSL Error\[\d+\]: (?:error:\w*:)?(?P<tls>.*)"
+    r"|Client <unknown> disconnected, (?P<why>not authorised)\."
+)
+CONNECTION = re.compile("New c|Client |OpenSSL Error")
+LEFT = "unexpected eof"  # a client that ended the connection itself
 
 
 class Broker:
     """mosquitto as a child process that ends with this one.
 
-    keys  the broker's directory of keys; None: no authentication
+    keys       the broker's directory of keys; None: no authentication
+    on_report  called, from another thread, with a line about clients that it refuses
     """
 
-    def __init__(self, endpoint: Endpoint, keys: Path | None = None) -> None:
+    def __init__(
+        self, endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
+    ) -> None:
         self._address = (endpoint.host, endpoint.port)
         self._where = f"{endpoint.host}:{endpoint.port}"
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
@@ -48,7 +65,8 @@ class Broker:
             if keys
             else (f"listener {endpoint.port} {endpoint.host}", *OPEN)
         )
-        settings = (*listener, *SETTINGS, "")
+        self._report, self._newest = LimitedReports(on_report), ""  # address of the newest connection
+        settings = (*listener, *SETTINGS, *CONNECTIONS[keys is not None], "")
         file = os.memfd_create("mosquitto.conf")
         try:
             os.write(file, "\n".join(settings).encode())
@@ -104,18 +122,33 @@ class Broker:
     def _read(self) -> None:
         assert self._process.stdout
         with self._process.stdout as lines:
-            self._stderr_lines.extend(line.strip() for line in lines)
+            for line in map(str.strip, lines):
+                if CONNECTION.match(line):
+                    self._on_connection(line)
+                else:
+                    self._stderr_lines.append(line)
+
+    def _on_connection(self, line: str) -> None:
+        """Report a refused client. Its address is that of the newest connection, unless the line states it."""
+        if connected := CONNECTED.match(line):
+            self._newest = connected["address"]
+        elif (refused := REFUSED.match(line)) and LEFT not in line:
+            why = refused["failed"] or refused["tls"] or refused["why"]
+            self._report(f"the MQTT broker refused a client at {refused['address'] or self._newest}: {why}")
 
 
 @contextmanager
-def private_broker(endpoint: Endpoint, keys: Path | None = None) -> Iterator[Broker]:
+def private_broker(
+    endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
+) -> Iterator[Broker]:
     """mosquitto on one address, without persistence, for the duration of the block.
 
-    keys    the broker's directory of keys; None: no authentication
-    raises  RunError if mosquitto is missing or does not start
+    keys       the broker's directory of keys; None: no authentication
+    on_report  called, from another thread, with a line about clients that it refuses
+    raises     RunError if mosquitto is missing or does not start
     """
     check_port_free(endpoint)
-    broker = Broker(endpoint, keys)
+    broker = Broker(endpoint, keys, on_report)
     try:
         broker.wait_until_it_answers()
         yield broker

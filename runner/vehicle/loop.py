@@ -43,7 +43,8 @@ from runner.records import (
     VehicleState,
     applied_to_json,
 )
-from runner.schema import event_problem
+from runner.schema import event_problem, shortened
+from runner.system.reports import LimitedReports
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.operators import SILENT_S, Operators
@@ -131,6 +132,7 @@ class ControlLoop:
     def __post_init__(self) -> None:
         self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
         self._uplink = MeasuredUplink(self.vehicle)
+        self._report_denial = LimitedReports(self.on_report)
         self._in_control = ""
         self._operators_checked = 0.0  # when operators were last checked for silence
         self._began = time.monotonic()
@@ -268,6 +270,7 @@ class ControlLoop:
         t = self._now()
         name = str(request.document.get("event"))
         if request.sender and (denied := self.access.denial(request.sender, name, self._operators.in_control)):
+            self._report_denial(f"refused {shortened(name)} of {request.sender}: {denied}")
             self._refuse(denied, t, request.answer)
             return
         stamped = {**request.document, "t": t}

@@ -237,7 +237,9 @@ def _drive(run: _Run) -> None:
     with (
         signals.stopping(END_S),
         _link(run) as (link, log),
-        private_broker(link.broker if link else run.vehicle.control, run.keys.broker if run.keys else None) as broker,
+        private_broker(
+            link.broker if link else run.vehicle.control, run.keys.broker if run.keys else None, say
+        ) as broker,
         _sides(own, link, run) as (vehicle, operator),
     ):
         for note in link.notes if link else ():

@@ -75,7 +75,7 @@ def run(arguments: Arguments) -> int:
 
     with ExitStack() as stack:
         if looped:
-            stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None))
+            stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None, say))
             stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
         own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
         operator = stack.enter_context(live_operator(own, arguments.conf))

@@ -126,12 +126,13 @@ def stands_still(operator):
     return frames(operator) == before
 
 
-def mosquitto(program, endpoint, holder, *words, password=None, cafile=None, tls=True, user=None):
+def mosquitto(program, endpoint, holder, *words, password=None, cafile=None, tls=True, certificate=True, user=None):
     """Exit status of a mosquitto client with a holder's keys, and what it printed."""
     ring = Keyring(holder)
     command = [program, "-h", endpoint.host, "-p", str(endpoint.port), "-q", "1", "-V", "mqttv5"]
     if tls:
-        command += ["--cafile", cafile or ring.authority, "--cert", ring.certificate, "--key", ring.key]
+        command += ["--cafile", cafile or ring.authority]
+        command += ["--cert", ring.certificate, "--key", ring.key] if certificate else []
     own = keyring.mqtt_password(ring.secret) if password is None else password
     if own:
         command += ["-u", user or ring.holder.name, "-P", own]
@@ -205,7 +206,18 @@ def test_a_vehicle_receives_nothing_of_another_and_operators_what_they_need(keys
         assert topics_received(broker, keys, holder, sender, last) == expected, holder
 
 
-def test_the_broker_refuses_intruders(keys, broker, tmp_path):
+def test_the_broker_refuses_intruders_and_says_so(keys, tmp_path):
+    broker, reports = Endpoint("127.0.0.1", free_port()), []
+    with private_broker(broker, keys / "broker", reports.append):
+        _intrude(keys, broker, tmp_path)
+        reasons = ("not authorised", "wrong version number", "verify failed", "did not return a certificate")
+        until(lambda: len(reports) == len(reasons))
+    for reason, report in zip(reasons, reports, strict=True):
+        assert report.startswith("the MQTT broker refused a client at 127.0.0.1: "), report
+        assert reason in report
+
+
+def _intrude(keys, broker, tmp_path):
     topic = f"tod/{NAME}/request/alice"
     assert published(broker, keys / "alice", topic) == (0, "")
     others = issue(tmp_path / "others", alice="controller")
@@ -217,6 +229,7 @@ def test_the_broker_refuses_intruders(keys, broker, tmp_path):
         (keys / "alice", {"tls": False}),
         (others / "alice", {"cafile": keys / "alice" / "ca.crt"}),
         (expired, {}),
+        (keys / "alice", {"certificate": False}),
     ):
         assert published(broker, intruder, topic, **how)[0] != 0, (intruder, how)
     assert published(broker, keys / "alice", topic) == (0, "")
@@ -385,13 +398,18 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
             for holder, (own, _) in zip(intruders, all_seen, strict=True):
                 assert set(own().values()) == {0}, holder
             _revoked_while_watching(keys, plans, reports)
-    refusals = {what.partition("client: ")[2] for what in reports if "refused an RTSP client" in what}
-    assert refusals == {
-        "its certificate is not accepted: unknown-ca",
-        "its certificate is not accepted: expired",
-        "its certificate is revoked",
-        "pqos may not watch",
-    }
+    refusals = [what for what in reports if "refused" in what]
+    assert sorted(refusals) == sorted(
+        f"keys: refused an RTSP client at 127.0.0.1: {why}"
+        for why in (
+            "its certificate is not accepted: unknown-ca",
+            "its password is wrong",
+            "its certificate is revoked",
+            "its certificate is not accepted: expired",
+            "pqos may not watch",
+            "it has not completed a TLS handshake with a certificate",
+        )
+    )
     secret = (keys / "alice" / keyring.SECRET).read_text()
     assert not any(secret in what for what in reports)
 
@@ -473,12 +491,24 @@ def test_silent_clients_do_not_block_others(keys):
                     pass
 
 
-def test_plain_rtsp_is_not_answered(keys):
-    with sending(keys) as (plans, _):
+def test_neither_plain_rtsp_nor_the_password_of_another_is_accepted(keys, tmp_path):
+    mixed = tmp_path / "mixed"
+    shutil.copytree(keys / "bob", mixed)
+    for file in (keyring.SECRET, keyring.HOLDER):
+        shutil.copy(keys / "alice" / file, mixed)
+    with sending(keys) as (plans, reports):
         plain = [replace(plan, operator=_unencrypted(plan)) for plan in plans]
-        with watching(plain, None) as (seen, _), watching(plans, keys / "alice") as (own, _):
+        with (
+            watching(plain, None) as (seen, _),
+            watching(plans, mixed) as (mixed_seen, _),
+            watching(plans, keys / "alice") as (own, _),
+        ):
             until(lambda: min(own().values()) > 30, every_s=0.1)
-            assert set(seen().values()) == {0}
+            assert {*seen().values(), *mixed_seen().values()} == {0}
+    assert sorted(what for what in reports if "refused" in what) == [
+        "keys: refused an RTSP client at 127.0.0.1: it has not completed a TLS handshake with a certificate",
+        "keys: refused an RTSP client at 127.0.0.1: its certificate is of bob, its password of alice",
+    ]
 
 
 def _unencrypted(plan):
