@@ -8,14 +8,18 @@ import socket
 import subprocess
 import threading
 import time
+import uuid
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from helpers import out_of_reach
+from mcap.reader import make_reader
+from soak.signals import MARK, marked_processes
 
-from rig import free_port, needs_root, process, until
+from rig import free_port, needs_root, process, run, until
 from rtsp_client import client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
@@ -30,8 +34,9 @@ from runner.operator.live import live_operator
 from runner.records import Sample
 from runner.security import keyring
 from runner.security.authority import Authority
-from runner.security.keyring import Keyring
+from runner.security.keyring import Keyring, mqtt_password, rtsp_password
 
+SECRET_FILES = (keyring.KEY, keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN)
 CAMERAS = ("front", "rear")
 WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "~cameras.mast", "page.serve=false", "pqos=constant")
 NAME = "delivery_robot"
@@ -517,17 +522,36 @@ def _unencrypted(plan):
     return (replace(client, properties={**client.properties, "location": location}), *rest)
 
 
-def test_a_demo_with_keys_streams(keys, tmp_path):
-    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
-    with process("demo", *WORDS, *ports, f"keys={keys}", "duration_s=4", f"log={tmp_path / 'drive'}") as demo:
+def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path):
+    """Neither in its output nor its drive, nor the MCAP of that, nor what a list of processes shows."""
+    drive, mark = tmp_path / "drive", uuid.uuid4().hex
+    words = (*WORDS, f"media.port={free_port()}", f"control.port={free_port()}", f"keys={keys}", f"log={drive}")
+    with process("demo", *words, "duration_s=4", env={MARK: mark}) as demo:
+        until(lambda: (drive / "operator.jsonl").exists() and len(marked_processes(mark)) == 4)
+        shown = [
+            Path(f"/proc/{pid}", name).read_bytes() for pid in marked_processes(mark) for name in ("cmdline", "environ")
+        ]
         output, _ = demo.communicate(timeout=60)
     assert demo.returncode == 0, output
-    sampled = list(read_drive(tmp_path / "drive").sides["operator"].of(Sample))
+    sampled = list(read_drive(drive).sides["operator"].of(Sample))
     assert min(camera.frames for camera in sampled[-1].cameras.values()) > 20
-    everything = b"".join(path.read_bytes() for path in (tmp_path / "drive").iterdir()) + output.encode()
-    for path in keys.rglob("*"):
-        if path.name in (keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN):
-            assert path.read_bytes() not in everything, path
+    run("export", str(drive))
+    with (drive / "drive.mcap").open("rb") as file:
+        mcap = make_reader(file)
+        exported = [message.data for *_, message in mcap.iter_messages()]
+        exported += [str(each.metadata).encode() for each in mcap.iter_metadata()]
+    assert len(exported) > 100
+    everything = b"\n".join((*shown, output.encode(), *exported, *(path.read_bytes() for path in drive.iterdir())))
+    assert NAME.encode() in everything
+    assert [secret for secret in _secrets(keys) if secret in everything] == []
+
+
+def _secrets(keys):
+    """What must not be shown: the contents of secret files, and the passwords that follow from them."""
+    files = [path for path in keys.rglob("*") if path.name in SECRET_FILES]
+    own = [Keyring(path.parent).secret for path in files if path.name == keyring.SECRET]
+    passwords = [password.encode() for each in own for password in (mqtt_password(each), rtsp_password(each, NAME))]
+    return [max(path.read_bytes().split(), key=len) for path in files] + passwords  # of a key, one line
 
 
 # --- what others on the network can read ------------------------------------------------------------------------------
