@@ -61,16 +61,18 @@ def picture():
 
 
 @contextmanager
-def served(picture, layouts):
+def served(picture, layouts, *words):
     """A robot's page with pictures: its server and the station."""
-    vehicle = configuration([*WORDS, f"page.port={free_port()}"]).vehicle()
+    vehicle = configuration([*WORDS, f"page.port={free_port()}", *words]).vehicle()
     station = Station(vehicle)
     page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
+    page.silent = set()  # names of cameras that send nothing
 
     def send():
         while not ended.wait(EVERY_S):
             for name in CAMERAS:
-                page.show(name, read_unit(picture, time.time(), time.time()))
+                if name not in page.silent:
+                    page.show(name, read_unit(picture, time.time(), time.time()))
 
     page.start()
     sending = threading.Thread(target=send)
@@ -197,6 +199,45 @@ def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module
         page.wait_for_function("() => window.tod?.state", timeout=1000 * WAIT_S)  # through navigations
         assert failed
         all_live(page)
+
+
+BUSY = """([keys, seconds]) => {
+  for (const key of keys) document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  const end = performance.now() + 1000 * seconds;
+  while (performance.now() < end);
+  return performance.timeOrigin + end;
+}"""
+
+
+def drawn_while_busy(page, keys, seconds):
+    """Press keys, and keep the page's main thread busy.
+
+    Returns the names of the cameras whose pictures were drawn in the last second of that time, and when it ended.
+    """
+    ended = page.evaluate(BUSY, [keys, seconds])
+    drawn = {name: [times[-1] for times in stages] for name, stages in page.evaluate("tod.stages()").items()}
+    return {name for name, times in drawn.items() if any(ended - 1000 < time <= ended for time in times)}, ended
+
+
+def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chromium, picture):
+    """Without a GPU, some functions of canvases and WebGL wait for the page's main thread."""
+    mast = ("cameras.mast.lens=fisheye", "cameras.mast.width_px=320", "cameras.mast.height_px=180")  # like the picture
+    with served(picture, None, *mast) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        page.keyboard.press("v")
+        server.silent.add("mast")
+        drawn, ended = drawn_while_busy(page, "", 4)  # the GPU is detected 3 s after the start
+        assert drawn == {"front", "rear"}
+        marks = [
+            mark for at, name, mark in page.evaluate("tod.measure()")["status_log"] if name == "mast" and at < ended
+        ]
+        assert marks[-1] == "lost"
+        server.silent.clear()
+        until(lambda: measure(page)["mast"]["status"] == "live")
+        assert {"front", "rear"} <= drawn_while_busy(page, "e3l", 2.5)[0]
+        until(lambda: page.evaluate("tod.birdseye()")["drawn"] == [""])
+        page.keyboard.press("v")
+        until(lambda: measure(page)["mast"]["straight"])
 
 
 def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture):

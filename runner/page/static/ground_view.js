@@ -4,18 +4,14 @@
  */
 
 import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
-import { now } from "./clock.js";
-import { COLOURS, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
+import { clearTo, COLOURS, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
-import { hasGpu } from "./picture.js";
+import { RemoteWarp } from "./remote_warp.js";
 import { MOVING, STALLED } from "./status.js";
-import { Warp } from "./warp.js";
 
 const DISTANCES_M = [1, 2, 5]; // from the vehicle
 const LABEL_M = 4; // distance from a camera to the label of its status
-// Without a GPU the CPU draws: a picture of a million px would occupy it for a fifth of a second.
-const SOFTWARE = { every_ms: 200, max_px: 200_000 };
 const FONT = 'system-ui, "DejaVu Sans", sans-serif';
 
 /** @typedef {import("./stream.js").Stream} Stream */
@@ -24,18 +20,17 @@ const FONT = 'system-ui, "DejaVu Sans", sans-serif';
 export class GroundView {
   shown = false;
   display = { width: 0, height: 0, ratio: 1 }; // the box on the screen, CSS px
-  /** @type {{picture: string, frames: string, lines: string, states: string[]}} */
-  drawn = { picture: "", frames: "", lines: "", states: [] }; // what the canvases show
+  /** @type {{picture: string, frames: string, lines: string}} */
+  drawn = { picture: "", frames: "", lines: "" }; // what the canvases show
   count = 0; // of the pictures drawn
   /** @type {string[]} */
   drawn_labels = []; // labels of the cameras when the displayed picture was drawn
-  drawn_at = -Infinity; // when the last picture was drawn
   why = ""; // why there is no picture, for the operator
-  /** @type {Warp|null} */
+  /** @type {RemoteWarp|null} */
   warp = null;
   /** @type {Stream[]} */
   streams = [];
-  /** @type {import("./warp.js").Layer[]} */
+  /** @type {import("./remote_warp.js").RemoteLayer[]} */
   layers = [];
   /** @type {import("./ground.js").Sight[]} */
   sights = [];
@@ -65,13 +60,14 @@ export class GroundView {
    * @param {Stream[]} streams  @param {Dimensions|null} dimensions
    */
   setCameras(streams, dimensions) {
-    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared_regions: "", drawn: { picture: "", frames: "", lines: "", states: [] } });
+    for (const layer of this.layers) layer.dispose();
+    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared_regions: "", drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } });
     this.updateStreams();
   }
 
   /** Show it in a box on the screen, or hide it. @param {{shown: boolean, width: number, height: number, ratio: number}} display */
   show({ shown, ...display }) {
-    Object.assign(this, { shown, display, drawn: { picture: "", frames: "", lines: "", states: [] } });
+    Object.assign(this, { shown, display, drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } });
     this.updateStreams();
     if (this.isOn()) this.draw();
     else this.clear();
@@ -79,7 +75,7 @@ export class GroundView {
 
   /** Otherwise a stale picture would appear when it is shown again. */
   clear() {
-    this.warp?.draw(this.warp.canvas, { x: 0, y: 0, width: 1, height: 1 }, []);
+    if (this.warp) this.order({ width: 1, height: 1 }, { x: 0, y: 0, width: 1, height: 1 }, []);
     this.context?.reset();
   }
 
@@ -96,23 +92,16 @@ export class GroundView {
   draw() {
     if (!this.isOn() || !this.canvas || !this.context) return;
     const seen = this.streams.map((stream) => stream.fromAbove());
-    if (!this.why) this.tryPictures(seen);
-    this.drawLines(seen);
-  }
-
-  tryPictures(seen) {
-    try {
+    if (!this.why) {
       this.prepare();
       this.drawPictures(seen);
-      if (this.warp?.lost) throw new Error("the browser dropped the WebGL context; reload the page");
-    } catch (error) {
-      this.why = error instanceof Error ? error.message : String(error);
     }
+    this.drawLines(seen);
   }
 
   /** Slow initialisation, done when first needed. */
   prepare() {
-    this.warp ??= new Warp(/** @type {OffscreenCanvas} */ (this.canvas));
+    this.warp ??= new RemoteWarp(/** @type {OffscreenCanvas} */ (this.canvas));
     if (this.layers.length || !this.dimensions) return;
     const { warp, dimensions, streams } = this;
     const lattice = (this.lattice = latticeOf(groundOf(dimensions).extent));
@@ -122,30 +111,32 @@ export class GroundView {
   }
 
   drawPictures(seen) {
-    const { warp, layers, dimensions, drawn } = this;
+    const { warp, layers, dimensions, display, drawn } = this;
     if (!warp || !dimensions) return;
-    const size = this.size();
+    if (warp.lost) return void (this.why = `${warp.lost}; reload the page`);
+    const size = warp.sizeFor({ width: display.width * display.ratio, height: display.height * display.ratio });
     const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
     const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
-    const isDue = hasGpu || now() - this.drawn_at >= SOFTWARE.every_ms;
-    const isBusy = warp.isBusy();
-    if (!isBusy) this.drawn_labels = drawn.states;
-    if (isBusy || (picture === drawn.picture && (frames === drawn.frames || !isDue))) return;
-    Object.assign(drawn, { picture, frames, states: seen.map(({ label }) => label) });
-    this.drawn_at = now();
+    if (warp.isBusy || (picture === drawn.picture && (frames === drawn.frames || !warp.isDue))) return;
+    Object.assign(drawn, { picture, frames });
     this.share(seen.map(({ region }) => region));
     const { px_per_m } = groundPlacement(size, dimensions);
     const { extent } = groundOf(dimensions);
     const middle = { x: -(extent.left + extent.right) / 2, y: (extent.front + extent.rear) / 2 };
-    warp.draw(size, { ...middle, width: size.width / px_per_m, height: size.height / px_per_m }, seen.map((each, i) => ({ ...each, layer: layers[i] })));
-    this.count++;
+    const extents = { ...middle, width: size.width / px_per_m, height: size.height / px_per_m };
+    this.order(size, extents, seen.map((each, i) => ({ ...each, layer: layers[i] })), seen.map(({ label }) => label));
   }
 
-  /** Size of the picture, px. */
-  size() {
-    const { width, height, ratio } = this.display;
-    const scale = hasGpu ? ratio : Math.min(ratio, Math.sqrt(SOFTWARE.max_px / (width * height)));
-    return { width: Math.round(width * scale), height: Math.round(height * scale) };
+  /** Have a picture drawn; labels: of its cameras. @param {string[]} labels */
+  async order(size, extents, parts, labels = []) {
+    const { drawn } = this;
+    try {
+      await this.warp?.draw(size, extents, parts);
+      if (drawn === this.drawn) this.drawn_labels = labels;
+      this.count++;
+    } catch (error) {
+      this.why = error instanceof Error ? error.message : String(error);
+    }
   }
 
   /** Set which camera shows which part of the ground. @param {import("./framing.js").Rectangle[]} regions that the pictures show */
@@ -165,9 +156,8 @@ export class GroundView {
     const rad = this.steering.angleAt(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
     const described = JSON.stringify([display, states, rad && Math.round(rad / STEERING_STEP_RAD), why]);
     if (described === this.drawn.lines) return;
+    if (!clearTo(context, display)) return;
     this.drawn.lines = described;
-    const { canvas } = context;
-    Object.assign(canvas, { width: Math.round(display.width * display.ratio), height: Math.round(display.height * display.ratio) }); // this also clears it
     context.scale(display.ratio, display.ratio);
     const size = Math.round(Math.min(22, Math.max(10, 0.045 * Math.min(display.width, display.height))));
     const laid = groundPlacement(display, dimensions);

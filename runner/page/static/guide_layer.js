@@ -6,6 +6,7 @@
 import { imageToBox, placement } from "./framing.js";
 import { imageOf, pathGuides, straightGuides } from "./guides.js";
 import { projection } from "./projection.js";
+import { resize } from "./resizing.js";
 
 export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
 const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
@@ -73,12 +74,10 @@ export class GuideLayer {
     const target = this.shown && seen && display.width && display.height ? { ...seen, rad: seen.rad && STEERING_STEP_RAD * Math.round(seen.rad / STEERING_STEP_RAD) } : null;
     const described = JSON.stringify(target && [display, target]);
     if (described === this.drawn) return;
-    this.drawn = described;
-    const width = Math.round(display.width * display.ratio);
-    const height = Math.round(display.height * display.ratio);
-    if (canvas.width === width && canvas.height === height) context.reset();
-    else Object.assign(canvas, { width, height }); // this also clears it
+    context.reset(); // lines that no longer match disappear, whatever the size
     this.lines = [];
+    if (target && !clearTo(context, display)) return;
+    this.drawn = described;
     if (target) this.drawOn(context, display, target);
   }
 
@@ -135,6 +134,17 @@ function labelDistances(context, lines, visible) {
     context.fillStyle = "#fff";
     context.fillText(words, at.x + size / 2, at.y);
   }
+}
+
+/**
+ * Clear a canvas that has the size of its box.
+ * @param {OffscreenCanvasRenderingContext2D} context  @param {Omit<Display, "view">} display
+ * @returns {boolean} whether it has; if not, it will be drawn later
+ */
+export function clearTo(context, { width, height, ratio }) {
+  const isResized = resize(context.canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
+  if (isResized) context.reset();
+  return isResized;
 }
 
 /** A label in the lower left corner of the visible part. */

@@ -33,6 +33,7 @@ const handlers = {
     store.slow = slow;
     publish("ages", ages);
   },
+  asked: () => worker.postMessage({ order: "ready" }),
   login: () => location.assign(`/login${location.search}`),
   crooked: (message) => publish("crooked", message),
   sent: ({ id, sent }) => sent || publish("unsent", id),

@@ -4,13 +4,11 @@
  * video and its alarms. So the planes are copied out of the frame and converted to pixels here, without waiting.
  */
 
-import { toRgba } from "./yuv.js";
+import { scaled, toRgba } from "./yuv.js";
 
-const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 /** @typedef {"I420"|"NV12"} Format */
 const FORMATS = ["I420", "NV12"];
 const MAX_SPARES = 16;
-const GPU_CHECK_MS = 3000;
 
 /** @typedef {{bytes: Uint8Array, image: ImageData}} Memory */
 /** @type {Memory[]} */
@@ -42,6 +40,12 @@ class FramePicture {
     return { width: this.width, height: this.height, format: this.frame.format, bytes, planes };
   }
 
+  /** A copy for another worker, see `receivedPicture`. */
+  copy() {
+    const frame = this.frame.clone();
+    return { frame, transferred: frame };
+  }
+
   close() {
     this.frame.close();
   }
@@ -54,7 +58,7 @@ class PlanePicture {
   /**
    * @param {Memory} memory
    * @param {PlaneLayout[]} planes
-   * @param {{format: Format, colorSpace: VideoColorSpace, width: number, height: number}} shape of the frame
+   * @param {{format: Format, colorSpace: VideoColorSpaceInit, width: number, height: number}} shape of the frame
    */
   constructor(memory, planes, { format, colorSpace, width, height }) {
     this.memory = memory;
@@ -74,11 +78,7 @@ class PlanePicture {
   }
 
   paint(context, width, height) {
-    const image = this.pixels();
-    if (width === image.width && height === image.height) return context.putImageData(image, 0, 0);
-    const still = new OffscreenCanvas(image.width, image.height);
-    still.getContext("2d", { alpha: false, willReadFrequently: true })?.putImageData(image, 0, 0);
-    context.drawImage(still, 0, 0, width, height);
+    paintImage(context, this.pixels(), width, height);
   }
 
   /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
@@ -92,6 +92,12 @@ class PlanePicture {
     return { width, height, format, bytes: this.memory.bytes.slice(), planes };
   }
 
+  copy() {
+    const { planes, format, colorSpace, width, height, painted } = this;
+    const bytes = this.memory.bytes.slice();
+    return { bytes, planes, painted, shape: { format, colorSpace, width, height }, transferred: bytes.buffer };
+  }
+
   close() {
     spare.push(this.memory);
     if (spare.length > MAX_SPARES) spare.shift(); // the oldest, most likely of another size
@@ -100,21 +106,33 @@ class PlanePicture {
 
 /** Whether this browser draws with a GPU. The check takes a while: the first pictures are drawn without it. */
 export let hasGpu = false;
-setTimeout(() => (hasGpu = detectGpu()), GPU_CHECK_MS);
 
-function detectGpu() {
-  const context = typeof OffscreenCanvas === "undefined" ? null : new OffscreenCanvas(1, 1).getContext("webgl");
-  if (!context) return false;
-  const info = context.getExtension("WEBGL_debug_renderer_info");
-  const name = context.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : context.RENDERER);
-  context.getExtension("WEBGL_lose_context")?.loseContext();
-  return !SOFTWARE.test(name);
+/** @param {boolean} found */
+export function setGpu(found) {
+  hasGpu = found;
 }
 
 function memoryFor(width, height, size) {
   const fits = ({ bytes, image }) => bytes.length === size && image.width === width && image.height === height;
   const found = spare.findIndex(fits);
   return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
+}
+
+/** Fill a canvas of this size with an image. @param {ImageData|ImageBitmap} image */
+export function paintImage(context, image, width, height) {
+  if (image instanceof ImageBitmap) return context.drawImage(image, 0, 0, width, height);
+  // Scaled here, since a second canvas would wait for the page's main thread, as drawImage(VideoFrame) does.
+  context.putImageData(width === image.width && height === image.height ? image : scaled(image, new ImageData(width, height)), 0, 0);
+}
+
+/**
+ * The picture that another worker has copied.
+ * @returns {Picture}
+ */
+export function receivedPicture({ frame, bytes, planes, painted, shape }) {
+  if (frame) return new FramePicture(frame);
+  const memory = { ...memoryFor(painted.width, painted.height, bytes.length), bytes };
+  return new PlanePicture(memory, planes, shape);
 }
 
 /** Whether a frame has square pixels in a known format, so that it can be converted here. */
@@ -132,7 +150,8 @@ function isPlain({ displayWidth, displayHeight, visibleRect, format }) {
 export async function pictureOf(frame, shown) {
   if (hasGpu || !isPlain(frame)) return new FramePicture(frame);
   try {
-    const { colorSpace, displayWidth: width, displayHeight: height } = frame;
+    const { displayWidth: width, displayHeight: height } = frame;
+    const colorSpace = frame.colorSpace.toJSON();
     const format = /** @type {Format} */ (frame.format); // isPlain has checked it
     const step = shown > 0 && 2 * shown <= width ? 2 : 1;
     const memory = memoryFor(width / step, height / step, frame.allocationSize());

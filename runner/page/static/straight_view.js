@@ -1,21 +1,15 @@
-/** A camera's picture, straightened by the worker. */
+/** A camera's pictures, straightened for the video worker. */
 
 import { straightMesh } from "./straight.js";
-import { FILLS, Warp } from "./warp.js";
-
-/** @type {Warp|null} of all straightened pictures: Chromium drops the oldest of more than four contexts in a worker */
-let shared = null;
+import { RemoteWarp } from "./remote_warp.js";
+import { FILLS } from "./warp.js";
 
 export class StraightView {
-  /**
-   * @param {any} camera as in hello
-   * @throws {Error} with a message for the operator
-   */
+  /** @param {any} camera as in hello */
   constructor(camera) {
     const { places, points, shares, triangles } = straightMesh(camera);
     const { width, height } = camera;
-    if (!shared || shared.lost) shared = new Warp(new OffscreenCanvas(1, 1));
-    this.warp = shared;
+    this.warp = new RemoteWarp(null);
     this.layer = this.warp.layer(places.map(({ x, y }) => ({ x, y: -y })), points);
     this.layer.share(shares, triangles);
     this.frame = { x: width / 2, y: -height / 2, width, height };
@@ -23,18 +17,17 @@ export class StraightView {
 
   dispose() {
     this.layer.dispose();
+    this.warp.dispose();
   }
 
   /**
-   * Fill a canvas with the straightened image; parts that the picture does not show are black.
+   * The straightened image; parts that the picture does not show are black.
    * @param {import("./picture.js").Picture} picture
    * @param {import("./framing.js").Rectangle} region of the full image that it shows
+   * @param {import("./framing.js").Size} size on the screen, px
    * @throws {Error} with a message for the operator
    */
-  paint(context, picture, region) {
-    const { width, height } = context.canvas;
-    if (this.warp.lost) throw new Error("the browser dropped the WebGL context");
-    this.warp.draw({ width, height }, this.frame, [{ layer: this.layer, fill: FILLS.picture, picture, region }]);
-    context.drawImage(this.warp.canvas, 0, 0);
+  straightened(picture, region, size) {
+    return this.warp.draw(this.warp.sizeFor(size), this.frame, [{ layer: this.layer, fill: FILLS.picture, picture, region }]);
   }
 }

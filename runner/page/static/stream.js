@@ -5,8 +5,9 @@ import { now } from "./clock.js";
 import { placement, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
-import { pictureOf } from "./picture.js";
+import { paintImage, pictureOf } from "./picture.js";
 import { GuideLayer } from "./guide_layer.js";
+import { resize } from "./resizing.js";
 import { alarmText, INTERVALS, judge, MOVING, STALLED } from "./status.js";
 import { drawOverlay } from "./overlay.js";
 import { straightOptics } from "./straight.js";
@@ -33,7 +34,7 @@ const UNTIMED_MS = 1000; // longest transit of a picture without a capture time
 const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRange: false };
 
 /** @typedef {import("./picture.js").Picture} Picture */
-/** @typedef {{picture: Picture, meta: any}} Shown */
+/** @typedef {{picture: Picture, meta: any, image?: import("./remote_warp.js").Image|null}} Shown image: the picture straightened; null: its region is unknown */
 
 export class Stream {
   arrived = now(); // page times of the newest unit and of the newest picture to draw, or of the start of the stream
@@ -55,6 +56,7 @@ export class Stream {
     this.canvas = null;
     /** @type {OffscreenCanvasRenderingContext2D|null} */
     this.context = null;
+    this.isFresh = true; // whether nothing was painted into the canvas yet
     /** @type {VideoDecoder|null} */
     this.decoder = null;
     this.sps = this.codec = null;
@@ -80,6 +82,7 @@ export class Stream {
     /** @type {number|null} */
     this.failed_at = null; // when the source failed: it may repeat old pictures as new
     this.status = this.reported = "synchronising";
+    this.isResizeDue = false; // whether the canvas keeps an old size for now
     /** @type {string|null} */
     this.painted_text = ""; // overlay text in the canvas, "" for the plain picture; null: to be painted again
     this.mark = ""; // the mark that the canvas shows
@@ -130,18 +133,23 @@ export class Stream {
 
   /** The region that the displayed picture is known to show. */
   shownRegion() {
-    const { shown, region } = this;
-    return shown && region && this.capturedAt() >= this.region_since && hasAspectOf(shown.picture, region) ? region : null;
+    return this.shown && this.regionOf(this.shown);
   }
 
-  /** Page time at which the displayed picture was captured; if unknown, the earliest possible time. */
-  capturedAt() {
-    const { captured = NaN, arrived = NaN } = this.shown?.meta ?? {};
+  /** The region that a picture is known to show. @param {Shown} one */
+  regionOf({ picture, meta }) {
+    const { region } = this;
+    return region && this.capturedAt(meta) >= this.region_since && hasAspectOf(picture, region) ? region : null;
+  }
+
+  /** Page time at which a picture was captured; if unknown, the earliest possible time. */
+  capturedAt({ captured = NaN, arrived = NaN }) {
     return (Number.isFinite(captured) ? captured : arrived - UNTIMED_MS) - this.station.clock.offset;
   }
 
   attach(canvas) {
     this.canvas = canvas;
+    this.isFresh = true;
     this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
     this.painted_text = null;
     this.station.wake();
@@ -282,31 +290,60 @@ export class Stream {
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
     this.waiting = { picture, meta };
-    this.decoded = now(); // a picture that cannot be drawn does not count: the display stays frozen
+    if (!this.straight) this.decoded = now(); // a picture that cannot be drawn does not count: the display stays frozen
     this.station.wake();
   }
 
   /** Whether there is a picture to draw. */
   get isWaiting() {
-    return this.waiting !== null && this.context !== null;
+    return this.waiting !== null && this.context !== null && (!this.straight || this.straight.warp.isDue);
   }
 
   /** Draw the newest frame; called in the worker's animation frame. */
   draw() {
-    if (!this.waiting || !this.context) return;
-    this.shown?.picture.close();
-    this.shown = this.waiting;
+    const { waiting } = this;
+    if (!waiting || !this.context) return;
     this.waiting = null;
+    if (this.straight) this.drawStraightened(waiting);
+    else this.show(waiting);
+  }
+
+  /** Draw a picture once it is straightened, unless it is no longer wanted then. @param {Shown} next */
+  async drawStraightened(next) {
+    const { straight, decoder } = this;
+    const isStraightened = await this.straightenPicture(next);
+    if (!isStraightened || straight !== this.straight || decoder !== this.decoder) return next.picture.close();
+    this.decoded = now();
+    this.show(next);
+  }
+
+  /** Straighten a picture; returns whether that succeeded. @param {Shown} one */
+  async straightenPicture(one) {
+    const { straight } = this;
+    const region = this.regionOf(one);
+    try {
+      one.image = region && straight ? await straight.straightened(one.picture, region, this.straightSize()) : null;
+      return true;
+    } catch (error) {
+      if (straight === this.straight) this.station.onStraightenFailed(this, error);
+      return false;
+    }
+  }
+
+  /** @param {Shown} next */
+  show(next) {
+    this.shown?.picture.close();
+    this.shown = next;
     this.drawn = true;
     this.last_drawn = now();
-    this.damaged = Boolean(this.shown.meta.flags & DAMAGED);
-    this.checkAge(this.shown.meta, now());
+    this.damaged = Boolean(next.meta.flags & DAMAGED);
+    this.checkAge(next.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
     this.paint(now());
     this.drawGuides();
-    this.recordStages(this.shown.meta, now());
+    this.recordStages(next.meta, now());
     if (this.station.keep) this.first ??= this.picture();
-    if (this.station.counted === this.name) this.readCounter(this.shown);
+    if (this.station.counted === this.name) this.readCounter(next);
   }
 
   /** Show or hide the guides of this camera. */
@@ -329,21 +366,19 @@ export class Stream {
     const { shown, expected, canvas } = this;
     const region = this.shownRegion();
     if (!shown || !region) return null;
-    if (this.straight) return canvas && { picture: { width: canvas.width, height: canvas.height }, region: this.full };
+    if (this.straight) return canvas && shown.image ? { picture: { width: canvas.width, height: canvas.height }, region: this.full } : null;
     const { width, height } = shown.picture;
-    const fits = expected && width === expected.width && height === expected.height && this.capturedAt() >= this.size_since;
+    const fits = expected && width === expected.width && height === expected.height && this.capturedAt(shown.meta) >= this.size_since;
     return fits ? { picture: { width, height }, region } : null;
   }
 
-  /**
-   * Show the picture straightened, or the original.
-   * @throws {Error} with a message for the operator: straightening is not available
-   */
-  straighten(on) {
+  /** Show the picture straightened, or the original. */
+  async straighten(on) {
     if (on === Boolean(this.straight)) return;
     this.straight?.dispose();
     this.straight = on ? new StraightView(this.camera) : null;
     this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
+    if (on && this.shown) await this.straightenPicture(this.shown); // a stalled picture has no successor
     this.painted_text = null; // repaint at the next tick
   }
 
@@ -391,7 +426,7 @@ export class Stream {
     const { connected, online } = this.station;
     const { on, sending, refused, drawn, damaged, arrived, decoded, late_until } = this;
     const faulty = this.failed_at !== null;
-    return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: this.camera.fps };
+    return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity) };
   }
 
   /** Whether too few of the received pictures are drawn; to be called a few times a second. */
@@ -412,8 +447,14 @@ export class Stream {
     return changed;
   }
 
+  /** Draw what waits for a canvas of another size. */
+  drawResized() {
+    if (this.isResizeDue) this.paint(now());
+    this.drawGuides();
+  }
+
   overlayText(time) {
-    if (this.status === "live") return this.straight && !this.shownRegion() ? NEW_REGION : "";
+    if (this.status === "live") return this.straight && !this.shown?.image ? NEW_REGION : "";
     const late = this.isLateToo(time) ? `, ${alarmText("late", 0, this.late_age)}` : "";
     return alarmText(this.status, time - Math.min(this.arrived, this.failed_at ?? Infinity), this.late_age) + late;
   }
@@ -428,7 +469,7 @@ export class Stream {
     if (!canvas || !context || (this.isInBirdseye && !this.display.width)) return; // the bird's-eye view is shown in its place
     const text = this.overlayText(time);
     this.resizeCanvas(canvas, STALLED.includes(this.status));
-    if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown.picture);
+    if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown);
     else blank(context);
     if (text) drawOverlay(context, this.visibleArea(canvas), this.display.view.mirrored, this.status, text);
     this.painted_text = text;
@@ -442,16 +483,12 @@ export class Stream {
     this.station.onMark(this.name, mark);
   }
 
-  paintPicture(context, picture) {
-    const region = this.shownRegion();
-    if (!this.straight) return picture.paint(context, context.canvas.width, context.canvas.height);
-    if (!region) return blank(context);
-    try {
-      this.straight.paint(context, picture, region);
-    } catch (error) {
-      this.station.onStraightenFailed(this, error);
-      picture.paint(context, context.canvas.width, context.canvas.height);
-    }
+  /** @param {OffscreenCanvasRenderingContext2D} context  @param {Shown} shown */
+  paintPicture(context, { picture, image = null }) {
+    const { width, height } = context.canvas;
+    if (!this.straight) picture.paint(context, width, height);
+    else if (image) paintImage(context, image, width, height);
+    else blank(context);
   }
 
   /**
@@ -461,11 +498,13 @@ export class Stream {
   resizeCanvas(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
-    const own = this.straight ? this.straightSize() : (this.shown?.picture.painted ?? box);
+    const own = this.straight ? (this.shown?.image ?? this.straightSize()) : (this.shown?.picture.painted ?? box);
     const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const width = own.width * times;
     const height = own.height * times;
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    if (this.isFresh) Object.assign(canvas, { width, height }); // nothing is shown yet
+    this.isResizeDue = !resize(canvas, { width, height });
+    this.isFresh = false;
   }
 
   /** A straightened image has the resolution of the screen, but at most the camera's. */
@@ -495,7 +534,7 @@ export class Stream {
       status: this.status,
       ...this.counts,
       error: this.error,
-      straight: this.straight !== null && this.painted_text !== null,
+      straight: Boolean(this.straight && this.shown?.image && this.painted_text !== null),
       width: picture?.width ?? 0,
       height: picture?.height ?? 0,
       drawn_size: { width: this.canvas?.width ?? 0, height: this.canvas?.height ?? 0 },

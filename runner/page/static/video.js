@@ -1,6 +1,7 @@
 /**
  * The worker: it owns the WebSocket and all video, so that neither charts nor dialogs of the page delay a picture. It
  * passes text messages from the station to the page unchanged, and draws pictures on the canvases that the page transfers.
+ * Some browser functions wait for the page's main thread: resizing.js, remote_warp.js and picture.js avoid that.
  */
 
 import { ageOf, skewOf } from "./ages.js";
@@ -8,6 +9,8 @@ import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
 import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
+import { startWarps } from "./remote_warp.js";
+import { onPageReady } from "./resizing.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
@@ -167,13 +170,7 @@ function applyGuides() {
 }
 
 function applyStraight() {
-  for (const stream of streams) {
-    try {
-      stream.straighten(straight.includes(stream.name));
-    } catch (error) {
-      onStraightenFailed(stream, error);
-    }
-  }
+  for (const stream of streams) stream.straighten(straight.includes(stream.name));
 }
 
 /** A picture cannot be straightened: show the original, and report why. */
@@ -222,6 +219,7 @@ function judgeAll() {
     toPage({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
   }
   if (isAsleep) ground.draw(); // it shows the status of pictures
+  if (streams.some(({ isWaiting }) => isWaiting)) wake(); // a picture that could not be straightened yet
 }
 
 /** Report the ages that the page shows, and the skew between the pictures of the cameras. */
@@ -233,6 +231,12 @@ function reportAges() {
   toPage({ kind: "ages", ages, skew_ms, slow });
 }
 
+/** Draw what waits for canvases of new sizes. */
+function drawResized() {
+  for (const stream of streams) stream.drawResized();
+  ground.draw();
+}
+
 // --- the page ---------------------------------------------------------------------------------------------------------
 
 const orders = {
@@ -242,6 +246,7 @@ const orders = {
     station.counted = message.counted;
     station.video = message.video && typeof VideoDecoder !== "undefined";
     connect();
+    if (station.video) startWarps();
     setInterval(tick, TICK_MS);
     setInterval(reportAges, REPORT_MS);
     setInterval(() => send({ clock: now() }), 1000);
@@ -253,6 +258,7 @@ const orders = {
     applyGuides();
   },
   first: ({ name }) => (first = name),
+  ready: () => onPageReady(drawResized),
   straight({ names }) {
     straight = names;
     applyStraight();

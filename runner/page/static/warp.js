@@ -48,9 +48,6 @@ const STRIPE_PX = 14;
 
 /** One picture and its mesh. */
 export class Layer {
-  /** @type {Picture|null} the picture in the texture */
-  loaded = null;
-
   /**
    * @param {WebGL2RenderingContext} gl
    * @param {Point[]} places on the canvas, y up  @param {(Point|null)[]} points px of the full image
@@ -101,14 +98,13 @@ export class Layer {
     gl.deleteTexture(this.texture);
   }
 
-  /** Upload a picture to the texture, unless it is there already. @param {Picture} picture */
+  /** Bind the texture, after uploading a picture if there is a new one. @param {Picture|null} picture */
   load(picture) {
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    if (picture === this.loaded) return;
+    if (!picture) return;
     picture.upload(gl);
     gl.generateMipmap(gl.TEXTURE_2D);
-    this.loaded = picture;
   }
 }
 
@@ -122,8 +118,6 @@ export class Warp {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (!gl) throw new Error("this browser has no WebGL 2");
     this.gl = gl;
-    /** @type {WebGLSync|null} */
-    this.fence = null;
     this.lost = false; // browsers drop the context when the graphics driver restarts
     canvas.addEventListener("webglcontextlost", () => (this.lost = true));
     const program = (this.program = linkedProgram(gl));
@@ -142,7 +136,7 @@ export class Warp {
   /**
    * @param {{width: number, height: number}} size of the canvas, px
    * @param {Frame} frame
-   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn picture: null unless filled with one
+   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn picture: null if the layer has it already, or needs none
    */
   draw({ width, height }, frame, drawn) {
     const { gl, canvas, uniforms } = this;
@@ -152,26 +146,27 @@ export class Warp {
     gl.uniform4f(uniforms.frame, frame.x, frame.y, frame.width / 2, frame.height / 2);
     gl.uniform1f(uniforms.stripe, STRIPE_PX);
     for (const { layer, fill, picture, region } of drawn) {
-      if (picture) layer.load(picture);
-      else gl.bindTexture(gl.TEXTURE_2D, layer.texture);
+      layer.load(picture);
       gl.uniform1i(uniforms.fill, fill);
       gl.uniform4f(uniforms.region, region.x, region.y, region.width, region.height);
       gl.bindVertexArray(layer.vertices);
       gl.drawElements(gl.TRIANGLES, layer.count, gl.UNSIGNED_INT, 0);
     }
     gl.bindVertexArray(null);
-    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    gl.flush();
   }
 
-  /** Whether the GPU is still drawing: another draw would wait for it, and block all video. */
-  isBusy() {
-    const { gl, fence } = this;
-    if (!fence || this.lost) return false;
-    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
-    gl.deleteSync(fence);
-    this.fence = null;
-    return false;
+  /** Wait until it is drawn, so that no more is ordered than can be drawn. Chromium's `finish` does not wait. */
+  wait() {
+    const { gl } = this;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  /** What was drawn; its first row is the lowest. */
+  pixels() {
+    const { gl, canvas: { width, height } } = this;
+    const image = new ImageData(width, height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(image.data.buffer));
+    return image;
   }
 }
 

@@ -7,7 +7,7 @@ const CLAMP = Uint8Array.from({ length: 256 + 2 * MARGIN }, (_, i) => Math.min(2
 const LUMA = { bt709: [0.2126, 0.0722], smpte170m: [0.299, 0.114], bt470bg: [0.299, 0.114] }; // weights of red and blue
 const tables = new Map();
 
-/** Look-up tables of a colour space: one addition for each component of a pixel. */
+/** Look-up tables of a colour space: one addition for each component of a pixel. @param {VideoColorSpaceInit} space */
 function tablesOf({ matrix, fullRange }) {
   const key = `${matrix} ${fullRange}`;
   if (!tables.has(key)) tables.set(key, makeTables(LUMA[matrix] ?? LUMA.smpte170m, fullRange));
@@ -30,7 +30,7 @@ function makeTables([red, blue], full) {
 
 /**
  * @param {Uint8Array} bytes of all planes  @param {{offset, stride}[]} planes as returned by VideoFrame.copyTo
- * @param {"I420"|"NV12"} format  @param {{matrix, fullRange}} space
+ * @param {"I420"|"NV12"} format  @param {VideoColorSpaceInit} space
  * @param {ImageData} image output, of the frame's size, or half of it in each direction
  * @param {number} width of the frame
  */
@@ -47,6 +47,22 @@ export function toRgba(bytes, planes, format, space, image, width) {
     const from = { y: y.offset + row * across * y.stride, below: y.stride, u: u.offset + chroma * u.stride, v: v.offset + chroma * v.stride };
     convert(bytes, from, chroma_step, lookUp, out, row * image.width, image.width);
   }
+}
+
+/**
+ * Fill an image with another one, stretched; without smoothing, which would take several times as long.
+ * @template {{width: number, height: number, data: Uint8ClampedArray}} I
+ * @param {I} from  @param {I} to
+ * @returns {I} `to`
+ */
+export function scaled(from, to) {
+  const [pixels, out] = [from, to].map(({ data }) => new Uint32Array(data.buffer, data.byteOffset, data.length / 4));
+  const columns = Uint32Array.from({ length: to.width }, (_, x) => ((x + 0.5) * from.width) / to.width);
+  for (let y = 0; y < to.height; y++) {
+    const row = from.width * Math.floor(((y + 0.5) * from.height) / to.height);
+    for (let x = 0, at = y * to.width; x < to.width; x++, at++) out[at] = pixels[row + columns[x]];
+  }
+  return to;
 }
 
 /** One row of pixels; two neighbours share their chroma. */
