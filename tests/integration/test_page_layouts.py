@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import subprocess
 import threading
 import time
@@ -25,8 +26,9 @@ from runner.records import CameraState, Outcome, VehicleState, applied_to_json
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
+image = pytest.importorskip("PIL.Image")
 
-WORDS = (*SMALL_ROBOT, "source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often
+WORDS = ("source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often
 CAMERAS = ("front", "rear", "mast")
 EVERY_S = 0.3
 
@@ -41,7 +43,7 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-        super().__init__(state=state, note=print, answer_s=1.0, attention=None, requests=[])
+        super().__init__(state=state, note=print, answer_s=1.0, attention=None, requests=[], seen=[])
 
     def captured_here(self, camera, captured):
         return captured
@@ -61,16 +63,17 @@ def picture():
 
 
 @contextmanager
-def served(picture, layouts, *words):
-    """A robot's page with pictures: its server and the station."""
-    vehicle = configuration([*WORDS, f"page.port={free_port()}", *words]).vehicle()
+def served(picture, layouts, *words, vehicle=SMALL_ROBOT):
+    """A vehicle's page with pictures: its server and the station."""
+    vehicle = configuration([*vehicle, *WORDS, f"page.port={free_port()}", *words]).vehicle()
     station = Station(vehicle)
     page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
     page.silent = set()  # names of cameras that send nothing
 
     def send():
         while not ended.wait(EVERY_S):
-            for name in CAMERAS:
+            station.seen.append(station.attention)
+            for name in vehicle.cameras:
                 if name not in page.silent:
                     page.show(name, read_unit(picture, time.time(), time.time()))
 
@@ -221,12 +224,17 @@ def drawn_while_busy(page, keys, seconds):
 
 def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chromium, picture):
     """Without a GPU, some functions of canvases and WebGL wait for the page's main thread."""
-    mast = ("cameras.mast.lens=fisheye", "cameras.mast.width_px=320", "cameras.mast.height_px=180")  # like the picture
-    with served(picture, None, *mast) as (server, _), opened(chromium, server.url) as page:
+    mast = {"lens": "fisheye", "width_px": 320, "height_px": 180, "calibrated": "false"}  # as large as the picture
+    words = [f"cameras.mast.{key}={value}" for key, value in mast.items()]
+    with served(picture, None, *words) as (server, station), opened(chromium, server.url) as page:
         all_live(page)
         page.keyboard.press("v")
         server.silent.add("mast")
+        until(lambda: station.attention in ("watching", "unfocused"))
+        station.seen.clear()
         drawn, ended = drawn_while_busy(page, "", 4)  # the GPU is detected 3 s after the start
+        assert "slow" in station.seen, "keys do nothing meanwhile"
+        until(lambda: station.attention in ("watching", "unfocused"))
         assert drawn == {"front", "rear"}
         marks = [
             mark for at, name, mark in page.evaluate("tod.measure()")["status_log"] if name == "mast" and at < ended
@@ -238,6 +246,130 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
         until(lambda: page.evaluate("tod.birdseye()")["drawn"] == [""])
         page.keyboard.press("v")
         until(lambda: measure(page)["mast"]["straight"])
+        until(lambda: colour_at(page, "mast", 0.02, 0.97) == AMBER)  # the label ESTIMATED
+
+
+AMBER = (255, 176, 0)
+
+
+def colour_at(page, camera, across, down):
+    """The colour of a pixel of a camera's box on the screen, in fractions of its sides."""
+    png = page.locator(f"[data-camera={camera}] .picture").screenshot()
+    shown = image.open(io.BytesIO(png)).convert("RGB")
+    return shown.getpixel((round(across * shown.width), round(down * shown.height)))
+
+
+def test_a_driver_is_warned_in_either_view(chromium, picture):
+    """Out of focus, a picture that was lost before, another page that takes control."""
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
+        page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
+        assert page.inner_text("#sound-header") == "✕ Sound blocked"
+        page.focus("#sound-header")
+        page.keyboard.press("Space")  # which allows sound, and must not mute it at once
+        until(page.locator("#sound-header").is_hidden)
+        assert page.evaluate("localStorage.getItem('tod-muted')") is None
+        page.evaluate("dispatchEvent(new Event('blur'))")
+        until(lambda: "OUT OF FOCUS" in page.inner_text("#attention"))
+        time.sleep(0.6)  # a shorter absence is not reported
+        page.evaluate("dispatchEvent(new Event('focus'))")
+        until(lambda: "No key reached this page" in page.inner_text("#toasts"))
+        assert (page.evaluate("tod.view"), page.evaluate("globalThis.tones")) == ("configure", None)
+
+        page.keyboard.press("t")
+        until(lambda: page.evaluate("tod.control") == "nobody")
+        server.silent.add("rear")
+        until(lambda: measure(page)["rear"]["status"] == "lost")
+        assert page.evaluate("globalThis.tones") is None
+        take_control(page)
+        until(lambda: page.evaluate("globalThis.tones") == 4)
+        server.silent.clear()
+        all_live(page)
+        with opened(chromium, server.url) as other:
+            take_control(other)
+            until(lambda: page.inner_text("#attention") == "CONTROL LOST: this page only watches; take control (t)")
+            assert "CONTROL LOST: another page is in control" in page.inner_text("#toasts")
+            until(lambda: page.evaluate("globalThis.tones") == 8)
+            shot(page, "control-lost-configure")
+            page.keyboard.press("v")
+            shot(page, "control-lost-drive")
+        take_control_in_drive = page.locator("#drive-control")
+        until(lambda: (take_control_in_drive.click(), page.evaluate("tod.control"))[1] == "you")
+        until(lambda: "CONTROL LOST" not in page.inner_text("#attention"))
+
+
+def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
+    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null")
+    with served(picture, None, *remapped) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        assert page.inner_text("#offer-drive") == "Drive view (x)"
+        titles = [page.get_attribute(f"#{name}", "title") for name in ("to-drive", "theme", "take-control")]
+        assert titles == ["Drive view: pictures first (x)", "Day or night", "take or release control (t)"]
+        page.dblclick("[data-camera=mast] .picture")
+        page.keyboard.press("x")
+        usual = edges(page)
+        assert usual["front"]["width"] > 2 * usual["mast"]["width"], "the enlarged picture stayed large"
+        for holder in ("nobody", "you"):
+            page.click("#drive-control")
+            until(lambda holder=holder: page.evaluate("tod.control") == holder)
+        page.keyboard.press("ArrowDown")
+        assert page.evaluate("tod.selected") == "rear"
+        page.click("#drawer")
+        page.click("#drawer")
+        page.keyboard.press("Enter")
+        until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
+        page.click("#drive-control")
+        until(lambda: page.evaluate("tod.control") == "nobody")
+        page.focus("#drive-control")
+        page.keyboard.press("Enter")  # a focused button is pressed
+        until(lambda: page.evaluate("tod.control") == "you")
+        spoken = """() => {
+          let spoken = 0;
+          const observer = new MutationObserver((all) => (spoken += all.length));
+          observer.observe(document.getElementById("announcer"), { childList: true });
+          return import("/static/store.js").then(async ({ publish }) => {
+            for (const status of ["late", "live", "late"]) publish("status", { camera: "front", status });
+            await new Promise((done) => setTimeout(done));
+            return spoken;
+          });
+        }"""
+        assert page.evaluate(spoken) == 2, "the same words again"
+
+
+LIMITED = """async () => {
+  const { publish, store } = await import("/static/store.js");
+  for (const each of Object.values(store.state.cameras)) each.reason = "total 1800 of 3000: the link carries less";
+  publish("state", Object.assign(store.state, { asked_kbps: 30000 }));
+}"""
+
+
+def test_eight_lost_pictures_are_named_in_full(chromium, picture):
+    with served(picture, None, vehicle=["vehicle=tum_q7"]) as (server, station):
+        server.silent.update(station.state.cameras)
+        with opened(chromium, server.url, 1280, 720) as page:
+            controlling(page)
+            page.keyboard.press("v")
+            until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
+            page.evaluate(LIMITED)
+            for width, height in ((1280, 720), (1024, 768), (1920, 1080)):
+                page.set_viewport_size({"width": width, "height": height})
+                until(lambda width=width: page.evaluate("innerWidth") == width)
+                shot(page, f"eight-lost-{width}")
+                assert boxes(page)[1] == {"outside": [], "cut": [], "low": [], "scrolls": False}, (width, height)
+
+
+def test_a_page_without_webcodecs_shows_no_picture_as_live_and_is_reported_as_slow(chromium, picture):
+    with served(picture, None) as (server, station), chromium.new_context() as tab:
+        tab.add_init_script("delete window.VideoDecoder")
+        page = tab.new_page()
+        visit(page, server.url)
+        until(lambda: has_started(page) and page.evaluate("tod.control") == "you")
+        until(lambda: page.locator(".tile[data-status=unsupported]").count() == 3)
+        assert "no WebCodecs" in page.inner_text("[data-camera=front] .refused")
+        until(lambda: station.attention == "slow")
 
 
 def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture):
@@ -247,11 +379,24 @@ def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture
         monitor = page.context.new_page()
         visit(monitor, f"{server.url}?show=front,mast")
         controlling(monitor)
-        for key in "v1":
-            page.keyboard.press(key)
+        page.keyboard.press("1")
         until(lambda: monitor.evaluate("tod.selected") == "front")
+        monitor.keyboard.press("v")
+        until(lambda: page.evaluate("tod.view") == "drive")
+        usual = edges(page)
         monitor.keyboard.press("r")  # reverse
         until(lambda: page.evaluate("tod.selected") == "rear")
+        until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
+        monitor.keyboard.press("Escape")
+        until(lambda: edges(page) == usual)
+        page.keyboard.press("1")
+        until(lambda: monitor.evaluate("tod.selected") == "front")
+        monitor.keyboard.press("2")  # it does not show the rear camera
+        until(lambda: page.evaluate("tod.selected") == "rear")
+        monitor.keyboard.press("l")
+        until(lambda: "rear: lines are already straight" in page.inner_text("#toasts"))
+        monitor.keyboard.press("w")
+        page.wait_for_selector("#monitors[open]")
 
 
 def test_monitors_share_selection_control_and_attention_with_their_page(chromium, picture):
@@ -323,7 +468,7 @@ def test_a_layout_survives_a_restart_of_the_operators_process(broker, tmp_path):
                 assert reply["result"] == "applied", reply
             return places
 
-    words = (*WORDS, f"control.port={broker.port}", f"media.port={free_port()}", f"page.port={port}")
+    words = (*SMALL_ROBOT, *WORDS, f"control.port={broker.port}", f"media.port={free_port()}", f"page.port={port}")
     for messages in ([{"layout": layout}], []):
         with process("operator", *words, f"conf={tmp_path}", stdout=subprocess.DEVNULL):
             until(lambda: answers(port))
@@ -372,7 +517,7 @@ CONTRAST = """([root, theme, states]) => {
     return isShown && width > 1 && height > 1 && !element.closest(":disabled, [aria-disabled=true], .unseen, svg");
   };
   const bad = [];
-  let measured = 0;
+  let [measured, bordered] = [0, 0];
   const look = (element) => {
     if (!seen(element)) return;
     measured++;
@@ -383,12 +528,22 @@ CONTRAST = """([root, theme, states]) => {
     const name = element.id || element.className || element.tagName;
     if (found < needed) bad.push(`${theme} ${name} "${element.textContent.trim().slice(0, 30)}": ${found.toFixed(2)}`);
   };
+  const lookAtBorder = (input) => {
+    if (!seen(input)) return;
+    bordered++;
+    const colour = parsed(getComputedStyle(input).borderTopColor);
+    const found = Math.min(...grounds(input.parentElement).map((ground) => ratio(over(colour, ground), ground)));
+    if (found < 3) bad.push(`${theme} border of ${input.getAttribute("aria-label")}: ${found.toFixed(2)}`);
+  };
   const lookBelow = (top) => {
     const walker = document.createTreeWalker(top, NodeFilter.SHOW_TEXT);
     const parents = new Set();
     while (walker.nextNode()) if (walker.currentNode.data.trim()) parents.add(walker.currentNode.parentElement);
     parents.forEach(look);
-    top.querySelectorAll("input:not([type=range])").forEach(look);
+    for (const input of top.querySelectorAll("input:not([type=range])")) {
+      look(input);
+      lookAtBorder(input);
+    }
   };
   lookBelow(document.querySelector(root));
   for (const [selector, attribute, values] of states) {
@@ -408,7 +563,7 @@ CONTRAST = """([root, theme, states]) => {
       element.hidden = hidden;
     }
   }
-  return [measured, bad];
+  return [measured, bad, bordered];
 }"""
 LEVELS = ["fine", "near", "late", "unknown", "none"]
 STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "unsupported"]
@@ -436,8 +591,8 @@ def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path)
 
         def look(view, root="body", on=page):
             for theme in ("day", "night"):
-                measured, bad = on.evaluate(CONTRAST, [root, theme, STATES if root == "body" else []])
-                assert measured > 3, view
+                measured, bad, bordered = on.evaluate(CONTRAST, [root, theme, STATES if root == "body" else []])
+                assert measured > 3 and (bordered > 0 or view != "configure"), view
                 found.extend(f"{view}: {each}" for each in bad)
 
         look("configure")

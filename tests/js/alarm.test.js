@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { Alarm } from "../../runner/page/static/alarm.js";
+import { Alarm, worstKind } from "../../runner/page/static/alarm.js";
 
 /** The tones of changes of status, each [ms, status, camera]. */
 function tones(...changes) {
@@ -33,4 +33,8 @@ test("a picture that fails a second after another one triggers a tone", () => {
 
 test("a late picture does not mask a stalled one, but is masked by it", () => {
   assert.deepEqual(tones([0, "late"], [50, "frozen"], [100, "late"], [2100, "late"]), ["late", "lost", null, "late"]);
+});
+
+test("a driver who takes control hears of the worst picture", () => {
+  assert.deepEqual([["live", "late"], ["late", "frozen"], ["unsupported"], ["live", "off"], []].map(worstKind), ["late", "lost", "lost", null, null]);
 });

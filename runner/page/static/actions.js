@@ -1,6 +1,6 @@
 /** The operator's actions; `inputs` in the configuration assigns them to keys and buttons. */
 
-import { enlarge, inControl, publish, select, store } from "./store.js";
+import { camera, enlarge, inControl, publish, select, store } from "./store.js";
 import { selectMode, toggleControl } from "./header.js";
 import { focusTile, switchCamera } from "./tiles.js";
 import { scaleTotal } from "./total.js";
@@ -53,18 +53,30 @@ export const ACTIONS = {
 };
 
 // Only the page shows what these change, so a monitor passes them on to it.
-const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "birdseye", "drawer", "map", "full_image"];
+const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "full_image"];
 const channel = new BroadcastChannel("tod-actions");
 
 export function startActions() {
-  for (const name of OF_PAGE) {
-    const { run } = ACTIONS[name];
-    ACTIONS[name].run = () => {
-      if (store.view !== "monitor") return run();
-      return inControl() ? channel.postMessage(name) : showProblem(whyNoControl());
-    };
-  }
-  channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && ACTIONS[data]?.run();
+  for (const name of OF_PAGE) passOn(name, () => false);
+  passOn("back", () => store.enlarged !== null || !inControl());
+  passOn("straighten", () => camera(store.selected) !== undefined);
+  channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && (typeof data === "number" ? selectNumber(data) : ACTIONS[data]?.run());
+}
+
+/** Have a monitor pass an action on to its page, unless it concerns the monitor itself. @param {string} name  @param {() => boolean} isOwn */
+function passOn(name, isOwn) {
+  const { run } = ACTIONS[name];
+  ACTIONS[name].run = () => (store.view !== "monitor" || isOwn() ? run() : tellPage(name));
+}
+
+/** @param {string|number} message name of an action, or the number of a camera */
+const tellPage = (message) => (inControl() ? channel.postMessage(message) : showProblem(whyNoControl()));
+
+/** Select a camera by its number among the vehicle's, from 1 on; a monitor has its page select one that it does not show. @param {number} number */
+export function selectNumber(number) {
+  const found = store.hello?.cameras.find(({ index }) => index === number - 1);
+  if (found || store.view !== "monitor") selectCamera(found?.name);
+  else tellPage(number);
 }
 
 /** @param {"left"|"front"|"right"|"rear"} role */

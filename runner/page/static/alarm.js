@@ -5,6 +5,12 @@ const REPEAT_MS = 2000; // a picture that flickers does not sound each time
 const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", late: "late", damaged: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
 
+/** The tone for the worst of these statuses; null: none is needed. @param {string[]} statuses @returns {"lost"|"late"|null} */
+export function worstKind(statuses) {
+  const kinds = statuses.map((status) => KINDS[status]);
+  return kinds.includes("lost") ? "lost" : kinds.includes("late") ? "late" : null;
+}
+
 /** When the last tone of this kind or of a worse one was. */
 const latest = (tones, kind) => Math.max(tones.lost, kind === "late" ? tones.late : -Infinity);
 

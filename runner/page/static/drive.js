@@ -4,8 +4,9 @@ import { inControl, listen, mode, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
-import { toggleControl } from "./header.js";
-import { send, showGuides } from "./link.js";
+import { holding, toggleControl } from "./header.js";
+import { withKey } from "./hints.js";
+import { reportAttention, showGuides } from "./link.js";
 import { SHAPES } from "./tiles.js";
 import { limitReasons } from "./total.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
@@ -18,10 +19,14 @@ const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
 const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
 
+const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of words
+
+const words = /** @type {HTMLElement} */ (byId("drive").querySelector(".words"));
+/** @type {string|null} */
+let fitted = ""; // the words when their size was chosen
 const attention = new Attention();
 let isFocused = document.hasFocus();
 let hiddenAt = -Infinity; // when the page was last hidden
-let reported = ""; // attention last reported to the station
 const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const isOnline = () => store.connected && store.state?.online;
 
@@ -32,6 +37,9 @@ function refresh() {
   setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
   refreshAlarms();
   refreshControl();
+  const text = words.textContent;
+  if (text !== fitted) fitWords();
+  fitted = text;
 }
 
 /** The worst latency of all pictures. A stalled picture has none, and is worse than any. */
@@ -70,9 +78,17 @@ function linkWords() {
 /** The pictures that are not live, by status: FROZEN front left, rear. */
 function refreshAlarms() {
   const found = ALARMS.map((status) => ({ status, cameras: names().filter((name) => store.status[name] === status) })).filter(({ cameras }) => cameras.length);
-  const words = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(displayName).join(", ")}`);
-  setText(byId("alarms"), words.join("  "));
+  const texts = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(displayName).join(", ")}`);
+  setText(byId("alarms"), texts.join("  "));
   setAttribute(byId("alarms"), "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
+}
+
+/** Make the words smaller where they would be cut off. */
+function fitWords() {
+  for (const fit of FITS) {
+    words.style.setProperty("--fit", String(fit));
+    if (words.scrollHeight <= words.clientHeight && words.scrollWidth <= words.clientWidth) return;
+  }
 }
 
 function refreshControl() {
@@ -109,19 +125,13 @@ function updateAttention() {
   if (document.hidden) hiddenAt = performance.now();
   const slow = store.slow && performance.now() - hiddenAt > SETTLED_MS;
   const message = attention.update({ hidden: document.hidden, focused: isFocused, elsewhere: store.elsewhere, slow }, performance.now());
-  const warning = inControl() ? attention.warning : null;
-  byId("attention").hidden = warning === null || (store.view !== "drive" && attention.state !== "slow");
+  const warning = inControl() ? attention.warning : holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
+  byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");
-  reportAttention();
-  if (message && inControl() && store.view !== "configure") publish("toast", { text: message, level: "problem" });
+  reportAttention(attention.state);
+  if (message && inControl()) publish("toast", { text: message, level: "problem" });
 }
 
-/** Report attention to the station, which passes it to the vehicle while this page is in control. */
-function reportAttention() {
-  if (!store.connected || reported === attention.state) return;
-  reported = attention.state;
-  send({ attention: reported });
-}
 
 export function startDrive() {
   byId("drive-control").addEventListener("click", toggleControl);
@@ -136,8 +146,8 @@ export function startDrive() {
     updateAttention();
   });
   document.addEventListener("visibilitychange", updateAttention);
+  new ResizeObserver(fitWords).observe(words);
   listen("hello state sample ages status control socket requests view", refresh);
-  listen("socket", () => (reported = ""));
   listen("control socket view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window

@@ -5,7 +5,7 @@ import { completed, moved, resized, sizeOf } from "./editing.js";
 import { GAP } from "./layout.js";
 import { pending, request, requests, showProblem, whyNoControl } from "./requests.js";
 import { showDraft } from "./tiles.js";
-import { byId, displayName, make, setAttribute, setText } from "./format.js";
+import { announce, byId, displayName, make, setAttribute, setText } from "./format.js";
 
 const STEPS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
 
@@ -101,12 +101,12 @@ const place = (name) => /** @type {any} */ (draft)[name];
 
 function move(name, row, column) {
   setDraft(moved(/** @type {any} */ (draft), name, row, column), false);
-  setText(byId("announcer"), `${displayName(name)}: ${placeText(name)}`);
+  announce(`${displayName(name)}: ${placeText(name)}`);
 }
 
 function resize(name, row_span, column_span) {
   setDraft(resized(/** @type {any} */ (draft), name, row_span, column_span), false);
-  setText(byId("announcer"), `${displayName(name)}: ${placeText(name)}`);
+  announce(`${displayName(name)}: ${placeText(name)}`);
 }
 
 // --- keys and pointer -------------------------------------------------------------------------------------------------

@@ -62,6 +62,9 @@ export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** Have a screen reader speak a text, also one that it has just spoken: it speaks what is added. @param {string} text */
+export const announce = (text) => byId("announcer").replaceChildren(make("span", {}, text));
+
 /** Set or remove an attribute, only if it differs. */
 export function setAttribute(element, name, value) {
   const text = value === false || value === null || value === undefined ? null : String(value);

@@ -37,6 +37,7 @@ function onDisconnected({ gamepad }) {
   if (pads().length) return;
   clearInterval(pollTimer);
   pollTimer = undefined;
+  presses.reset(); // a button held when a pad connects again does not count
 }
 
 /** Vibrate for a picture that is lost or late. */

@@ -4,7 +4,7 @@
  */
 
 import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
-import { clearTo, COLOURS, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
+import { clearTo, COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
 import { RemoteWarp } from "./remote_warp.js";
@@ -166,7 +166,7 @@ export class GroundView {
     drawVehicle(context, dimensions, laid);
     if (why) return drawLabel(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
     drawScale(context, display, laid, size);
-    if (this.streams.some(({ camera }) => !camera.calibrated)) labelPicture(context, "ESTIMATED", { left: 0, top: 0, bottom: display.height });
+    if (this.streams.some(({ camera }) => !camera.calibrated)) labelPicture(context, ESTIMATED, { left: 0, top: 0, bottom: display.height });
     this.drawStates(context, laid, size, seen);
   }
 

@@ -10,6 +10,7 @@ import { resize } from "./resizing.js";
 
 export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
 const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
+export const ESTIMATED = "ESTIMATED"; // label of what is computed for a camera that is not calibrated
 const USUAL_PX = 960;
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
@@ -37,7 +38,7 @@ export class GuideLayer {
    */
   constructor(camera, dimensions) {
     this.dimensions = dimensions;
-    this.label = camera.calibrated ? "" : "ESTIMATED";
+    this.label = camera.calibrated ? "" : ESTIMATED;
     this.toImage = projection(camera);
     this.straight = this.straightLines();
   }

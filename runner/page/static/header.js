@@ -1,8 +1,10 @@
 /** The header: vehicle, mode, totals and control; and the banner when vehicle or station is offline. */
 
-import { inControl, listen, mode, publish, store } from "./store.js";
+import { inControl, listen, mode, note, publish, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
+import { withKey } from "./hints.js";
+import { Holding } from "./holding.js";
 import { MOVING } from "./status.js";
 import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 
@@ -13,6 +15,7 @@ const HOLDERS = { you: "You are in control", another: "Another page is in contro
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
+export const holding = new Holding();
 const buttons = [...byId("modes").querySelectorAll("button")];
 
 /** Request another mode. The mode that the vehicle reports stays highlighted. */
@@ -21,10 +24,22 @@ export function selectMode(selected) {
   request("mode", { event: "mode_selected", mode: selected }, `mode ${selected}`);
 }
 
+/** This page has lost control without releasing it: the driver must know, and other pages may drive. */
+function onControl() {
+  if (store.view === "monitor" || !holding.update(store.holder)) return;
+  const text = `CONTROL LOST: ${HOLDERS[store.holder].toLowerCase()}`;
+  note({ text, level: "problem" });
+  showProblem(text);
+  publish("deposed");
+}
+
 export function toggleControl() {
   if (!store.connected) return;
   if (store.view === "monitor") return showProblem("only the page can take or release control, not its monitors");
-  if (store.holder === "you") return send({ release_control: true });
+  if (store.holder === "you") {
+    holding.onRelease();
+    return send({ release_control: true });
+  }
   if (store.holder === "nobody") return send({ take_control: true });
   setText(byId("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
   byId("confirm", HTMLDialogElement).showModal();
@@ -57,7 +72,7 @@ function refreshControl() {
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
-  button.title = `${store.connected ? "take or release control (t)" : whyNoControl()}`;
+  button.title = store.connected ? withKey("take or release control", "control") : whyNoControl();
 }
 
 function refreshBanner() {
@@ -114,6 +129,7 @@ export function startHeader() {
     confirm.returnValue = "";
   });
   byId("help-open").addEventListener("click", () => publish("help"));
+  listen("control", onControl);
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshSkew);

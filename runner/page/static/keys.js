@@ -1,13 +1,13 @@
 /** The keyboard, and the dialog that lists its keys and the buttons of gamepads. */
 
 import { listen, publish, store } from "./store.js";
-import { ACTIONS, selectCamera } from "./actions.js";
+import { ACTIONS, selectNumber } from "./actions.js";
+import { labelOf } from "./hints.js";
 import { selectMode } from "./header.js";
 import { actionOf, keyOf } from "./presses.js";
 import { byId, make } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
-const ARROWS = { ArrowLeft: "←", ArrowUp: "↑", ArrowRight: "→", ArrowDown: "↓", Escape: "Esc" };
 const CHORD_MS = 2500;
 /** @type {[string, string, string][]} key, button, action */
 const FIXED = [
@@ -42,8 +42,17 @@ function onKeyDown(event) {
   action.run();
 }
 
+/**
+ * Give the focus of a clicked button back to the cameras: Enter would press it again, and arrow keys would select no camera.
+ * A button pressed by a key keeps it, as does one whose arrow keys have a meaning of their own.
+ */
+function onClick({ detail, target }) {
+  const button = detail > 0 && target instanceof Element ? target.closest("button") : null;
+  if (button === document.activeElement && !button?.closest("dialog, [role=tablist], [role=radiogroup], .mover")) button?.blur();
+}
+
 function onFixedKey(key) {
-  if (/^[1-9]$/.test(key)) return selectCamera(store.hello?.cameras.find(({ index }) => index === +key - 1)?.name);
+  if (/^[1-9]$/.test(key)) return selectNumber(+key);
   if (key !== "m") return;
   chordAt = performance.now();
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
@@ -59,11 +68,6 @@ function keyTable() {
   return make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...[...rows, ...FIXED].filter(([key, button]) => key || button).map(row)));
 }
 
-function labelOf(key) {
-  if (!key) return "";
-  return ARROWS[key] ?? (/^\p{Lu}$/u.test(key) ? `Shift+${key}` : key);
-}
-
 export function startKeys() {
   const help = byId("help", HTMLDialogElement);
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
@@ -73,4 +77,5 @@ export function startKeys() {
     help.showModal();
   });
   addEventListener("keydown", onKeyDown);
+  addEventListener("click", onClick, true); // before a dialog opens, which would return the focus when it closes
 }

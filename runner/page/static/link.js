@@ -77,6 +77,9 @@ export function transferCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
+/** State whether the operator can see this page; the worker reports it to the station. @param {string} state */
+export const reportAttention = (state) => worker.postMessage({ order: "attention", state });
+
 /** Transfer the canvas of a camera's guides to the worker. */
 export function transferGuides(name, element) {
   if (!canShowVideo) return;

@@ -5,6 +5,7 @@ import { listen, store } from "./store.js";
 import { requests } from "./requests.js";
 import { startTheme } from "./theme.js";
 import { startViews } from "./views.js";
+import { startHints } from "./hints.js";
 import { startHeader } from "./header.js";
 import { startTiles } from "./tiles.js";
 import { startDrive } from "./drive.js";
@@ -24,6 +25,7 @@ import { startGamepads } from "./gamepads.js";
 
 startTheme();
 startViews();
+startHints();
 startHeader();
 startTiles();
 startDrive();

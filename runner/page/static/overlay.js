@@ -15,10 +15,21 @@ export const AMBER = "#ffb000";
  * @param {string} text
  */
 export function drawOverlay(context, area, mirrored, status, text) {
+  readably(context, area, mirrored, () => drawStatus(context, area, status, text));
+}
+
+/**
+ * Draw with the origin in an area's corner so that it reads correctly on the screen.
+ * @param {OffscreenCanvasRenderingContext2D} context
+ * @param {{x: number, y: number, width: number, height: number}} area
+ * @param {boolean} mirrored whether the canvas is mirrored
+ * @param {() => void} draw
+ */
+export function readably(context, area, mirrored, draw) {
   context.save();
   if (mirrored) context.transform(-1, 0, 0, 1, area.x + area.width, area.y);
   else context.translate(area.x, area.y);
-  drawStatus(context, area, status, text);
+  draw();
   context.restore();
 }
 

@@ -8,6 +8,7 @@ import { makeSlider } from "./slider.js";
 import { SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
+import { withKey } from "./hints.js";
 import { colourOf } from "./colours.js";
 import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
@@ -29,7 +30,7 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
-const straight = make("button", { "data-control": "straight", title: "straighten the picture of this fisheye, or show the original (l)", onclick: () => toggleStraight() }, "Straighten");
+const straight = make("button", { "data-control": "straight", "data-key": "straighten", "data-title": "straighten the picture of this fisheye, or show the original", onclick: () => toggleStraight() }, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
@@ -45,7 +46,7 @@ const weight = number("weight", "weight", { min: 0, step: "any" });
 const weightNote = make("span", { class: "muted" });
 const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
-const full = make("button", { "data-control": "roi-full", onclick: () => sendFull(), title: "full image (f)" }, "Full image");
+const full = make("button", { "data-control": "roi-full", onclick: () => sendFull() }, "Full image");
 const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image" }, "Lock aspect");
 const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), shown: make("i", { class: "is" }), requested: make("i", { class: "wish" }) };
 const differing = make("p", { class: "differing" });
@@ -160,7 +161,7 @@ function refreshHead(now) {
   setAttribute(on, "aria-label", `${name()} on`);
   setAttribute(on, "data-pending", requested ? "" : null);
   on.disabled = Boolean(whyNot());
-  on.title = whyNot() ?? "switch this camera on or off (o)";
+  on.title = whyNot() ?? withKey("switch this camera on or off", "switch");
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
   setText(reason, [word === "unsupported" ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
 }
@@ -174,6 +175,7 @@ function refreshSettings(info, now) {
   for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
   setAttribute(locked, "aria-pressed", isLocked());
   apply.disabled = full.disabled = Boolean(why);
+  full.title = why ?? withKey("full image", "full_image");
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
   setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "share of the total"));

@@ -4,6 +4,7 @@
  */
 
 import { inControl, listen, note, publish, store } from "./store.js";
+import { withKey } from "./hints.js";
 import { send } from "./link.js";
 
 const GIVE_UP_MS = 2000; // after the station should have answered "timed out" itself
@@ -42,7 +43,7 @@ export function pending(control) {
 export function whyNoControl() {
   if (!store.connected) return "no connection to the station";
   if (store.holder === "another") return "another page holds control";
-  return store.view === "monitor" ? "the page of this monitor does not hold control" : "take control first (t)";
+  return store.view === "monitor" ? "the page of this monitor does not hold control" : withKey("take control first", "control");
 }
 
 /** Show a problem in a toast. */

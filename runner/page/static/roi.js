@@ -3,6 +3,7 @@
 import { camera, decisionOf, inControl, listen, mode, publish } from "./store.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { toBox, toPicture, visible } from "./framing.js";
+import { withKey } from "./hints.js";
 import { isStraight } from "./straighten.js";
 import { inside, SMALLEST, withAspect } from "./region.js";
 import { make, sameRegion } from "./format.js";
@@ -66,7 +67,7 @@ export function fullRegion(name) {
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
-  if (isStraight(name)) return "no ROI can be chosen on a straightened picture; turn straightening off (l), or type the numbers";
+  if (isStraight(name)) return `no ROI can be chosen on a straightened picture; ${withKey("turn straightening off", "straighten")}, or type the numbers`;
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 

@@ -1,10 +1,11 @@
 /**
- * Tones for stalled or late pictures, in the Drive view of the page in control. Browsers allow sound only after a click or
- * key press, such as the one that takes control; until then, and while muted, the page shows it.
+ * Tones for stalled or late pictures, on the page in control. Browsers allow sound only after a click or key press, such as
+ * the one that takes control; until then, and while muted, the page shows it.
  */
 
 import { listen, publish, store } from "./store.js";
-import { Alarm } from "./alarm.js";
+import { Alarm, worstKind } from "./alarm.js";
+import { withKey } from "./hints.js";
 import { byId, setAttribute, setText } from "./format.js";
 
 const KEY = "tod-muted";
@@ -13,25 +14,39 @@ const TONE_S = 0.15;
 const VOLUME = 0.3;
 
 const alarm = new Alarm();
+const buttons = ["sound", "sound-header"].map((id) => byId(id));
 /** @type {AudioContext|null} */
 let context = null;
+let wasBlocked = true; // whether the browser blocked sound when the last press began
 let isDriving = false; // whether this page has control; kept while the connection is lost, when tones matter most
 
 const isMuted = () => localStorage.getItem(KEY) === "yes";
 
 /** Create or resume the audio context if needed; it stays blocked until a click or key press. */
 function unlock() {
-  if (store.view !== "drive") return void context?.suspend();
   if (!isDriving) return;
   if (!context) {
     context = new AudioContext();
-    context.onstatechange = refresh;
+    context.onstatechange = onAudioState;
   }
   if (context.state !== "running") context.resume().catch(() => refresh());
 }
 
+/** The press that resumes the sound must not mute it as well. @param {Event} event */
+function onPress(event) {
+  if (event instanceof KeyboardEvent && event.repeat) return;
+  wasBlocked = context?.state !== "running";
+  unlock();
+}
+
+function onAudioState() {
+  const kind = worstKind(Object.values(store.status));
+  if (isDriving && kind) play(kind); // the browser blocked its tone
+  refresh();
+}
+
 function play(kind) {
-  if (context?.state !== "running") return;
+  if (isMuted() || context?.state !== "running") return;
   for (const [i, frequency] of TONES[kind].entries()) {
     const from = context.currentTime + i * TONE_S;
     const oscillator = new OscillatorNode(context, { type: "square", frequency });
@@ -41,12 +56,26 @@ function play(kind) {
   }
 }
 
-function onStatus({ camera, status }) {
-  if (!isDriving || store.view !== "drive") return;
-  const kind = alarm.due(camera, status, performance.now());
+/** @param {"lost"|"late"|null} kind */
+function sound(kind) {
   if (!kind) return;
   publish("alarm", kind);
-  if (!isMuted()) play(kind);
+  play(kind);
+}
+
+/** Sound for the worst picture, which may have gone wrong before this page had control. */
+const soundCurrent = () => isDriving && sound(worstKind(Object.values(store.status)));
+
+function onStatus({ camera, status }) {
+  if (isDriving) sound(alarm.due(camera, status, performance.now()));
+}
+
+function onControl() {
+  const before = isDriving;
+  isDriving = store.holder === "you" || (isDriving && !store.connected);
+  unlock();
+  if (isDriving && !before) soundCurrent();
+  refresh();
 }
 
 export function toggleSound() {
@@ -57,21 +86,23 @@ export function toggleSound() {
 function refresh() {
   const isBlocked = context?.state !== "running";
   const words = isMuted() ? "✕ Muted" : isBlocked ? "✕ Sound blocked" : "Sound on";
+  const title = isMuted() || !isBlocked ? withKey("tones for lost, frozen and late pictures, or none", "sound") : "the browser blocks sound until a click or key press";
+  for (const button of buttons) {
+    setText(button, words);
+    setAttribute(button, "data-level", isMuted() || isBlocked ? "near" : "fine");
+    button.title = title;
+  }
   byId("sound").hidden = !isDriving;
-  setText(byId("sound"), words);
-  setAttribute(byId("sound"), "data-level", isMuted() || isBlocked ? "near" : "fine");
-  byId("sound").title = isMuted() || !isBlocked ? "tones for lost, frozen and late pictures, or none (b)" : "the browser blocks sound until a click or key press";
+  byId("sound-header").hidden = !isDriving || !(isMuted() || isBlocked);
 }
 
 export function startSound() {
-  byId("sound").addEventListener("click", () => (context?.state === "running" || isMuted()) && toggleSound());
-  for (const kind of ["pointerup", "keydown"]) addEventListener(kind, unlock);
-  listen("control view", () => {
-    isDriving = store.holder === "you" || (isDriving && !store.connected);
-    unlock();
-    refresh();
-  });
+  for (const button of buttons) button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleSound());
+  for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
+  listen("control", onControl);
+  listen("hello", refresh);
   listen("status", onStatus);
+  listen("deposed", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
   refresh();
 }

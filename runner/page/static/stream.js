@@ -6,10 +6,10 @@ import { placement, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
 import { paintImage, pictureOf } from "./picture.js";
-import { GuideLayer } from "./guide_layer.js";
+import { ESTIMATED, GuideLayer, labelPicture } from "./guide_layer.js";
 import { resize } from "./resizing.js";
 import { alarmText, INTERVALS, judge, MOVING, STALLED } from "./status.js";
-import { drawOverlay } from "./overlay.js";
+import { drawOverlay, readably } from "./overlay.js";
 import { straightOptics } from "./straight.js";
 import { StraightView } from "./straight_view.js";
 import { FILLS } from "./warp.js";
@@ -28,6 +28,7 @@ const REFUSED_RETRY_MS = 5000; // between two checks whether the browser can dec
 const LATE_HOLD_MS = 500; // how long one late picture is indicated, at least until it counts as frozen
 const STAGES = 1200;
 const NEW_REGION = "NEW REGION"; // while it is unknown which part of the image a picture shows
+const NO_VIDEO = "This browser has no WebCodecs.";
 const UNTIMED_MS = 1000; // longest transit of a picture without a capture time
 // Not every encoder signals the colour space that the vehicle uses (ITU-R BT.709); for small pictures browsers assume BT.601.
 /** @type {VideoColorSpaceInit} */
@@ -70,7 +71,8 @@ export class Stream {
     this.pace = new Pace();
     this.counts = { received: 0, due: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // the decoder's last one
-    this.refused = isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there is no picture
+    this.lasting = !station.video ? NO_VIDEO : isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there will never be a picture
+    this.refused = this.lasting; // why there is none
     this.refused_at = now(); // when the browser last reported that it has no decoder
     this.stages = [];
     this.first_drawn = null;
@@ -165,8 +167,9 @@ export class Stream {
     const reached = unit.arrived - this.station.clock.offset + this.station.clock.bound;
     const isLatest = !(unit.flags & CATCH_UP); // those before it are older, however recent the newest picture is
     this.arrived = this.drawn || !isLatest || !Number.isFinite(reached) ? received : Math.min(received, reached);
-    if (this.refused && unit.flags & KEY && isKnown(this.camera.codec)) this.retryRefused(unit.data);
-    if (!this.station.video || this.refused) return void Object.assign(this, { decoded: received, drawn: true }); // judged by arrival alone
+    if (!(unit.flags & CATCH_UP)) this.counts.due++; // also if it cannot be drawn
+    if (this.refused && !this.lasting && unit.flags & KEY) this.retryRefused(unit.data);
+    if (this.refused) return;
     if (unit.flags & RESTART) this.restart();
     if (unit.flags & KEY) this.configure(unit.data);
     if (!this.decoder || this.decoder.state !== "configured") return this.resync();
@@ -217,7 +220,6 @@ export class Stream {
   decode(unit, received) {
     this.timestamp += 1000;
     this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
-    if (!(unit.flags & CATCH_UP)) this.counts.due++;
     const type = unit.flags & KEY ? "key" : "delta";
     try {
       this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
@@ -350,6 +352,7 @@ export class Stream {
   showGuides(shown) {
     if (!this.guides) return;
     this.guides.shown = shown;
+    if (this.straight) this.painted_text = null; // repaint, since both have the label
     this.drawGuides();
   }
 
@@ -471,9 +474,17 @@ export class Stream {
     this.resizeCanvas(canvas, STALLED.includes(this.status));
     if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown);
     else blank(context);
+    this.labelEstimate(context, canvas);
     if (text) drawOverlay(context, this.visibleArea(canvas), this.display.view.mirrored, this.status, text);
     this.painted_text = text;
     this.reportMark(this.isLateToo(time) ? "damaged late" : this.status);
+  }
+
+  /** A picture straightened by optics that nobody has measured says so, as lines on the ground do. */
+  labelEstimate(context, canvas) {
+    if (!this.straight || !this.shown?.image || this.camera.calibrated || this.guides?.shown) return;
+    const area = this.visibleArea(canvas);
+    readably(context, area, this.display.view.mirrored, () => labelPicture(context, ESTIMATED, { left: 0, top: 0, bottom: area.height }));
   }
 
   /** Report the mark that the canvas shows from now on. */

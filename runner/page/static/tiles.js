@@ -11,8 +11,9 @@ import { birdseyeSize, placeBirdseye } from "./birdseye.js";
 import { framingText, WHOLE } from "./framing.js";
 import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
+import { withKey } from "./hints.js";
 import { colourOf } from "./colours.js";
-import { byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
+import { announce, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
@@ -103,7 +104,6 @@ function buildTile({ name, pose }) {
   const reason = make("div", { class: "reason", role: "tooltip" });
   const refused = make("p", { class: "refused", hidden: true });
   parts.box.append(reason, refused);
-  if (!canShowVideo) parts.box.append(make("p", { class: "no-picture" }, "no video in this browser"));
   const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.shown, parts.status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
@@ -256,7 +256,7 @@ function refreshSwitch(name, { on }) {
   setAttribute(on, "data-pending", requested ? "" : null);
   on.disabled = !inControl() || !now;
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
-  setAttribute(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : "switch this camera on or off (o)");
+  setAttribute(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : withKey("switch this camera on or off", "switch"));
 }
 
 function refreshCaption(name, { rates, form, reason }) {
@@ -309,7 +309,7 @@ function onStatus({ camera: name, status }) {
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (ALARMS.includes(status)) setText(byId("announcer"), `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
+  if (ALARMS.includes(status)) announce(`${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
 }
 
 export function startTiles() {
@@ -321,7 +321,7 @@ export function startTiles() {
   listen("selected", moveFocus);
   listen("enlarged", (name) => {
     layOut();
-    if (name && !wasHinted) publish("toast", { text: "Esc or double click to go back", level: "hint" });
+    if (name && !wasHinted) publish("toast", { text: `${withKey("double click to go back", "back")}`, level: "hint" });
     wasHinted = true;
   });
   if (!canShowVideo) showNoVideo();

@@ -10,7 +10,7 @@ import { Clock, now } from "./clock.js";
 import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
-import { onPageReady } from "./resizing.js";
+import { askPage, onPageReady, silence } from "./resizing.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
@@ -35,6 +35,7 @@ const CONNECT_MS = 1000; // timeout of an attempt to connect
 const SILENT_MS = 2000; // the station sends four messages a second
 const RECONNECT_MS = 500;
 const REPORT_MS = 250;
+const HUNG_MS = 1500; // without an answer of the page's main thread: keys do nothing, either
 const HEADER = 24;
 const MAX_LOGGED = 200;
 
@@ -70,6 +71,8 @@ const ground = new GroundView(station.steering);
 let isAsleep = true; // no animation frame is requested
 let tickedAt = now();
 let wasLate = false; // at the last tick
+let attention = ""; // of the operator, as the page states it
+let reported = ""; // to the station
 const log = []; // [page time, camera, mark] when a changed mark was drawn
 
 const toPage = (message) => postMessage(message);
@@ -121,6 +124,7 @@ function checkConnection() {
 function setConnected(open) {
   if (station.connected === open) return;
   station.connected = open;
+  reported = "";
   if (!open) judgeAll();
   toPage({ kind: "socket", open });
 }
@@ -229,6 +233,14 @@ function reportAges() {
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow });
+  askPage();
+  reportAttention();
+}
+
+/** Report the operator's attention, which the station passes on while this page is in control; a page that hangs cannot. */
+function reportAttention() {
+  const state = attention && silence() > HUNG_MS ? "slow" : attention;
+  if (state !== reported && send({ attention: state })) reported = state;
 }
 
 /** Draw what waits for canvases of new sizes. */
@@ -258,7 +270,14 @@ const orders = {
     applyGuides();
   },
   first: ({ name }) => (first = name),
-  ready: () => onPageReady(drawResized),
+  ready() {
+    onPageReady(drawResized);
+    reportAttention();
+  },
+  attention({ state }) {
+    attention = state;
+    reportAttention();
+  },
   straight({ names }) {
     straight = names;
     applyStraight();

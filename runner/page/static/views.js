@@ -3,7 +3,7 @@
  * offered once, when this tab first gets control. A monitor, a window with some of the pictures, has its own view.
  */
 
-import { inControl, listen, publish, store } from "./store.js";
+import { enlarge, inControl, listen, publish, store } from "./store.js";
 import { openTab } from "./tabs.js";
 import { byId } from "./format.js";
 
@@ -17,6 +17,7 @@ function setView(view) {
   sessionStorage.setItem(VIEW, view);
   dismissOffer();
   applyView();
+  enlarge(null); // each view begins with its usual pictures
   publish("view", view);
 }
 

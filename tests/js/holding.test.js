@@ -1,0 +1,21 @@
+/** Control that is lost is noticed once, control that is released is not lost. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { Holding } from "../../runner/page/static/holding.js";
+
+const updated = (holding, ...holders) => holders.map((holder) => [holding.update(holder), holding.isLost]);
+
+test("control taken by another page is lost until it is back", () => {
+  const found = updated(new Holding(), "nobody", "you", "you", "another", "another", "nobody", "you", "another");
+  assert.deepEqual(found, [[false, false], [false, false], [false, false], [true, true], [false, true], [false, true], [false, false], [true, true]]);
+});
+
+test("control that a page releases, or never had, is not lost", () => {
+  const holding = new Holding();
+  updated(holding, "you");
+  holding.onRelease();
+  assert.deepEqual(updated(holding, "nobody", "another"), [[false, false], [false, false]]);
+  assert.deepEqual(updated(new Holding(), "another"), [[false, false]]);
+});
