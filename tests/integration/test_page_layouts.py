@@ -266,32 +266,38 @@ def test_a_driver_is_warned_in_either_view(chromium, picture):
         controlling(page)
         count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
         page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
-        assert page.inner_text("#sound-header") == "✕ Sound blocked"
-        page.focus("#sound-header")
+        assert page.inner_text("#sound-configure") == "✕ Sound blocked"
+        shot(page, "sound-blocked")
+        page.focus("#sound-configure")
         page.keyboard.press("Space")  # which allows sound, and must not mute it at once
-        until(page.locator("#sound-header").is_hidden)
+        until(page.locator("#sound-configure").is_hidden)
         assert page.evaluate("localStorage.getItem('tod-muted')") is None
         page.evaluate("dispatchEvent(new Event('blur'))")
         until(lambda: "OUT OF FOCUS" in page.inner_text("#attention"))
         time.sleep(0.6)  # a shorter absence is not reported
         page.evaluate("dispatchEvent(new Event('focus'))")
         until(lambda: "No key reached this page" in page.inner_text("#toasts"))
-        assert (page.evaluate("tod.view"), page.evaluate("globalThis.tones")) == ("configure", None)
+        assert page.evaluate("tod.view") == "configure"
+
+        def tones():
+            """Four for a lost picture; on a busy machine there may be others."""
+            return page.evaluate("globalThis.tones ?? 0")
 
         page.keyboard.press("t")
         until(lambda: page.evaluate("tod.control") == "nobody")
         server.silent.add("rear")
         until(lambda: measure(page)["rear"]["status"] == "lost")
-        assert page.evaluate("globalThis.tones") is None
+        before = tones()
         take_control(page)
-        until(lambda: page.evaluate("globalThis.tones") == 4)
+        until(lambda: tones() >= before + 4)
         server.silent.clear()
         all_live(page)
+        before = tones()
         with opened(chromium, server.url) as other:
             take_control(other)
             until(lambda: page.inner_text("#attention") == "CONTROL LOST: this page only watches; take control (t)")
             assert "CONTROL LOST: another page is in control" in page.inner_text("#toasts")
-            until(lambda: page.evaluate("globalThis.tones") == 8)
+            until(lambda: tones() >= before + 4)
             shot(page, "control-lost-configure")
             page.keyboard.press("v")
             shot(page, "control-lost-drive")

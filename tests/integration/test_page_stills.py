@@ -226,8 +226,13 @@ def test_buttons_act_once_and_a_pad_that_disconnects_is_announced(page, station)
     assert page.evaluate("tod.view") == "drive"
     hold(4)
     assert until(lambda: getattr(station, "last_request", None)) == {"event": "mode_selected", "mode": "automatic"}
+    until(lambda: page.locator(".tile.selected").get_attribute("data-camera") == "mirrored")
     page.evaluate("unplug()")
     until(lambda: "Wheel disconnected" in page.inner_text("#toasts"))
+    polls = page.evaluate("plug('Wheel'), pads[0].buttons[12].pressed = true, polls")
+    until(lambda: page.evaluate("polls") > polls + 2)
+    assert page.locator(".tile.selected").get_attribute("data-camera") == "mirrored", "held while it connected"
+    page.evaluate("unplug()")
     assert "Wheel disconnected" in page.locator("#news").text_content()
 
 

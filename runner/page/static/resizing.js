@@ -3,11 +3,8 @@
  * main thread. So a canvas gets a new size only when that thread has just answered; until then, it keeps the old one.
  */
 
-import { now } from "./clock.js";
-
 let isReady = false; // whether the main thread has just answered, so that waiting for it is short
-/** @type {number|null} page time when it was asked; null: it has answered */
-let askedAt = null;
+let isAsked = false; // whether it has not answered yet
 
 /** @param {{width: number, height: number}} canvas  @param {import("./framing.js").Size} size px  @returns {boolean} whether it has this size now */
 export function resize(canvas, { width, height }) {
@@ -19,18 +16,17 @@ export function resize(canvas, { width, height }) {
 
 /** Ask the page's main thread for a sign of life. */
 export function askPage() {
-  if (askedAt !== null) return;
-  askedAt = now();
-  postMessage({ kind: "asked" });
+  if (!isAsked) postMessage({ kind: "asked" });
+  isAsked = true;
 }
-
-/** How long the main thread has not answered, ms. */
-export const silence = () => (askedAt === null ? 0 : now() - askedAt);
 
 /** The page's main thread has answered. @param {() => void} draw what waits for new sizes */
 export function onPageReady(draw) {
-  askedAt = null;
+  isAsked = false;
   isReady = true;
-  draw();
-  isReady = false;
+  try {
+    draw();
+  } finally {
+    isReady = false;
+  }
 }

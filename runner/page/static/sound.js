@@ -14,7 +14,7 @@ const TONE_S = 0.15;
 const VOLUME = 0.3;
 
 const alarm = new Alarm();
-const buttons = ["sound", "sound-header"].map((id) => byId(id));
+const buttons = ["sound", "sound-configure"].map((id) => byId(id));
 /** @type {AudioContext|null} */
 let context = null;
 let wasBlocked = true; // whether the browser blocked sound when the last press began
@@ -93,7 +93,7 @@ function refresh() {
     button.title = title;
   }
   byId("sound").hidden = !isDriving;
-  byId("sound-header").hidden = !isDriving || !(isMuted() || isBlocked);
+  byId("sound-configure").hidden = !isDriving || !(isMuted() || isBlocked);
 }
 
 export function startSound() {

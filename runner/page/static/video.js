@@ -10,7 +10,7 @@ import { Clock, now } from "./clock.js";
 import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
-import { askPage, onPageReady, silence } from "./resizing.js";
+import { askPage, onPageReady } from "./resizing.js";
 import { Steering } from "./steering.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
@@ -35,7 +35,7 @@ const CONNECT_MS = 1000; // timeout of an attempt to connect
 const SILENT_MS = 2000; // the station sends four messages a second
 const RECONNECT_MS = 500;
 const REPORT_MS = 250;
-const HUNG_MS = 1500; // without an answer of the page's main thread: keys do nothing, either
+const HUNG = 6; // reports without an answer of the page's main thread: keys do nothing, either
 const HEADER = 24;
 const MAX_LOGGED = 200;
 
@@ -73,6 +73,7 @@ let tickedAt = now();
 let wasLate = false; // at the last tick
 let attention = ""; // of the operator, as the page states it
 let reported = ""; // to the station
+let unanswered = 0; // reports since the page's main thread has last answered; not a time, which passes while this worker waits, too
 const log = []; // [page time, camera, mark] when a changed mark was drawn
 
 const toPage = (message) => postMessage(message);
@@ -234,12 +235,14 @@ function reportAges() {
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow });
   askPage();
+  unanswered++;
   reportAttention();
 }
 
 /** Report the operator's attention, which the station passes on while this page is in control; a page that hangs cannot. */
 function reportAttention() {
-  const state = attention && silence() > HUNG_MS ? "slow" : attention;
+  const isHung = unanswered >= HUNG && ["watching", "unfocused"].includes(attention);
+  const state = isHung ? "slow" : attention;
   if (state !== reported && send({ attention: state })) reported = state;
 }
 
@@ -271,6 +274,7 @@ const orders = {
   },
   first: ({ name }) => (first = name),
   ready() {
+    unanswered = 0;
     onPageReady(drawResized);
     reportAttention();
   },
