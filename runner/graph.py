@@ -16,6 +16,7 @@ from runner.core.model import (
     Camera,
     Capture,
     Element,
+    Endpoint,
     Graph,
     Media,
     ModelError,
@@ -274,7 +275,7 @@ def shell(elements: Iterable[Element]) -> str:
 
 
 def rtsp_url(media: Media, camera: str) -> str:
-    return f"{'rtsps' if media.secure else 'rtsp'}://{media.host}:{media.port}/{camera}"
+    return f"{'rtsps' if media.secure else 'rtsp'}://{media}/{camera}"
 
 
 def video_codec(graph: Graph) -> str:
@@ -346,6 +347,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
     """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
+    port = int(camera.graph.settings["first_port"]) + index
     values: dict[str, Value | None] = {
         **camera.source.settings,
         **camera.graph.settings,
@@ -359,7 +361,8 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "controls": _controls(camera.capture),
         "host": media.host,
         "url": rtsp_url(media, camera.name),
-        "port": int(camera.graph.settings["first_port"]) + index,
+        "port": port,
+        "endpoint": str(Endpoint(media.host, port)),
     }
     if "dscp" in camera.graph.settings:
         dscp = int(camera.graph.settings["dscp"])

@@ -250,6 +250,7 @@ def test_values_as_gstreamer_reads_them(value: Any, expected: str) -> None:
 
 def test_the_url_of_a_camera() -> None:
     assert rtsp_url(MEDIA, "front_left") == "rtsp://127.0.0.1:8554/front_left"
+    assert rtsp_url(replace(MEDIA, host="fd00::2"), "front_left") == "rtsp://[fd00::2]:8554/front_left"
 
 
 # --- invalid graphs -------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from urllib.parse import urlencode
 import pytest
 from helpers import vehicle
 
+from runner.errors import RunError
 from runner.h264.access_unit import AccessUnit
 
 pytest.importorskip("aiohttp")
@@ -196,6 +197,16 @@ def test_wrong_answers_to_the_login_do_not_displace_the_other_notes():
 )
 def test_a_page_is_known_by_the_names_that_browsers_send(port, scheme, accepted):
     assert hosts(("Station.example.org", "10.0.0.1"), port, scheme) == accepted
+    assert hosts(("FD00:0::2",), 8090, scheme) == {"[fd00::2]:8090"}
+
+
+def test_a_page_at_an_ipv6_address():
+    try:
+        with served("page.host=::1") as (port, _), socket.create_connection(("::1", port), timeout=5) as line:
+            line.sendall(f"GET / HTTP/1.1\r\nHost: [::1]:{port}\r\nConnection: close\r\n\r\n".encode())
+            assert line.recv(12) == b"HTTP/1.1 200"
+    except RunError as error:  # only where there is no IPv6
+        assert "cannot assign requested address" in str(error)
 
 
 @pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])

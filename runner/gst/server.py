@@ -6,7 +6,6 @@ callbacks run in any of these threads, and one lock guards all shared state.
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections import Counter
@@ -26,7 +25,7 @@ from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
-from runner.system.ports import check_port_free
+from runner.system.ports import check_port_free, ip_address_of
 from runner.system.reports import LimitedReports
 
 if TYPE_CHECKING:
@@ -168,7 +167,7 @@ class CameraServer:
             self._server.get_mount_points().add_factory(f"/{name}", camera.factory)
         self._attached = self._server.attach(None)
         if not self._attached:
-            raise RunError(f"the RTSP server cannot listen on {media.host}:{media.port}; choose another media.port")
+            raise RunError(f"the RTSP server cannot listen on {media}; choose another media.port")
         watches = (self._watch_connections, *((self._watch_keys,) if self._viewers else ()))
         self._watches = [every(WATCH_MS, watch, lambda what: on_report("viewers", what)) for watch in watches]
         threading.Thread(target=self._expire_sessions, name="rtsp-sessions", daemon=True).start()
@@ -615,7 +614,7 @@ def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
 
 def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool:
     """Addresses for RTP and RTCP: the server's own, or all if it listens on all."""
-    address = socket.gethostbyname(media.host)
+    address = ip_address_of(media.host)
     first, last = media.rtp_ports
     pool = GstRtspServer.RTSPAddressPool()
     pool.add_range(address, address, first, last, 0)

@@ -257,9 +257,16 @@ async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> No
         await serving
 
 
+def _ipv4_address(host: str) -> str:
+    try:
+        return socket.gethostbyname(host)
+    except OSError as error:
+        sys.exit(f"{host} has no IPv4 address: {str(error.strerror).lower()}; link=relay knows no others")
+
+
 async def main() -> None:
     settings = json.loads(sys.argv[1])
-    media, control = ((socket.gethostbyname(host), port) for host, port in (settings["media"], settings["control"]))
+    media, control = ((_ipv4_address(host), port) for host, port in (settings["media"], settings["control"]))
     link = Link.of(settings)
     listening = {"media": listen(media[0]), "control": listen(control[0])}
     print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from runner.core.model import Endpoint
@@ -57,8 +57,7 @@ class Broker:
     def __init__(
         self, endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
     ) -> None:
-        self._address = (endpoint.host, endpoint.port)
-        self._where = f"{endpoint.host}:{endpoint.port}"
+        self._endpoint = endpoint
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         listener = (
             broker_settings(str(keys.absolute()), endpoint.host, endpoint.port).splitlines()
@@ -91,20 +90,19 @@ class Broker:
         status = self._process.poll()
         if status is not None:
             message = "; ".join(filter(None, (children.ending(status), self._last_line())))
-            raise RunError(f"the MQTT broker on {self._where} ended: {message}")
+            raise RunError(f"the MQTT broker on {self._endpoint} ended: {message}")
 
     def wait_until_it_answers(self) -> None:
         """raises RunError if it does not answer within `START_S`"""
         until = time.monotonic() + START_S
         while time.monotonic() < until and self._process.poll() is None:
             signals.check()
-            with socket.socket() as probe:
-                probe.settimeout(START_S)
-                if probe.connect_ex(self._address) == 0 and self._process.poll() is None:
+            with suppress(OSError), socket.create_connection((self._endpoint.host, self._endpoint.port), START_S):
+                if self._process.poll() is None:
                     return
             time.sleep(0.02)
         message = self._last_line() if self._process.poll() is not None else "it does not answer"
-        raise RunError(f"mosquitto does not start on {self._where}: {message}; choose another control.port")
+        raise RunError(f"mosquitto does not start on {self._endpoint}: {message}; choose another control.port")
 
     def reload(self) -> None:
         """Reload passwords and revocation list; clients that are no longer accepted are disconnected."""

@@ -11,7 +11,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,6 @@ class PageServer(Listener):
         self._holder = keyring.watched_holder(station.note) if keyring else None
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
         check_port_free(vehicle.page.endpoint)
-        self._address = (vehicle.page.endpoint.host, vehicle.page.endpoint.port)
         self._plotly = plotly_script("page")
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
@@ -116,15 +116,15 @@ class PageServer(Listener):
 
     @property
     def url(self) -> str:
-        host, port = self._address
+        endpoint = self._vehicle.page.endpoint
         if self._holder is None:
-            return f"http://{host}:{port}/"
-        return f"https://{next(iter(self._names), host)}:{port}/"
+            return f"http://{endpoint}/"
+        return f"https://{replace(endpoint, host=next(iter(self._names), endpoint.host))}/"
 
     @property
     def _names(self) -> tuple[str, ...]:
         """Addresses and names at which browsers reach the page."""
-        return self._holder.get().hosts if self._holder else LOOPBACK
+        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._vehicle.page.host)
 
     def start(self) -> None:
         self._thread.start()
@@ -182,10 +182,10 @@ class PageServer(Listener):
             app, access_log=None, logger=self._logger(), shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
         )
         await self._runner.setup()
-        tls = self._tls.context if self._tls else None
+        endpoint, tls = self._vehicle.page.endpoint, self._tls.context if self._tls else None
         handshake_s = REQUEST_S if tls else None  # until it has ended, `_expire` has nothing to close
         self._server = await self._loop.create_server(
-            self._new_connection, *self._address, ssl=tls, ssl_handshake_timeout=handshake_s
+            self._new_connection, endpoint.host, endpoint.port, ssl=tls, ssl_handshake_timeout=handshake_s
         )
 
     def _logger(self) -> logging.Logger:
@@ -514,8 +514,17 @@ class PageServer(Listener):
 
 def hosts(names: Iterable[str], port: int, scheme: str) -> set[str]:
     """What browsers send as Host: a name in lower case, without the port if it is the scheme's own."""
-    known = {name.lower() for name in names}
+    known = {_as_in_url(name) for name in names}
     return {f"{name}:{port}" for name in known} | (known if port == DEFAULT_PORTS[scheme] else set())
+
+
+def _as_in_url(name: str) -> str:
+    """An address or name as browsers write it: IPv6 in its shortest form (RFC 5952), in brackets."""
+    try:
+        address = ip_address(name)
+    except ValueError:
+        return name.lower()
+    return f"[{address}]" if address.version == 6 else str(address)
 
 
 def _recent(camera: Camera) -> RecentUnits:

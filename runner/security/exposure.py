@@ -16,9 +16,11 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
     """The keys that a side's configuration names; None: it names none and needs none.
 
     needed  files that this side needs in addition to those that every holder has
-    raises  UserError if keys are incomplete, or missing although video or control leave this machine
+    raises  UserError if keys are incomplete, or missing although video or control leave this machine; for an address of
+            media.host that they do not work with
     """
     if vehicle.keys is not None:
+        _check_server_name(vehicle)
         return Keyring.of(Path(vehicle.keys), *needed)
     reached = {"media.host": vehicle.media.host, "control.host": vehicle.control.host}
     exposed = [f"{key} {host}" for key, host in reached.items() if not is_loopback(host)]
@@ -26,6 +28,16 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
         rule = "are reached over a network: give keys=DIR, made by `tod-runner keys`, or insecure=true"
         raise UserError("command line", "keys", None, f"{' and '.join(exposed)} {rule}")
     return None
+
+
+def _check_server_name(vehicle: Vehicle) -> None:
+    """GLib's TLS client states the host as server name (RFC 6066, section 3), and GnuTLS refuses an IPv6 address there.
+
+    raises  UserError
+    """
+    if ":" in vehicle.media.host and any(camera.graph.transport == "rtsp" for camera in vehicle.cameras.values()):
+        rule = "an IPv6 address does not work for RTSP with keys: give a name that stands for it, as in /etc/hosts"
+        raise UserError("command line", "media.host", vehicle.media.host, rule)
 
 
 class KeysOfAll(NamedTuple):

@@ -1,4 +1,4 @@
-"""Whether a server may listen at its configured address."""
+"""Addresses of servers, and whether one may listen at its own."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ from runner.core.model import Endpoint
 from runner.errors import RunError
 
 
+def ip_address_of(host: str) -> str:
+    """The address of a name, IPv4 if it has both kinds; raises OSError."""
+    found = sorted((family, address[0]) for family, *_, address in socket.getaddrinfo(host, None))  # AF_INET is first
+    return str(found[0][1])
+
+
 def check_port_free(endpoint: Endpoint) -> None:
     """raises RunError if another process already listens there, or the address is not one of this machine"""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((endpoint.host, endpoint.port))
-        except OSError as error:
-            what = error.strerror.lower() if error.strerror else str(error)
-            raise RunError(f"cannot listen on {endpoint.host}:{endpoint.port}: {what}; choose another port") from None
+    try:
+        address = ip_address_of(endpoint.host)
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((address, endpoint.port))
+    except OSError as error:
+        what = error.strerror.lower() if error.strerror else str(error)
+        raise RunError(f"cannot listen on {endpoint}: {what}; choose another port") from None

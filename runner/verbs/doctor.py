@@ -186,7 +186,7 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
         except RunError as error:
             yield Diagnosis(False, f"{key}: {error}")
         else:
-            yield Diagnosis(True, f"{key}: {endpoint.host}:{endpoint.port} is free")
+            yield Diagnosis(True, f"{key}: {endpoint} is free")
 
 
 def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:

@@ -155,6 +155,18 @@ next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  #
 WAIT_S = 60.0  # a demo starts in 3 s, and in 15 if five such tests run in parallel
 
 
+def _has_ipv6() -> bool:
+    with socket.socket(socket.AF_INET6) as probe:
+        try:
+            probe.bind(("::1", 0))
+        except OSError:
+            return False
+    return True
+
+
+LOOPBACK6 = "::1" if _has_ipv6() else "127.0.0.1"  # some tests run with it, so that IPv6 is tested where it exists
+
+
 def free_port(count: int = 1) -> int:
     """The first of so many ports in a row that nothing is bound to, UDP or TCP, and that were not handed out before.
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from rig import streaming, until
+from rig import LOOPBACK6, streaming, until
 from runner.core.commands import Command
 from runner.errors import UserError
 from runner.operator.frames import live_frames
@@ -17,7 +17,8 @@ pytestmark = pytest.mark.gst
 
 @pytest.fixture
 def robot():
-    with streaming("vehicle=delivery_robot", "fps_max=15", cameras=()) as (side, vehicle, _, _):
+    host = f"media.host={LOOPBACK6}"
+    with streaming("vehicle=delivery_robot", "fps_max=15", host, cameras=()) as (side, vehicle, _, _):
         side.turn(
             [Command(name, *knob) for name in vehicle.cameras for knob in (("size", (450, 260)), ("bitrate", 900))]
         )
@@ -26,6 +27,7 @@ def robot():
             [
                 "vehicle=delivery_robot",
                 "fps_max=15",
+                host,
                 f"media.port={vehicle.media.port}",
             ],
         )

@@ -19,7 +19,7 @@ from helpers import out_of_reach
 from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
-from rig import free_port, needs_root, process, run, until
+from rig import LOOPBACK6, free_port, needs_root, process, run, until
 from rtsp_client import client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
@@ -79,8 +79,8 @@ def changed(keys, action, name, now=lambda: datetime.now(UTC)):
 @contextmanager
 def driving(keys, *words):
     """A vehicle with keys and its broker; yields (broker, words for the operator)."""
-    media, control = free_port(), Endpoint("127.0.0.1", free_port())
-    common = (*WORDS, f"media.port={media}", f"control.port={control.port}", *words)
+    media, control = free_port(), Endpoint(LOOPBACK6, free_port())
+    common = (*WORDS, f"media.port={media}", f"control.port={control.port}", f"control.host={control.host}", *words)
     with private_broker(control, keys / "broker") as broker, process("vehicle", *common, f"keys={keys / NAME}"):
         yield broker, common
 
@@ -101,6 +101,15 @@ def answer_to(operator, event):
 
 def frames(operator):
     return {name: counters.frames for name, counters in operator.station.samples.items()}
+
+
+def test_an_ipv6_address_does_not_work_for_rtsp_with_keys(keys):
+    status, output = refusal("vehicle", *WORDS, f"keys={keys / NAME}", "media.host=::1")
+    assert (status, output) == (
+        2,
+        "command line: media.host: ::1: an IPv6 address does not work for RTSP with keys: "
+        "give a name that stands for it, as in /etc/hosts",
+    )
 
 
 def test_video_and_control_pass_and_each_role_may_do_what_it_is_for(keys):
@@ -308,7 +317,7 @@ def test_rotated_keys_take_effect_without_a_restart(keys):
 
 def broker_of(common):
     port = next(word for word in common if word.startswith("control.port="))
-    return Endpoint("127.0.0.1", int(port.partition("=")[2]))
+    return Endpoint(LOOPBACK6, int(port.partition("=")[2]))
 
 
 # --- video ------------------------------------------------------------------------------------------------------------
@@ -356,10 +365,10 @@ def watching(plans, holder, vehicle=NAME):
         side.stop()
 
 
-@pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
-def test_only_key_holders_receive_pictures(keys, graph):
+@pytest.mark.parametrize(("graph", "host"), [("h264_rtsp", "127.0.0.1"), ("h264_srt", LOOPBACK6)])
+def test_only_key_holders_receive_pictures(keys, graph, host):
     with (
-        sending(keys, f"graph={graph}", f"graph.first_port={free_port(3)}") as (plans, _),
+        sending(keys, f"graph={graph}", f"graph.first_port={free_port(3)}", f"media.host={host}") as (plans, _),
         watching(plans, keys / "bob") as (seen, messages),
     ):
         until(lambda: min(seen().values()) > 10, every_s=0.1)
