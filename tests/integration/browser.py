@@ -83,7 +83,14 @@ def take_control(page):
 
 
 def measure(page):
-    return until(lambda: page.evaluate("tod.measure()")["cameras"])  # empty before hello
+    def measured():
+        try:
+            return page.evaluate("tod.measure()")["cameras"]  # empty before hello
+        except sync_api.Error as error:
+            if "does not answer" not in error.message:
+                raise
+
+    return until(measured)
 
 
 def all_live(page, seconds=rig.WAIT_S):

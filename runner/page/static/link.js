@@ -5,6 +5,7 @@ import { onStationMessage, publish, store } from "./store.js";
 const { canShowVideo, early, worker } = globalThis.boot;
 const HUNG_MS = 1500; // the worker reports four times a second
 const CHECK_MS = 250;
+const ANSWERED_MS = 10_000; // limit of a question to the worker
 const questions = new Map();
 let lastQuestion = 0;
 let reportedAt = performance.now(); // when the worker last reported
@@ -115,5 +116,8 @@ export const reportSize = (name, { clientWidth: width, clientHeight: height }, v
 export function ask(what, name) {
   const id = ++lastQuestion;
   worker.postMessage({ order: "ask", id, what, name });
-  return new Promise((resolve) => questions.set(id, resolve));
+  return new Promise((resolve, reject) => {
+    questions.set(id, resolve);
+    setTimeout(() => questions.delete(id) && reject(new Error("the video worker does not answer")), ANSWERED_MS);
+  });
 }
