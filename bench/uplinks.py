@@ -237,13 +237,12 @@ def cameras(drive: Drive) -> Mapping[str, Camera]:
 def totals(drive: Drive) -> list[tuple[float, float]]:
     """The total in force over time with its packet headers: s by the vehicle's log, kbit/s."""
     mounted = cameras(drive)
-    return [
-        (
-            line.t,
-            float(wire_kbps([mounted[name] for name, own in line.cameras.items() if own.on], exact(line.total_kbps))),
-        )
-        for line in drive.sides["vehicle"].of(DecisionMade)
-    ]
+
+    def on_wire(line: DecisionMade) -> float:
+        on = [mounted[name] for name, own in line.cameras.items() if own.on]
+        return float(wire_kbps(on, exact(line.total_kbps)))
+
+    return [(line.t, on_wire(line)) for line in drive.sides["vehicle"].of(DecisionMade)]
 
 
 def _link_use(drive: Drive, over_time: Series) -> float:

@@ -187,18 +187,17 @@ def _give_up(
     key  of the memory, where they are kept
     """
     before: tuple[str, ...] = memory.get(key, ())
-    order, given_up = _shed_order(vehicle), before[:0]
-    if order and draft.total is not None:
+    given_up: tuple[str, ...] = ()
+    if order := _shed_order(vehicle):
+        assert draft.total is not None
         floors = {name: floor * state.copies.get(name, 1) for name, floor in _floors(vehicle).items()}
         of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
         given_up = allocation.shed(of_all, draft.total, floors, order, before)
     if given_up != before:
         memory = {**memory, key: given_up}
-    return (
-        draft.noted(f"{', '.join(given_up)} given up for the floors of others") if given_up else draft,
-        given_up,
-        memory,
-    )
+    if given_up:
+        draft = draft.noted(f"{', '.join(given_up)} given up for the floors of others")
+    return draft, given_up, memory
 
 
 def _without(given_up: Collection[str], wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:

@@ -75,7 +75,7 @@ def measure(
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
     sent, received_files = files(vehicle), files(operator)
     names = [name for name in cameras if name in sent and name in received_files]
-    for name in cameras.keys() & sent.keys() - received_files.keys() if names else ():
+    for name in [name for name in cameras if names and name in sent and name not in received_files]:
         on_warning(f"{name} is left out: no picture of it was received, so mean and worst are too high")
     videos = _Videos(drive.path, read_video, decode_video)
 

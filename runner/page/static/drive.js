@@ -132,7 +132,6 @@ function updateAttention() {
   if (message && inControl()) publish("toast", { text: message, level: "problem" });
 }
 
-
 export function startDrive() {
   byId("drive-control").addEventListener("click", toggleControl);
   byId("guides").addEventListener("click", toggleGuides);
