@@ -132,11 +132,10 @@ class _Glib:
         load_types()
         self._loop = GLib.MainLoop()
         self._calls: deque[Callable[[], None]] = deque()
-        # One watch for all calls: see runner/gst/one_shot.py.
+        # One watch for all calls: see runner/gst/one_shot.py. Its priority is that of the timers: at a lower one,
+        # calls would wait for as long as an overloaded loop always has a timer to run.
         self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._watch = GLib.unix_fd_add_full(
-            GLib.PRIORITY_DEFAULT_IDLE, self._wakeup, GLib.IOCondition.IN, self._on_wakeup
-        )
+        self._watch = GLib.unix_fd_add_full(GLib.PRIORITY_DEFAULT, self._wakeup, GLib.IOCondition.IN, self._on_wakeup)
         self.beat = time.monotonic()
         self._beating = GLib.timeout_add(BEAT_MS, self._on_beat)
         self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)

@@ -203,6 +203,21 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     assert f"front: {aside.HUNG}" in messages
 
 
+def test_calls_run_although_timers_keep_gstreamer_s_thread_busy():
+    from gi.repository import GLib
+
+    from runner import apply
+
+    glib = apply._Glib()
+    busy = GLib.timeout_add(0, lambda: True)  # always due, as a timer is on an overloaded machine
+    try:
+        for _ in range(3):
+            glib.call("reading the counters", lambda: None)
+    finally:
+        GLib.source_remove(busy)
+        glib.end(lambda: None)
+
+
 def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
     from runner import apply
 
