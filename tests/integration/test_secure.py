@@ -412,7 +412,8 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
             for holder, (own, _) in zip(intruders, all_seen, strict=True):
                 assert set(own().values()) == {0}, holder
             _revoked_while_watching(keys, plans, reports)
-    refusals = [what for what in reports if "refused" in what]
+    # On a busy machine, a watcher may end between the server's challenge and its answer.
+    refusals = [what for what in reports if "refused" in what and not what.endswith("it has given no password")]
     assert sorted(refusals) == sorted(
         f"keys: refused an RTSP client at 127.0.0.1: {why}"
         for why in (
